@@ -1,4 +1,4 @@
-"""Control: mode of the hand, grip laws, setpoints, slip monitor and tasks.
+"""Control: hand modes, grip control laws, setpoints, slip monitor and tasks.
 
-This package uses neither sockets nor the servo protocol.
+This package does not use sockets or the servo protocol.
 """

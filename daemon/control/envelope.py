@@ -1,7 +1,7 @@
-"""Simulated map of the objects that the hand can hold, by shape, size, friction and mass.
+"""Look up which objects the hand can hold in simulation, by shape, size, friction and mass.
 
-`softfinger envelope --keep` creates it, and `grasp` uses it to warn. A map is valid only for the
-hand that it was simulated for; the packaged map is valid for the built-in hand.
+`softfinger envelope --keep` creates the map, and `grasp` uses it for warnings. A map is valid only
+for the hand that was simulated; the packaged map is valid for the built-in hand.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ _SECTIONS = ("hand", "tip", "material")
 
 
 def identity(settings: Settings) -> dict[str, Any]:
-    """Return the settings that identify the hand of a map."""
+    """Return the settings that identify a map's hand."""
     identifying = {name: getattr(settings, name).model_dump(mode="json") for name in _SECTIONS}
     return identifying | {"control": {"law": settings.control.law}}
 
 
 def increased_force_limit(settings: Settings, force: float) -> float:
-    """Return the force [N] up to which the slip monitor may raise a grip of ``force`` [N]."""
+    """Return the maximum [N] to which the slip monitor may increase a commanded ``force`` [N]."""
     force_max = GRIP_FRACTION * settings.safety.force_max
     return max(min(force + settings.control.grip_raise_max, force_max), force)
 
 
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
-    """Return the first setting that differs, with both values, or an empty text.
+    """Describe the first setting that differs, with both values; return "" if none differs.
 
-    A setting that an older map does not contain counts as its default.
+    If an older map does not contain a setting, its default is used.
     """
     defaults = identity(Settings())
     for name, section in expected.items():
@@ -54,10 +54,10 @@ def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
 
 
 class Envelope:
-    """Map of one hand, evaluated for the object of the settings."""
+    """Map for one hand, evaluated for the object in the settings."""
 
     def __init__(self, settings: Settings) -> None:
-        """Read the map that the settings name, or the packaged one if it fits this hand.
+        """Read the map named in the settings, or otherwise the packaged map if it fits this hand.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class Envelope:
             width, count = settings.object.width, len(self._masses)
             column = min(range(len(sizes)), key=lambda k: abs(sizes[k] - width))
             row = max(sum(each <= control.tip_friction + 1e-9 for each in frictions) - 1, 0) * count
-            # For each mass, the outcomes of a block and of a disc.
+            # Each entry contains the outcomes for a block and a disc of one mass.
             rows = zip(*(found[shape][row : row + count] for shape in found["shapes"]), strict=True)
             self._outcomes = ["".join(cells[column] for cells in shapes) for shapes in rows]
             self._force_limit = found["raised"]
@@ -86,11 +86,11 @@ class Envelope:
         self._settings = settings
 
     def warning(self, force: float) -> str:
-        """Return a warning if a grasp of ``force`` [N] may fail, or an empty text.
+        """Return a warning if a grasp with ``force`` [N] may fail, otherwise "".
 
-        The lookup uses the nearest object size, the largest friction up to `control.tip_friction`,
-        and the mass whose weight is `control.object_load`. The mass is scaled by the ratio of the
-        force limit of the map to the force limit of this grip.
+        The lookup uses the nearest object size, the highest friction not above
+        `control.tip_friction`, and the mass whose weight is `control.object_load`. The mass is
+        scaled by the ratio of the map's force limit to this grip's force limit.
         """
         if not self._is_valid:
             return ""

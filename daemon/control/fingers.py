@@ -1,4 +1,4 @@
-"""Fingers of the control state machine: their contacts, and the goals of their joints."""
+"""Access the fingers' contacts and set their joint goals for the control state machine."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Goal, State
 
-# rad from the present angle to the goal angle of a torque-controlled joint. It is large enough that
+# rad from the current angle to the goal angle of a torque-controlled joint. It is large enough that
 # the current limit determines the torque (`hand_estimator` expects 0.25 rad). It is smaller than
-# `safety.goal_reach`, so that the goal may change sides at once.
+# `safety.goal_reach`, so that the goal may jump from one side of the joint to the other.
 _GOAL_OFFSET = 0.35
-# rad between the largest tilt that a turn may cause and the tilt that is a fault.
+# rad between the maximum tilt allowed for a rotation and the tilt that triggers a fault.
 _TILT_RESERVE = 0.1
 
 
 def range_text(angle: float, low: float, high: float) -> str:
-    """Return the found and expected part of a message for an angle [rad] outside its range."""
+    """Return the "found …, expected …" part of a message about an out-of-range angle [rad]."""
     found, lower, upper = (f"{math.degrees(each):.1f}°" for each in (angle, low, high))
     return f"found {found} ({angle:.4g} rad), expected {lower} to {upper} ({low:.2f} to {high:.2f})"
 
 
 class Fingers:
-    """The fingers of the scene, with their contacts and the setpoints of their joints."""
+    """The fingers in the scene, with their contacts and joint setpoints."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
-        """Create the fingers; ``state`` and ``grasp`` are read in each tick and never written."""
+        """Create the fingers; ``state`` and ``grasp`` are read on each tick but never written."""
         self.indices = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self.reading, self.pose, self.grasp = state.reading, state.object, grasp
         self._settings, self._contacts = settings, state.contacts
@@ -43,15 +43,15 @@ class Fingers:
 
     @property
     def force(self) -> float:
-        """Mean force of the tips [N]."""
+        """Mean tip force [N]."""
         return sum(self._contacts[index].force for index in self.indices) / len(self.indices)
 
     def turning_range(self) -> tuple[float, float]:
-        """Return the lowest and the highest angle [rad] to which this grip can turn the object.
+        """Return the minimum and maximum angle [rad] to which this grip can rotate the object.
 
-        While the object turns by φ, each joint moves by φ divided by the sum of both rotation
-        Jacobians, and the tilt of each tip changes by the sum of both angles. The joint and tilt
-        limits bound the range.
+        When the object rotates by φ, each joint moves by φ divided by the sum of both rotation
+        Jacobians, and the tilt of each tip changes by the sum of these two angles. The joint and
+        tilt limits determine the range.
         """
         settings, present_angle = self._settings, self.pose.angle
         rotation = self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1]
@@ -69,7 +69,7 @@ class Fingers:
         return present_angle + min(low, 0.0), present_angle + max(high, 0.0)
 
     def turn_refusal(self, angle: float) -> str:
-        """Return the reason why the object can't turn to ``angle`` [rad], or an empty text."""
+        """Return the reason why the object can't rotate to ``angle`` [rad], or "" if it can."""
         if not self.pose.valid:
             return "the object's angle is not known"
         low, high = self.turning_range()
@@ -78,7 +78,7 @@ class Fingers:
     # Setpoints
 
     def hold_here(self) -> None:
-        """Set all setpoints to the present joint angles, at rest."""
+        """Set all setpoints to the current joint angles with zero speed."""
         for index, q in enumerate(self.reading.q):
             self._setpoints[index].reset(q)
 
@@ -87,10 +87,10 @@ class Fingers:
         self._setpoints[index].target = q
 
     def close_fingers(self, touching: set[int]) -> set[int]:
-        """Close the fingers without contact, and return the fingers in contact.
+        """Close the fingers that are not in contact; return the fingers in contact.
 
-        A finger whose contact is new, so that it is not in ``touching``, stops at its present
-        angle. ``touching`` is the result of the last tick.
+        ``touching`` is the result from the previous tick. A finger with a new contact, which is not
+        in ``touching``, stops at its current angle.
         """
         law, now_touching = self._settings.control, set[int]()
         for index in self.indices:
@@ -104,25 +104,25 @@ class Fingers:
         return now_touching
 
     def advance_setpoints(self, rate: float) -> bool:
-        """Advance the setpoints at ``rate`` [rad/s] or less; return True if all have arrived."""
+        """Advance the setpoints at up to ``rate`` [rad/s]; return True if all have arrived."""
         arrived = [joint.step(rate) for joint in self._setpoints]
         return all(arrived)
 
     @property
     def distance_max(self) -> float:
-        """Largest distance of a joint from the target of its setpoint [rad]."""
+        """Maximum distance of a joint from its setpoint's target [rad]."""
         return max(abs(self.reading.q[i] - self._setpoints[i].target) for i in self.indices)
 
     # Goals
 
     def follow_setpoints(self, goal: Goal, current: float) -> None:
-        """Set goals that make the joints follow their setpoints with at most ``current`` [A]."""
+        """Set goals so that the joints follow their setpoints with at most ``current`` [A]."""
         for index in self.indices:
             goal.q[index] = self._setpoints[index].value
             goal.current[index] = current
 
     def apply_torques(self, goal: Goal, torques: tuple[float, float]) -> None:
-        """Set goals that make the joints apply ``torques`` [N·m], positive closing."""
+        """Set goals so that the joints apply ``torques`` [N·m], positive when closing."""
         for index in self.indices:
             current = torques[index] / self._settings.control.torque_constant
             goal.q[index] = self.reading.q[index] + math.copysign(_GOAL_OFFSET, current)

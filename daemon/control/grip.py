@@ -1,23 +1,25 @@
-"""Grip laws: joint torques from the tip forces and the object's angle, once both tips touch.
+"""Compute joint torques from tip forces and object angle, once both tips are in contact.
 
-`control.grip_kernels` computes them. Two fingers have one motion that changes the grip (both close)
-and one that moves the object (q1 + δ, q2 − δ), so every law has two parts:
+`control.grip_kernels` contains the computations. Two fingers have one motion that changes the grip
+(both close) and one that moves the object (q1 + δ, q2 − δ). Every control law therefore has two
+parts:
 
-1. *grip*: a feed-forward torque (moment arm times target force, plus joint friction), a
-   proportional and an integral term on the force error, and damping matched to the tip stiffness;
-2. *steering*, the 'serial two-phased' law of the soft-fingertip literature: the error of the
-   object's angle is integrated and added with opposite signs to the joint goals, which a PD
-   controller follows. The object turns by φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
+1. *grip*: a feed-forward torque (moment arm × target force + joint friction), proportional and
+   integral feedback of the force error, and damping matched to the tip stiffness;
+2. *steering*, the serial two-phased controller of the soft-fingertip literature: the object angle
+   error is integrated and added with opposite signs to the joint goals, which a PD controller
+   follows. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
 
-With ``control.law = "energy"`` the moment arms are the gradient of the contact tables' energy along
+With ``control.law = "energy"``, the moment arms are the gradient of the contact-table energy along
 the rolling increments. They include the moments and shear forces of the tips.
 
-With ``"upright"`` the law ignores the object's angle until a command steers it. Both joints get the
-same torque, with damping, as in the literature on blind grasping. A virtual spring between the
-fingers places the minimum of the tips' elastic energy where the object stands upright, for any
-shear that is stuck in the tips (`hand.upright`). A dither of the fingers against each other
-overcomes joint friction until the object rests in that minimum. Then the law holds the
-antisymmetric joint angle. Once steered, it uses the arm of the force about the pivot as moment arm.
+With ``"upright"``, the control law ignores the object angle until a command steers it. Both joints
+receive the same torque plus damping, as in the literature on blind grasping. A virtual spring
+between the fingers places the minimum of the tips' elastic energy at the upright object pose,
+regardless of residual shear in the tips (`hand.upright`). Antisymmetric dither of the fingers
+overcomes joint friction until the object has settled in that minimum. The law then holds the
+antisymmetric joint angle. Once a command steers the object, the moment arm is the force's arm about
+the pivot.
 """
 
 from __future__ import annotations
@@ -34,26 +36,24 @@ from softfinger.daemon.types import ObjectPose, Reading
 
 
 class Grip:
-    """Control the force from the tactile estimate; steer by antisymmetric joint motion."""
+    """Controller for the grip force (from tactile estimates) and for antisymmetric steering."""
 
     def __init__(self, settings: Settings, fingers: list[int], grasp: GraspState) -> None:
-        """Create the law for the given ``fingers``, left first; ``grasp`` is read in each tick."""
+        """Create the controller for ``fingers``, left first; ``grasp`` is read on each tick."""
         control = settings.control
         dt = 1.0 / settings.loop.rate
         self._control = control
         self._single_finger = None if len(fingers) == 2 else fingers[0]
         self._grasp = grasp
         self._state = state = GripState()
-        self.force = Setpoint(dt, control.smooth_time, state.force)  # mean of both tips [N]
-        self.angle = Setpoint(dt, control.smooth_time, state.angle)  # of the object [rad]
+        self.force = Setpoint(dt, control.smooth_time, state.force)  # mean tip force [N]
+        self.angle = Setpoint(dt, control.smooth_time, state.angle)  # object angle [rad]
         self.slip = state.slip
         self.commanded = 0.0  # commanded force [N]
-        self.commanded_max = (
-            math.inf
-        )  # upper bound of the commanded force, set by `limit_force` [N]
-        self.target = 0.0  # commanded force, or more to prevent slip [N]
-        self.has_slipped = False  # the object has turned in the grip in this tick
-        self.target_angle = math.nan  # of the object [rad], NaN unless it is steered
+        self.commanded_max = math.inf  # set by `limit_force` [N]
+        self.target = 0.0  # commanded force, increased if necessary to prevent slip [N]
+        self.has_slipped = False  # the object has rotated in the grip on this tick
+        self.target_angle = math.nan  # target object angle [rad], NaN if not steered
         set_law(state.slip.law, settings)
         law = state.law
         law.dt = dt
@@ -78,19 +78,19 @@ class Grip:
 
     @property
     def is_blind(self) -> bool:
-        """True if the law grips without the object's angle."""
+        """True if the control law does not use the object angle."""
         return self._state.law.is_blind
 
     @property
     def is_dithering(self) -> bool:
-        """True while the dither that brings the object upright is running or due."""
+        """True while the dither that brings the object upright is running or pending."""
         state = self._state
         awaited = state.law.is_blind and self._single_finger is None and not state.is_steering
         return awaited and state.dither_elapsed < state.law.dither_time
 
     @property
     def stopping_ratio(self) -> float:
-        """Ratio of the earliest stopping angle to the present angle; 0 unless |angle| grows."""
+        """Ratio of the earliest stopping angle to the current angle; 0 unless |angle| increases."""
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
             return 0.0
@@ -98,17 +98,20 @@ class Grip:
 
     @property
     def is_turning(self) -> bool:
-        """True while the setpoint of the object's angle is moving to its target."""
+        """True while the object angle setpoint is moving to its target."""
         return self._state.is_steering and self.angle.value != self.target_angle
 
     def start(self, measured: float, force: float) -> None:
-        """Take over from the approach at the ``measured`` force and go to ``force`` [N]."""
+        """Take over from the approach at the ``measured`` force and change it to ``force`` [N]."""
         kernels.start(self._state.array, self._grasp.array, self.force.windows, measured)
         self.target_angle = math.nan
         self.retarget(force)
 
     def retarget(self, force: float) -> None:
-        """Go to another grip force [N]; a lower one scales the force increase down with it."""
+        """Change the commanded force [N].
+
+        A lower force also reduces the slip-related increase in proportion.
+        """
         force = min(force, self.commanded_max)
         if force < self.commanded:
             self.slip.needed_force *= force / self.commanded
@@ -121,29 +124,29 @@ class Grip:
         self._state.force_rate = change / self._control.force_time
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the force to ``force_max`` [N] from now on; reach it within ``duration`` [s]."""
+        """Limit the force to ``force_max`` [N] from now on and reach it within ``duration`` [s]."""
         self.commanded_max = force_max
         self.retarget(force_max)
         self._state.force_rate = abs(self.force.value - force_max) / duration
 
     def force_for_load(self) -> float:
-        """Return the force [N] for the load, with the slip margin and the hidden load."""
+        """Return the force [N] required for the load, including slip margin and hidden load."""
         law, grasp = self.slip.law, self._grasp
         load = self.slip.assumed_load
-        if not law.has_shear and law.object_load == 0.0:  # friction may hide a load of this size
+        if not law.has_shear and law.object_load == 0.0:  # friction may hide this load
             load = max(load, law.joint_friction / max(grasp.load_arm, 0.5 * law.width))
         spare = law.friction * (1.0 - law.margin) - grasp.shear
         return max(load / max(spare, 0.3 * law.friction), self.slip.needed_force)
 
     def steer(self, present: float, angle: float) -> None:
-        """Turn the object from its ``present`` angle to ``angle`` [rad] and hold it there."""
+        """Rotate the object from its ``present`` angle to ``angle`` [rad] and hold it there."""
         if math.isnan(self.target_angle):
             self.angle.reset(present)
         self.target_angle = self.angle.target = angle
         self._state.is_steering = True
 
     def set_joint_stiffness(self, joint_stiffness: float) -> None:
-        """Set the antisymmetric joint stiffness [N·m/rad] without a step in the torques."""
+        """Set the antisymmetric joint stiffness [N·m/rad] without a torque step."""
         state, (q1, q2) = self._state, self._grasp.q
         present = 0.5 * (q1 - q2)
         ratio = state.joint_stiffness / joint_stiffness
@@ -151,13 +154,13 @@ class Grip:
         state.joint_stiffness = joint_stiffness
 
     def begin_holding(self) -> None:
-        """Mark the grip as settled: from now on, external loads can be detected."""
+        """Mark the grip as settled, so that external loads can be detected."""
         kernels.begin_holding(self._state.array, self._grasp.array)
 
     def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
-        """Return joint torques [N·m], positive closing, 0 for a finger that does not take part.
+        """Return joint torques [N·m], positive when closing, 0 for an unused finger.
 
-        Set ``holding`` if the grip is settled, so that only loads move the joints.
+        Set ``holding`` if the grip is settled; only loads then move the joints.
         """
         if self._single_finger is not None:
             return self._single_torque(reading, False)
@@ -174,10 +177,10 @@ class Grip:
         return torque1, torque2
 
     def hold_goal(self, reading: Reading) -> tuple[float, float]:
-        """Return joint torques [N·m] while frames are late: hold the force, end a turn.
+        """Return joint torques [N·m] while frames are late: hold the force and end any rotation.
 
-        The joints are still read. Constant torques would keep the object turning, without damping
-        or steering.
+        Joint readings are still available, so damping and steering continue. Constant torques would
+        keep the object rotating.
         """
         if self._single_finger is not None:
             return self._single_torque(reading, True)

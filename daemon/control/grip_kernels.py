@@ -1,7 +1,7 @@
-"""State and kernels of the grip laws; `control.grip` explains the laws.
+"""State and kernels of the grip control laws, which `control.grip` explains.
 
-The kernels called from Python take the state of the laws, the grasp of this tick, and the windows
-of both setpoints. Pairs are (left, right). SI units.
+The kernels called from Python take the controller state, this tick's grasp, and the windows of both
+setpoints. Pairs are (left, right). SI units.
 """
 
 from __future__ import annotations
@@ -21,59 +21,59 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_ERROR_SIGMA = 2.0  # standard deviations of the torque constant, allowed in the force limit
-_ARM_MIN = 0.1  # of the finger's length
-_INTEGRAL_RATIO = 0.3  # limit of the integral term, as a fraction of the force target
-_DISTRIBUTE_BANDWIDTH = 2.0  # Hz, integral control of the force difference of the tips
-_DISTRIBUTE_ANGLE = 3e-3  # rad that this may turn the object
-_DEAD_BAND = 3.0  # standard deviations of the angle, dead band of the joints at rest
-_DITHER_STEP_MAX = 0.05  # s, largest time step of the dither, after a pause between ticks
-_STIFFNESS_MIN = 100.0  # N/m, lower bound, since the gains are divided by it
-_ROTATION_MIN = 0.1  # lower bound of the object's rotation per antisymmetric angle
+_TORQUE_ERROR_SIGMA = 2.0  # torque-constant standard deviations included in the force limit
+_ARM_MIN = 0.1  # fraction of the finger length
+_INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
+_DISTRIBUTE_BANDWIDTH = 2.0  # Hz, integral control of the tip force difference
+_DISTRIBUTE_ANGLE = 3e-3  # rad, maximum object rotation due to this control
+_DEAD_BAND = 3.0  # angle standard deviations, dead band at standstill
+_DITHER_STEP_MAX = 0.05  # s, maximum dither time step after a delayed tick
+_STIFFNESS_MIN = 100.0  # N/m, lower bound because gains are divided by stiffness
+_ROTATION_MIN = 0.1  # minimum object rotation per antisymmetric joint angle
 
 
 class GripLaw(Record):
-    """Constants of the grip laws."""
+    """Constants of the grip control laws."""
 
     dt: float  # [s]
     force_gain: float
     force_bandwidth: float  # [rad/s]
     rotate_bandwidth: float  # [rad/s]
     rotate_speed: float  # [rad/s]
-    damping: float  # 2 ζ √J; times √stiffness it is the damping [N·m·s/rad]
-    friction: float  # of a joint [N·m]
-    driving: float  # ratio of motor torque to tip torque of a closing joint
-    friction_speed: float  # from which friction is fully compensated [rad/s]
+    damping: float  # 2 ζ √J; multiply by √stiffness for damping [N·m·s/rad]
+    friction: float  # joint friction [N·m]
+    driving: float  # ratio of motor torque to tip torque when closing
+    friction_speed: float  # speed for full friction compensation [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
-    turn_decay: float  # factor per tick of the turning rate without frames
-    is_blind: bool  # the object is brought upright by dither, without its measured angle
-    half_separation: float  # half the distance of the pivots [m]
-    length: float  # of a finger [m]
-    offset: float  # of a finger [m]
-    radius: float  # of a tip [m]
+    turn_decay: float  # decay factor per tick of the turning rate without frames
+    is_blind: bool  # dither brings the object upright; its angle is not used
+    half_separation: float  # half the pivot separation [m]
+    length: float  # finger length [m]
+    offset: float  # fingertip offset [m]
+    radius: float  # tip radius [m]
     dither_torque: float  # [N·m]
     dither_rate: float  # [rad/s]
-    dither_time: float  # until the dither has faded [s]
+    dither_time: float  # dither duration [s]
 
 
 class GripState(Record):
-    """Commanded values and internal state of the grip laws."""
+    """Commanded values and internal state of the grip control laws."""
 
     law: GripLaw
-    force: SetpointState  # mean of both tips [N]
-    angle: SetpointState  # of the object [rad]
+    force: SetpointState  # mean tip force [N]
+    angle: SetpointState  # object angle [rad]
     slip: SlipState
-    commanded: float  # force [N]
+    commanded: float  # commanded force [N]
     force_rate: float  # [N/s]
     joint_stiffness: float  # [N·m/rad]
-    is_steering: bool  # the object's angle has a target
+    is_steering: bool  # the object angle has a target
     integral: float  # [N]
-    grip_force: float  # feed-forward and feedback together [N]
-    offset_rate: float  # rate of the offset that turns the object [rad/s]
+    grip_force: float  # sum of feed-forward and feedback [N]
+    offset_rate: float  # rate of the offset that rotates the object [rad/s]
     offset: float  # goal of (q1 − q2)/2 [rad]
     dither_elapsed: float  # time since the dither began [s]
-    last_time: float  # time of the last tick with equal torques or start [s]
+    last_time: float  # time of the last tick with equal torques, or of the start [s]
     balance_offset: float  # part of the offset that balances the tip forces [rad]
     closing_friction: float  # fraction of the joint friction compensated for closing
     torque: Pair  # last torques of both joints [N·m]
@@ -99,7 +99,7 @@ def start(
 
 @kernel
 def begin_holding(grips: Records[GripState], grasps: Records[GraspState]) -> None:
-    """Mark the grip as settled: from now on, loads can be detected."""
+    """Mark the grip as settled, so that loads can be detected."""
     slip_monitor.begin(grips[0].slip, grasps[0])
 
 
@@ -113,10 +113,10 @@ def grip_torques(
     dq: tuple[float, float],
     holding: bool,
 ) -> tuple[float, float, float, bool]:
-    """Return the torques of both joints [N·m], the target force [N], and True if it slipped.
+    """Return both joint torques [N·m], the target force [N], and True if the object slipped.
 
-    ``angle`` is the object's angle [rad], NaN if unknown, and ``dq`` are the joint velocities
-    [rad/s]. ``holding`` is True in a settled grip, in which only loads move the joints.
+    ``angle`` is the object angle [rad] (NaN if unknown) and ``dq`` are the joint velocities
+    [rad/s]. ``holding`` is True in a settled grip, where only loads move the joints.
     """
     g = grips[0]
     grasp = grasps[0]
@@ -155,9 +155,9 @@ def grip_torques(
 def hold_goal(
     grips: Records[GripState], grasps: Records[GraspState], dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return joint torques while frames are late: hold the force, end a turn.
+    """Return joint torques while frames are late: hold the force and end any rotation.
 
-    It is called instead of :func:`grip_torques`.
+    Call this instead of :func:`grip_torques`.
     """
     g = grips[0]
     g.offset_rate *= g.law.turn_decay
@@ -174,9 +174,9 @@ def single_torque(
     dq: float,
     frames_late: bool,
 ) -> float:
-    """Return the torque [N·m] of one ``finger`` on an object with its own support.
+    """Return the torque [N·m] for one ``finger`` that presses on a supported object.
 
-    With ``frames_late`` the force stays constant.
+    If ``frames_late``, the force stays constant.
     """
     g = grips[0]
     grasp = grasps[0]
@@ -185,7 +185,7 @@ def single_torque(
     closing_rate = 0.0
     if not frames_late:
         target = setpoint.advance(g.force, force_windows, g.force_rate)
-        # The object can't yield, so friction of the tip on it may take some of the torque.
+        # The object can't yield, so friction between tip and object may take some of the torque.
         q, law = grasp.q[finger], g.law
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
         limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
@@ -206,14 +206,14 @@ def _mean_stiffness(grasp: GraspState) -> float:
 
 @inner_kernel
 def _rotation_per_offset(grasp: GraspState) -> float:
-    """Return the derivative of the object's angle by the antisymmetric joint angle."""
+    """Return the derivative of the object angle with respect to the antisymmetric joint angle."""
     rotation_per_offset: float = grasp.jacobian_rotation[0] + grasp.jacobian_rotation[1]
     return max(rotation_per_offset, _ROTATION_MIN)
 
 
 @inner_kernel
 def _force_feedback(g: GripState, target: float, measured: float, bound: float) -> float:
-    """Return the feedback part of the force [N]; ``bound`` limits its integral term."""
+    """Return the force feedback [N]; ``bound`` limits its integral term."""
     law = g.law
     error = target - measured
     # Anti-windup: do not integrate while a torque is at its limit.
@@ -226,10 +226,10 @@ def _force_feedback(g: GripState, target: float, measured: float, bound: float) 
 
 @inner_kernel
 def _force_limit(g: GripState, load: float, arm: float) -> float:
-    """Return an upper limit of the grip force [N] that does not depend on the sensors.
+    """Return an upper limit for the grip force [N] that is independent of the sensors.
 
-    It is the target force, increased for the error of the torque constants, for joint friction and
-    for the torque [N·m] of the detected ``load``. ``arm`` is the moment arm of the force [m].
+    The limit is the target force, increased to allow for the torque constant error, joint friction
+    and the torque due to the detected ``load`` [N·m]. ``arm`` is the force's moment arm [m].
     """
     law = g.law
     force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * law.torque_error)
@@ -238,13 +238,13 @@ def _force_limit(g: GripState, load: float, arm: float) -> float:
 
 @inner_kernel
 def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -> float:
-    """Move the antisymmetric goal, and return its rate [rad/s]."""
+    """Move the antisymmetric goal and return its feed-forward rate [rad/s]."""
     target = setpoint.advance(g.angle, windows, g.law.rotate_speed)
     rotation = _rotation_per_offset(grasp)
     offset_rate = g.angle.speed / rotation
     if not math.isnan(angle):
         error = target - angle
-        if setpoint.has_arrived(g.angle):  # dead band, so that joints at rest do not follow noise
+        if setpoint.has_arrived(g.angle):  # With the dead band, joints at rest do not follow noise.
             noise = _DEAD_BAND * grasp.angle_std
             error -= min(max(error, -noise), noise)
         g.offset += g.law.rotate_bandwidth * error / rotation * g.law.dt
@@ -254,10 +254,10 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
 
 @inner_kernel
 def _distribute(g: GripState, grasp: GraspState) -> None:
-    """Balance the tip forces, which friction of the object on its support may keep unequal.
+    """Equalise the tip forces, which friction between object and support may keep unequal.
 
-    The force law controls only their mean. To balance them, both fingers shift sideways by a small
-    angle, which turns the object by _DISTRIBUTE_ANGLE at most.
+    The force controller acts only on their mean. To equalise them, both fingers shift sideways by a
+    small angle, which rotates the object by at most _DISTRIBUTE_ANGLE.
     """
     off = (
         0.5
@@ -273,7 +273,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
 
 @inner_kernel
 def _closing_rate(grasp: GraspState, rate: float, offset_rate: float) -> float:
-    """Return the closing rate [rad/s] for a force ``rate`` [N/s] during a turn."""
+    """Return the closing rate [rad/s] that yields a force ``rate`` [N/s] during a rotation."""
     arm = grasp.moment_arm
     rotation = grasp.jacobian_rotation
     d_rate = 2.0 * rate / _mean_stiffness(grasp)
@@ -290,7 +290,7 @@ def _torques(
     offset_rate: float,
     dq: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the torques of two fingers at commanded rates of closing and offset [rad/s]."""
+    """Return both joint torques for the commanded closing and offset rates [rad/s]."""
     law = g.law
     arm = mean(grasp.moment_arm)
     damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
@@ -311,10 +311,10 @@ def _torques(
 def _equal_torques(
     g: GripState, grasp: GraspState, target: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the torques of two fingers that push with equal force at any angle of the object.
+    """Return joint torques that push with equal force at any object angle.
 
-    While the dither lasts, the spring of `hand.upright` acts between the fingers. The dither fades,
-    so that joint friction leaves no bias. After that, the joints hold their antisymmetric angle.
+    During the dither, the virtual spring from `hand.upright` acts between the fingers. The dither
+    fades out so that joint friction leaves no bias. The joints then hold their antisymmetric angle.
     """
     law, q = g.law, grasp.q
     closing_rate = _closing_rate(grasp, g.force.speed, 0.0)
@@ -336,14 +336,14 @@ def _equal_torques(
             upright_spring(closed, depth, target, grasp.tilt_moment_ratio, lengths),
             g.joint_stiffness,
         )
-        # The hold that follows must start with the present torque of the spring.
+        # The subsequent hold must start with the current spring torque.
         g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
-        # The amplitude grows during the first period and fades throughout.
+        # The amplitude increases during the first period, and it fades throughout the dither.
         phase = law.dither_rate * g.dither_elapsed
         amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
         steering = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
         if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-            # Use the clock instead of counting ticks: late ticks must not slow the dither down to
+            # Use the clock instead of counting ticks. Otherwise late ticks could slow the dither to
             # the resonance of the fingers on the tips, at 1 to 2 Hz.
             g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     else:
@@ -356,9 +356,9 @@ def _equal_torques(
 
 @inner_kernel
 def _motor_torque(law: GripLaw, torque: float, rate: float) -> float:
-    """Return the motor torque for a tip torque [N·m] at the commanded joint ``rate`` [rad/s].
+    """Return the motor torque required for a tip torque [N·m] at a joint ``rate`` [rad/s].
 
-    A joint at rest gets the torque that it needs to close.
+    A joint at standstill gets the torque required for closing.
     """
     opening = min(max(-rate / law.friction_speed, 0.0), 1.0)
     return torque * (law.driving - opening * (law.driving - 1.0 / law.driving))
@@ -366,5 +366,5 @@ def _motor_torque(law: GripLaw, torque: float, rate: float) -> float:
 
 @inner_kernel
 def _friction(law: GripLaw, rate: float) -> float:
-    """Return the friction of a joint [N·m] at the commanded ``rate`` [rad/s]."""
+    """Return the joint friction [N·m] at the commanded ``rate`` [rad/s]."""
     return law.friction * min(max(rate / law.friction_speed, -1.0), 1.0)

@@ -14,12 +14,12 @@ class Mode(StrEnum):
     """Mode of the hand."""
 
     DISARMED = "disarmed"  # torque off
-    ARMED = "armed"  # torque on, joints hold where they are
-    MOVING = "moving"  # joints on their way to commanded angles
-    GRASPING = "grasping"  # closing, or building up the force
-    HOLDING = "holding"  # force and object's angle held
-    ROTATING = "rotating"  # turning the object in the grip
-    RELEASING = "releasing"  # opening
+    ARMED = "armed"  # torque on, joints hold their positions
+    MOVING = "moving"  # joints moving to commanded angles
+    GRASPING = "grasping"  # closing, or increasing the force
+    HOLDING = "holding"  # holding force and object angle
+    ROTATING = "rotating"  # rotating the object
+    RELEASING = "releasing"  # opening the fingers
     FAULT = "fault"  # torque off until the fault is cleared
 
 
@@ -200,5 +200,5 @@ COMMANDS: dict[str, CommandKind] = {
     ),
 }
 
-# These commands never stiffen or move the hand, so they are accepted even if they arrived late.
+# These commands never stiffen or move the hand, so they are accepted even if they arrive late.
 SAFE_COMMANDS = frozenset({"disarm", "tare", "clear"})

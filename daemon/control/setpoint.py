@@ -1,4 +1,4 @@
-"""Smooth setpoints: a jerk-limited path to a target that may jump in any tick.
+"""Generate smooth setpoints: a jerk-limited path to a target that may jump on any tick.
 
 The values may have any unit.
 """
@@ -23,7 +23,7 @@ class RunningMean(Record):
 
 
 class SetpointState(Record):
-    """State of a setpoint. The values of both running means are stored in separate windows."""
+    """State of a setpoint. The values for both running means are stored in separate windows."""
 
     target: float
     value: float
@@ -37,7 +37,7 @@ class SetpointState(Record):
 
 @inner_kernel
 def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
-    """Set the setpoint to ``value``, at rest."""
+    """Set the setpoint to ``value`` with zero speed."""
     s.target = s.ramp = s.value = value
     s.speed = 0.0
     s.idle_count = s.first.length + s.second.length
@@ -50,14 +50,14 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
 
 @inner_kernel
 def has_arrived(s: SetpointState) -> bool:
-    """Return True if the setpoint is at rest at its target."""
+    """Return True if the setpoint has stopped at its target."""
     there: bool = s.idle_count >= s.first.length + s.second.length and s.ramp == s.target
     return there
 
 
 @inner_kernel
 def _add(mean: RunningMean, windows: FloatArray, start: int, value: float) -> float:
-    """Add ``value`` to a running mean whose window begins at ``start``, and return the mean."""
+    """Add ``value`` to the running mean whose window begins at ``start``; return the mean."""
     index = mean.index
     mean.sum += value - windows[start + index]
     windows[start + index] = value
@@ -68,7 +68,7 @@ def _add(mean: RunningMean, windows: FloatArray, start: int, value: float) -> fl
 
 @inner_kernel
 def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
-    """Advance by one tick towards the target at ``rate`` [1/s] or less; return the new value."""
+    """Advance by one tick towards the target at up to ``rate`` [1/s]; return the new value."""
     remaining = s.target - s.ramp
     last = s.value
     if remaining == 0.0:
@@ -77,7 +77,7 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
             return last
         s.idle_count += 1
         if s.idle_count >= length:
-            reset(s, windows, s.target)  # clears the rounding errors of the running sums
+            reset(s, windows, s.target)  # Clear accumulated rounding errors.
             return s.target
     else:
         step_max = rate * s.dt
@@ -104,34 +104,34 @@ def _reset(setpoints: Records[SetpointState], windows: FloatArray, value: float)
 
 
 class Setpoint:
-    """Ramp of limited rate, smoothed by two running means in series.
+    """Rate-limited ramp, smoothed by two running means in series.
 
-    The first mean limits the acceleration to rate/window, the second the jerk to
-    rate/(window · window/2). The value never overshoots, for any sequence of targets. It reaches
-    the target 1.5 windows after the ramp does.
+    The first mean limits the acceleration to rate/window; the second limits the jerk to
+    rate/(window · window/2). The value never overshoots, whatever the sequence of targets. It
+    reaches the target 1.5 windows after the ramp.
     """
 
     def __init__(self, dt: float, window: float, state: SetpointState) -> None:
-        """Create a setpoint in ``state`` for a tick of ``dt`` and a first ``window`` [s]."""
+        """Create a setpoint in ``state`` with tick period ``dt`` and first ``window`` [s]."""
         self.state = state
         self.state.dt = dt
         self.state.first.length = max(round(window / dt), 1)
         self.state.second.length = max(round(0.5 * window / dt), 1)
         self.windows = np.zeros(self.state.first.length + self.state.second.length)
         self.reset(0.0)
-        self.step(0.0)  # compiles the kernel before the first tick
+        self.step(0.0)  # Compile the kernel before the first tick.
 
     def reset(self, value: float) -> None:
-        """Set the setpoint to ``value``, at rest."""
+        """Set the setpoint to ``value`` with zero speed."""
         _reset(self.state.array, self.windows, value)
 
     def step(self, rate: float) -> bool:
-        """Advance by one tick at ``rate`` [1/s] or less; return True at rest at the target."""
+        """Advance by one tick at up to ``rate`` [1/s]; return True if stopped at the target."""
         return _step(self.state.array, self.windows, rate)
 
     @property
     def target(self) -> float:
-        """Target; it may be set in any tick."""
+        """Target, which may be set on any tick."""
         return self.state.target
 
     @target.setter
@@ -140,10 +140,10 @@ class Setpoint:
 
     @property
     def value(self) -> float:
-        """Present value."""
+        """Current value."""
         return self.state.value
 
     @property
     def speed(self) -> float:
-        """Present speed [1/s]."""
+        """Current speed [1/s]."""
         return self.state.speed

@@ -1,41 +1,43 @@
-"""Slip monitor: the load on a held object, and the grip force that it needs.
+"""Estimate the load on a held object and the grip force that it requires.
 
-In each tick, with the names of `SlipLaw`, `SlipState` and `GraspState`:
+The following is computed on each tick, with the names from `SlipLaw`, `SlipState` and `GraspState`:
 
-    r         torque residual of the joints, low-pass filtered; r̄ is its mean
-    L         load on each tip: r̄ − offset = load_arm L + load_curvature L²           (`load_of`)
+    r         low-pass filtered torque residual of each joint; r̄ is the mean of both
+    L         load per tip: r̄ − offset = load_arm L + load_curvature L²               (`load_of`)
     load      min(4 max(|L| − friction/(2 load_arm), 0), |L| + friction/slope)
-    needed    max(load, shear of solid tips, object_load/2)/(tip_friction (1 − margin) − shear),
-              `needed_force` of the state
+    needed    max(load, solid-tip shear, object_load/2)/(tip_friction (1 − margin) − shear),
+              stored as `needed_force`
     force     min(max(commanded, needed), force_limit)
 
-**Offset.** Gear friction and the errors of modulus and torque constant cause a residual without a
-load. It is measured when holding begins. Later it follows r̄ slowly (_SETTLING_TIME). It follows the
-commanded torque at once while the joints stand still, because friction carries torque that is added
-to a joint that sticks. It stays within `friction` of its start, or a further _RELAXATION_SHARE of
-the tips' moment below it, because rubber relaxes.
+**Offset.** Gear friction and errors in modulus and torque constant cause a residual even without a
+load. This offset is measured when holding begins. It then follows r̄ slowly (_SETTLING_TIME). While
+the joints are at standstill, it follows the commanded torque immediately, because friction carries
+any torque that is added to a stuck joint. The offset stays within ±`friction` of its initial value.
+Below that, it may decrease by another _RELAXATION_SHARE of the tip moment, because rubber relaxes.
 
-**Load.** Friction hides a load of up to friction/load_arm, 2 N for each tip of the default hand.
-Half of it is ignored. From there on the load is increased by the hidden part. An increase of the
-grip force by more than _UNCONFIRMED_SHARE needs a confirmation: the object has turned, both joints
-have yielded at once, or |L| exceeds twice the friction.
+**Load.** Friction hides a load of up to friction/load_arm, which is 2 N per tip for the default
+hand. Loads below half of that are ignored; larger loads are increased by the hidden part.
+Increasing the grip force by more than _UNCONFIRMED_SHARE requires confirmation: the object has
+rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
 
-**Sudden events** increase the force at once by all that is allowed: torques that jump beyond their
-noise while both joints yield, shear that jumps in the frames of solid tips, and a rotation of the
-object beyond the shear deformation μ (d1 + d2)/2W of the tips. A sliding tip shows no more load
-than its friction, so the size of a sudden load is unknown. For a pull the two torques jump alike,
-for a twist in opposite directions; a sideways push looks like a twist.
+**Sudden events** increase the force immediately. A torque jump beyond the noise while both joints
+yield, or a shear jump in the frames of solid tips, increases it to its limit. An object rotation
+beyond the tips' shear deformation μ (d1 + d2)/2W increases it by _ROTATION_INCREASE. A sliding tip
+cannot show a load above its friction, so the size of a sudden load is unknown. In a pull, the two
+torques jump in the same direction; in a twist, they jump in opposite directions. A sideways push
+looks like a twist.
 
-An increase stays for _HOLD_TIME and then decreases by increase_max in _DECAY_TIME.
+A force increase is held for _HOLD_TIME and then decreases by increase_max per _DECAY_TIME.
 
 Limits of the method:
 
-- A pressure grid measures normal pressure only. An object that slides along parallel faces changes
-  no d, no θ and no joint angle, so ``control.tip_friction`` must not exceed the real friction.
-- Loads that grow slowly stay hidden in the joints' friction; docs/safety.md has the figures.
-- A grip weaker than joint friction allows to judge (7 N for the default hand) is not guarded well.
-- A load towards the palm wedges the object between the tips. It shows less and slips later.
-- While the force changes or the object turns, currents also move the joints: the last load stays.
+- A pressure grid measures only normal pressure. Sliding along parallel faces does not change d, θ
+  or the joint angles, so ``control.tip_friction`` must not exceed the actual friction.
+- Slowly growing loads stay hidden in joint friction; docs/safety.md gives the values.
+- Grips below 7 N (default hand) are poorly protected, because joint friction hides their loads.
+- A load towards the palm wedges the object between the tips. It is less visible and slips later.
+- While the force changes or the object rotates, the motors also move the joints, so the load
+  estimate is not updated.
 """
 
 from __future__ import annotations
@@ -49,68 +51,68 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
-_AVERAGE_TIME = 0.1  # s; a velocity flickers by one unit of 0.024 rad/s
-_SETTLING_TIME = 1.0  # s in which the residual of a new hold settles
-_HOLD_TIME = 1.0  # s for which an increase outlasts its reason
-_DECAY_TIME = 2.0  # s in which it then decreases by `grip_raise_max`, and rotations are forgotten
-_SUDDEN_SHARE = 0.7  # part of the friction force with its margin from which a sudden load counts
-_ROTATION_INCREASE = 0.5  # relative increase after a rotation of the object
-_ROTATION_MARGIN = 1.5  # times the rotation by shear deformation
-_GATE = 4.0  # standard deviations of torques and angle beyond which a jump is no noise
-_JUMP_MIN = 0.01  # N·m, least jump
-_SHEAR_JUMP = 0.6  # N, least jump of solid tips' shear: six standard deviations
-_YIELD_SPEED = 0.01  # rad/s, half a unit of velocity
-_STANDSTILL = 1e-3  # rad from a joint's average over _SETTLING_TIME if it stands: below a count
-_AGREEMENT = 0.25  # part of the mean that each joint and each tip must show
-_FRICTION_MAX = 0.3  # N·m; a larger torque in the free approach was no friction
-_UNCONFIRMED_SHARE = 0.3  # of the commanded force
-_RELAXATION_SHARE = 0.2  # part of a tip's force that rubber may lose during a hold
-_ARM_MIN = 0.2  # of the object's width, lower bound of the load's lever arm
-_SPARE_MIN = 0.3  # of the friction, lower bound of what rolling leaves of it
+_AVERAGE_TIME = 0.1  # s; velocities fluctuate by one unit of 0.024 rad/s
+_SETTLING_TIME = 1.0  # s, settling time of the residual in a new hold
+_HOLD_TIME = 1.0  # s, duration of an increase after its cause has ended
+_DECAY_TIME = 2.0  # s for a decrease by `grip_raise_max`; decay time of rotations
+_SUDDEN_SHARE = 0.7  # fraction of the usable friction force above which a sudden load counts
+_ROTATION_INCREASE = 0.5  # relative increase after an object rotation
+_ROTATION_MARGIN = 1.5  # multiple of the rotation due to shear deformation
+_GATE = 4.0  # standard deviations beyond which a jump is not noise
+_JUMP_MIN = 0.01  # N·m, minimum torque jump
+_SHEAR_JUMP = 0.6  # N, minimum shear jump of solid tips: six standard deviations
+_YIELD_SPEED = 0.01  # rad/s, half a velocity unit
+_STANDSTILL = 1e-3  # rad from a stationary joint's average over _SETTLING_TIME, below one count
+_AGREEMENT = 0.25  # fraction of the mean that each joint and each tip must show
+_FRICTION_MAX = 0.3  # N·m; a larger torque during free approach is not friction
+_UNCONFIRMED_SHARE = 0.3  # fraction of the commanded force
+_RELAXATION_SHARE = 0.2  # fraction of the tip force that rubber may lose during a hold
+_ARM_MIN = 0.2  # fraction of the object width, minimum lever arm of the load
+_SPARE_MIN = 0.3  # minimum fraction of the friction that remains after rolling
 
 
 class SlipLaw(Record):
     """Constants of a slip monitor."""
 
     dt: float  # [s]
-    width: float  # of the object [m]
+    width: float  # object width [m]
     force_max: float  # [N]
-    friction: float  # Coulomb, tip on object
-    margin: float  # part of it that stays unused
+    friction: float  # Coulomb coefficient between tip and object
+    margin: float  # fraction of friction that stays unused
     joint_friction: float  # [N·m]
-    load_friction: float  # part of the tip's moment that gears hold until the joint opens
+    load_friction: float  # fraction of the tip moment that gears hold until the joint opens
     object_load: float  # [N]
-    has_shear: bool  # the frames show shear
+    has_shear: bool  # frames measure shear
     increase_max: float  # [N]
-    increase_ratio: float  # of the commanded force
+    increase_ratio: float  # fraction of the commanded force
 
 
 class SlipState(Record):
     """Load, friction and force increase of one held object."""
 
     law: SlipLaw
-    friction: float  # of a joint, with the part by this tick's force [N·m]
-    residual: Pair  # of the joints' torques, averaged [N·m]
-    variance: Pair  # of the mean residual and of half the difference [N²·m²]
-    speed: Pair  # of the joints, averaged [rad/s]
+    friction: float  # joint friction, including the force-dependent part [N·m]
+    residual: Pair  # average joint torque residuals [N·m]
+    variance: Pair  # variance of the mean residual and of half the difference [N²·m²]
+    speed: Pair  # average joint speeds [rad/s]
     q: Pair  # joint angles, averaged over _SETTLING_TIME [rad]
-    torque: float  # mean torque of both joints in the last tick [N·m]
-    is_watched: bool  # the residual at the begin of holding is known
+    torque: float  # mean torque of both joints on the previous tick [N·m]
+    is_watched: bool  # the initial residual of the hold is known
     offset: float  # residual without a load [N·m]
-    start_offset: float  # offset at the begin of holding beyond friction [N·m]
-    holding_time: float  # time since then, up to _SETTLING_TIME [s]
-    load: float  # on each tip, with the hidden part [N]
-    assumed_load: float  # the largest of this, the shear of solid tips and the declared load [N]
+    start_offset: float  # part of the initial offset that exceeds friction [N·m]
+    holding_time: float  # time since holding began, up to _SETTLING_TIME [s]
+    load: float  # load per tip, including the hidden part [N]
+    assumed_load: float  # maximum of `load`, solid-tip shear and declared load [N]
     is_confirmed: bool  # the load may increase the force by more than _UNCONFIRMED_SHARE
-    pull: float  # load in the frames of solid tips, averaged [N]
-    twist: float  # likewise of a twist [N]
-    rotation_seen: Pair  # `unexplained_rotation` up to this tick [rad]
-    rotation: Pair  # unexplained rotation of the last _DECAY_TIME, of each tip [rad]
-    has_turned: bool  # the object has turned in the grip in this tick
-    reflex_triggered: bool  # a sudden event in this tick
-    needed_force: float  # force, kept for _HOLD_TIME [N]
+    pull: float  # average pull measured by solid tips [N]
+    twist: float  # average twist measured by solid tips [N]
+    rotation_seen: Pair  # `unexplained_rotation` at the previous update [rad]
+    rotation: Pair  # unexplained rotation per tip over the last _DECAY_TIME [rad]
+    has_turned: bool  # the object has rotated in the grip on this tick
+    reflex_triggered: bool  # sudden event on this tick
+    needed_force: float  # required force, held for _HOLD_TIME [N]
     force_limit: float  # [N]
-    idle_time: float  # time since the force was needed [s]
+    idle_time: float  # time since the force was last required [s]
 
 
 def set_law(law: SlipLaw, settings: Settings) -> None:
@@ -129,7 +131,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 
 @inner_kernel
 def reset(s: SlipState) -> None:
-    """Reset everything but the law and the torque: there is no object, or a new one."""
+    """Reset everything except the law and the torque when the object is released or replaced."""
     s.is_watched = s.is_confirmed = s.has_turned = s.reflex_triggered = False
     s.friction = s.offset = s.start_offset = s.holding_time = 0.0
     s.load = s.assumed_load = s.pull = s.twist = 0.0
@@ -140,7 +142,7 @@ def reset(s: SlipState) -> None:
 
 @inner_kernel
 def begin(s: SlipState, grasp: GraspState) -> None:
-    """Begin to hold: the present residual is no load."""
+    """Begin holding and take the current residual as the no-load offset."""
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
         return
@@ -161,7 +163,7 @@ def mean(pair: Pair) -> float:
 
 @inner_kernel
 def clip(value: float, bound: float) -> float:
-    """Return ``value`` within ± ``bound``."""
+    """Clip ``value`` to ±``bound``."""
     return min(max(value, -bound), bound)
 
 
@@ -175,18 +177,18 @@ def update(
     dq: FloatPair,
     torques: Pair,
 ) -> float:
-    """Return the grip force [N]: ``commanded``, or more if the load needs it.
+    """Return the grip force [N]: ``commanded``, or more if the load requires it.
 
-    ``holding`` is True while only loads move the joints. ``closing``, −1 to 1, is the part of the
-    joints' friction that the torques include, ``dq`` the joint velocities [rad/s] and ``torques``
-    those of the last tick [N·m].
+    ``holding`` is True while only loads move the joints. ``closing`` (−1 to 1) is the fraction of
+    joint friction included in the torques, ``dq`` are the joint velocities [rad/s], and ``torques``
+    are the joint torques of the previous tick [N·m].
     """
     law = s.law
     moment = mean(grasp.normal) * mean(grasp.moment_arm)
     free_torque = max(mean(grasp.free_torque), law.joint_friction)
     s.friction = min(free_torque, _FRICTION_MAX) + law.load_friction * moment
     is_held = holding and s.is_watched and grasp.load_arm > 0.0
-    # Rolling takes a part of the friction that grows with the grip force.
+    # Rolling uses part of the friction that grows with the grip force.
     spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
     usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
     sudden_min = _SUDDEN_SHARE * max(spare_friction, 0.0) * mean(grasp.normal)
@@ -199,10 +201,10 @@ def update(
         s.has_turned = _has_turned(s, grasp)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.torque = mean(torques)
-    # The torques cannot judge a grip that bears less than the joints' friction hides.
+    # Ignore the torques if joint friction hides more load than the grip can bear.
     if law.friction * commanded * grasp.load_arm <= s.friction:
         s.load = 0.0
-    if law.has_shear:  # a load beyond the shear is an error of the force
+    if law.has_shear:  # A load above the measured shear is a force error.
         s.load = min(s.load, pull + _SHEAR_JUMP)
     if grasp.sensor_fault:
         s.load = pull = s.needed_force = 0.0
@@ -223,7 +225,7 @@ def update(
 
 @inner_kernel
 def _update_needed_force(s: SlipState, needed_force: float, commanded: float) -> None:
-    """Keep an increase for _HOLD_TIME; then let it decrease."""
+    """Hold a force increase for _HOLD_TIME, then let it decay."""
     if needed_force >= s.needed_force:
         s.needed_force = min(needed_force, s.force_limit)
         s.idle_time = 0.0
@@ -237,9 +239,9 @@ def _update_needed_force(s: SlipState, needed_force: float, commanded: float) ->
 
 @inner_kernel
 def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
-    """Return the largest force [N] to which a grip may be increased.
+    """Return the maximum force [N] to which the grip may be increased.
 
-    A ``declared`` load needs no confirmation.
+    An increase up to the force for the ``declared`` load requires no confirmation.
     """
     law = s.law
     share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
@@ -251,16 +253,16 @@ def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
 def _detect_torque_jump(
     s: SlipState, grasp: GraspState, closing: float, dq: FloatPair, is_held: bool, sudden_min: float
 ) -> bool:
-    """Average the residuals; return True if both jumped while both joints yielded.
+    """Average the residuals; return True if both residuals jumped while both joints yielded.
 
-    A wrong current or frame affects one joint alone, or moves no joint.
+    A wrong current or frame affects only one joint or does not move the joints.
     """
     known_torque = closing * (s.friction if closing < 0.0 else s.law.joint_friction)
     deviation1 = grasp.torque_residual[0] - known_torque - s.residual[0]
     deviation2 = grasp.torque_residual[1] - known_torque - s.residual[1]
     jump_min = _JUMP_MIN + s.friction * max(1.0 - s.holding_time / _SETTLING_TIME, 0.0)
     sudden = False
-    for k in range(2):  # a pull, and a twist
+    for k in range(2):  # pull, then twist
         sense = 1.0 - 2.0 * k
         deviation = 0.5 * (deviation1 + sense * deviation2)
         last = 0.5 * (s.residual[0] + sense * s.residual[1])
@@ -292,7 +294,7 @@ def _detect_torque_jump(
 def _detect_shear_jump(
     s: SlipState, pull: float, twist: float, is_held: bool, sudden_min: float
 ) -> bool:
-    """Average the load [N] in the frames of solid tips; return True if it jumped."""
+    """Average the load [N] measured by solid tips; return True if it jumped."""
     pull_jump = pull - s.pull
     twist_jump = twist - s.twist
     s.pull += pull_jump * s.law.dt / _AVERAGE_TIME
@@ -304,12 +306,12 @@ def _detect_shear_jump(
 
 @inner_kernel
 def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> None:
-    """Estimate the load from the part of the residual that friction does not explain."""
+    """Estimate the load from the residual that friction cannot explain."""
     law = s.law
     smaller = 0.0
     if s.residual[0] * s.residual[1] > 0.0:
         smaller = min(abs(s.residual[0]), abs(s.residual[1]))
-    residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # a load shows in both joints
+    residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load affects both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     is_standing = True
     for k in range(2):
@@ -323,7 +325,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
         s.offset += deviation * law.dt / s.holding_time
     lowest = s.start_offset - s.friction - relaxation
     s.offset = min(max(s.offset, lowest), s.start_offset + s.friction)
-    # Friction that decreases or changes its direction is no load.
+    # A decrease or reversal of friction is not a load.
     deviation = residual - s.offset
     increase = residual - s.start_offset
     deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
@@ -338,9 +340,9 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
 
 @inner_kernel
 def _has_turned(s: SlipState, grasp: GraspState) -> bool:
-    """Return True if the object has turned by more than the tips' shear deformation.
+    """Return True if the object has rotated by more than the tips' shear deformation.
 
-    Both tips must show the rotation, because a faulty sensor shows one of its own.
+    Both tips must show the rotation, because a faulty sensor can indicate one by itself.
     """
     for k in range(2):
         s.rotation[k] += grasp.unexplained_rotation[k] - s.rotation_seen[k]

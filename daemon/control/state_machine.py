@@ -1,38 +1,38 @@
-"""State machine of the hand: it takes commands and sets one goal for the servos in each tick.
+"""State machine of the hand: handles commands and sets one servo goal on each tick.
 
 State        Mode       Action                           Event → next state
 -----------  ---------  -------------------------------  ------------------------------------------
 Off          DISARMED   torque is off                    `arm` → Armed
              FAULT      torque is off                    `clear` → Off (DISARMED)
-Armed        ARMED      joints hold where they are       `move` → Travelling (MOVING);
+Armed        ARMED      joints hold their positions      `move` → Travelling (MOVING);
                                                          `grasp`, `hold` → Approaching
-Travelling   MOVING     joints go to commanded angles    arrived, or timed out → Armed;
+Travelling   MOVING     joints move to commanded angles  arrived, or timed out → Armed;
                                                          `grasp`, `hold` → Approaching
-             RELEASING  joints go to the open angles     arrived, or timed out → Armed
+             RELEASING  joints move to the open angles   arrived, or timed out → Armed
 Approaching  GRASPING   fingers close; the first one to  all touch → Pressing; at the joint limits
                         touch waits for the other        for _ARRIVAL_TIMEOUT → Armed
 Pressing     GRASPING   the force increases              force reached → Settled, then Turning if
                                                          an angle was commanded
 Settled      HOLDING    force and angle are constant:    `grasp`, `hold`, `limit_force` with
-                        only loads move the joints       another value, contact lost and back
+                        only loads move the joints       another value, contact regained
                                                          → Changing
 Changing     HOLDING    force or angle changes           force and angle reached → Settled
-Turning      ROTATING   the object turns                 angle reached → Settled
+Turning      ROTATING   the object rotates               angle reached → Settled
 
-Transitions that several states have in common:
+Several states share these transitions:
 
-- all: a fault → Off (FAULT); `stop`, `disarm` → Off (DISARMED), but a fault stays until `clear`
+- all: a fault → Off (FAULT); `stop`, `disarm` → Off (DISARMED), but a fault persists until `clear`
 - with torque: `release` → Travelling (RELEASING)
 - Settled, Changing, Turning: `rotate` → Turning
-- Approaching, Pressing, Settled, Changing, Turning: tips touch each other for _EMPTY_TIME →
+- Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for _EMPTY_TIME →
   Travelling (RELEASING)
-- Pressing, Settled, Changing, Turning: a contact is missing for _CONTACT_LOSS_TIME → Armed.
-  Until then the joints hold their positions (`ContactLoss`).
+- Pressing, Settled, Changing, Turning: a contact is missing for _CONTACT_LOSS_TIME → Armed. Until
+  then, the joints hold their positions (`ContactLoss`).
 
-Each transition creates a new object of one of the classes below. Timers and flags are attributes of
-the state that uses them, so they end with it. `control.modes` lists the commands of each mode,
-`loop.requests` checks them, `control.fingers` drives the joints, `control.grip` computes the grip
-law, and `safety.safety` limits the goals.
+Each transition creates a new instance of one of the classes below. Timers and flags are attributes
+of the state that uses them and are discarded with it. `control.modes` lists the commands for each
+mode, `loop.requests` checks them, `control.fingers` drives the joints, `control.grip` computes the
+joint torques of a grip, and `safety.safety` limits the goals.
 """
 
 from __future__ import annotations
@@ -47,47 +47,47 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
-# rad between a joint and its goal, below which it has arrived: five times the position error due to
-# the default joint friction at the default servos.stiffness.
+# rad, maximum distance between a joint and its goal on arrival. It is five times the position error
+# due to the default joint friction at the default servos.stiffness.
 _ARRIVAL_DISTANCE = 0.03
-# s that a joint may take to arrive after its setpoint has; after that, friction holds it.
+# s allowed for a joint to arrive after its setpoint; friction then holds the joint.
 _ARRIVAL_TIMEOUT = 1.0
-# Fraction of the force target: the force scatters by 0.3 to 0.6 % (1 σ) with simulated sensors.
+# Fraction of the force target. The force noise is 0.3 to 0.6 % (1 σ) with simulated sensors.
 _FORCE_TOLERANCE = 0.03
-# Fraction of the force target: additional force above it that gear friction may hold, at most.
-# It is 6 % in the small hand.
+# Fraction of the force target: maximum excess force that gear friction may hold. It is 6 % in the
+# small hand.
 _HELD_FORCE_MAX = 0.12
-# Fraction of the force target: the error that joint friction may cause. 0.05 N·m at the default
-# finger are a tenth of 6 N. The integral term removes this error within seconds.
+# Fraction of the force target: error that joint friction may cause. For the default finger, 0.05
+# N·m corresponds to a tenth of 6 N. The integral term removes this error within seconds.
 _FRICTION_TOLERANCE = 0.1
-# s after which such a force counts as reached: ten times the settling time without friction.
+# s after which a force with this error counts as reached: ten times the frictionless settling time.
 _STUCK_TIME = 2.0
-# rad off the angle's target: the angle scatters by 0.5 to 2 mrad (1 σ) with simulated sensors.
+# rad from the target angle. The angle noise is 0.5 to 2 mrad (1 σ) with simulated sensors.
 _ANGLE_TOLERANCE = math.radians(0.5)
-# s for which force and angle must stay at their targets: five frames at 25 Hz, and twice the
+# s for which force and angle must stay at their targets. It is five frames at 25 Hz and twice the
 # default smooth_time.
 _SETTLING_TIME = 0.2
-# Fraction of the force target. A streamed target may never rest, so a grip also settles when it
-# follows its setpoint within this distance of the target.
+# Fraction of the force target. A streamed target may change continuously, so a grip also settles
+# when it follows a setpoint that is within this distance of the target.
 _STREAM_TOLERANCE = 0.25
-# Smaller changes of a streamed setpoint or of the force increase are ignored as noise: a fraction
-# of the force, and rad (1 σ of the angle).
+# Smaller changes in a streamed setpoint or in the force increase are ignored as noise: fraction of
+# the force, and rad (1 σ of the angle).
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
-# s without a contact before it counts as lost: two frames at 25 Hz could show it again.
+# s without contact until it counts as lost. Two frames at 25 Hz could show it again in this time.
 _CONTACT_LOSS_TIME = 0.1
-# s for which the tips must seem to touch each other: more than one frame at 25 Hz.
+# s for which the tips must appear to touch each other, more than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 
 
 class ControlState:
-    """Base of the states."""
+    """Base class of the states."""
 
     mode: Mode
 
 
 @dataclass
 class Off(ControlState):
-    """DISARMED, or FAULT until the fault is cleared."""
+    """Torque is off: DISARMED, or FAULT until the fault is cleared."""
 
     mode: Mode = Mode.DISARMED
 
@@ -97,13 +97,13 @@ class Armed(ControlState):
     """The joints hold their positions."""
 
     mode = Mode.ARMED
-    current: float  # limit [A]
-    following_count: int = 0  # remaining ticks in which the setpoints follow the joints
+    current: float  # current limit [A]
+    following_count: int = 0  # remaining ticks during which setpoints follow the joints
 
 
 @dataclass
 class Travelling(ControlState):
-    """The joints go to the targets of their setpoints: MOVING or RELEASING."""
+    """The joints move to their setpoint targets: MOVING or RELEASING."""
 
     mode: Mode
     arrived_for: float = 0.0  # time since the setpoints arrived [s]
@@ -111,7 +111,7 @@ class Travelling(ControlState):
 
 @dataclass
 class GraspCommand:
-    """Commanded values of a grasp, stored until it has settled."""
+    """Values commanded for a grasp, stored until it has settled."""
 
     force: float  # [N]
     is_streamed: bool  # the force is a streamed setpoint
@@ -126,23 +126,23 @@ class Approaching(ControlState):
     command: GraspCommand
     touching: set[int] = field(default_factory=set)  # fingers
     arrived_for: float = 0.0  # time since the setpoints reached the joint limits [s]
-    empty_for: float = 0.0  # time for which the tips have seemed to touch each other [s]
+    empty_for: float = 0.0  # duration of apparent tip-to-tip contact [s]
 
 
 @dataclass
 class ContactLoss:
     """A contact is missing: the joints hold their positions."""
 
-    current: float  # limit [A]
+    current: float  # current limit [A]
     lost_for: float = 0.0  # [s]
 
 
 @dataclass
 class GripHistory:
-    """Data that the states of one grip share, from the first contact of all fingers to its end."""
+    """Data shared by the states of one grip, from first contact of all fingers to its end."""
 
     loss: ContactLoss | None = None
-    empty_for: float = 0.0  # time for which the tips have seemed to touch each other [s]
+    empty_for: float = 0.0  # duration of apparent tip-to-tip contact [s]
     settled_force: float = math.nan  # commanded force when the grip last settled [N]
     settled_angle: float = math.nan  # commanded angle when the grip last settled [rad]
     increase_reported: bool = False
@@ -151,11 +151,11 @@ class GripHistory:
 
 @dataclass
 class Gripping(ControlState):
-    """Base of the states in which the grip law computes the joint torques."""
+    """Base class of the states in which the grip controller computes joint torques."""
 
     history: GripHistory
-    reached_for: float = 0.0  # time for which force and angle have been at their targets [s]
-    near_for: float = 0.0  # time for which the force error has been within _FRICTION_TOLERANCE [s]
+    reached_for: float = 0.0  # time that force and angle have been at their targets [s]
+    near_for: float = 0.0  # time that the force error has been within _FRICTION_TOLERANCE [s]
 
 
 @dataclass(kw_only=True)
@@ -179,16 +179,16 @@ class Changing(Gripping):
 
 
 class Turning(Gripping):
-    """The object turns."""
+    """The object rotates."""
 
     mode = Mode.ROTATING
 
 
 class Control:
-    """State machine of the hand and its commands. Only the loop's thread calls it."""
+    """State machine of the hand and its commands. Only the loop thread may call it."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
-        """Create the machine; ``state`` and ``grasp`` are read in each tick and never written."""
+        """Create the machine; ``state`` and ``grasp`` are read on each tick but never written."""
         self._settings = settings
         self.fingers = Fingers(settings, state, grasp)
         self.grip = Grip(settings, self.fingers.indices, grasp)
@@ -202,7 +202,7 @@ class Control:
 
     @property
     def torque(self) -> bool:
-        """True if the torque of the servos is to be on."""
+        """True if servo torque must be on."""
         return not isinstance(self.state, Off)
 
     def _enter(self, state: ControlState) -> None:
@@ -222,13 +222,17 @@ class Control:
     # Commands
 
     def fail(self, reason: str, name: str) -> None:
-        """Latch a fault: torque off until ``clear``. ``name`` is its row of `safety.limits`."""
+        """Latch a fault: torque stays off until ``clear``.
+
+        ``name`` is its row in `safety.limits`.
+        """
         self._enter(Off(Mode.FAULT))
         self.events.append(("error", name, reason))
 
     def arm(self) -> None:
         """Switch torque on and hold the joints at their positions."""
-        # Torque is switched on at the end of the first tick. Until the second, the joints may move.
+        # Torque is switched on at the end of the first tick. The joints may move until the second
+        # tick.
         self._enter(Armed(self._settings.safety.current_move, following_count=2))
 
     def disarm(self) -> None:
@@ -241,7 +245,7 @@ class Control:
             self._enter(Off())
 
     def move(self, **angles: float) -> None:
-        """Move the joint ``left``, ``right`` or both to these angles [rad]."""
+        """Move the ``left`` and/or ``right`` joint to the given angle [rad]."""
         if self.mode is not Mode.MOVING:
             self.fingers.hold_here()
         for name, q in angles.items():
@@ -256,10 +260,10 @@ class Control:
         self._enter(Travelling(Mode.RELEASING))
 
     def grasp(self, force: float, is_streamed: bool = False) -> None:
-        """Close until all fingers touch, then build up a mean tip force of ``force`` [N].
+        """Close until all fingers touch, then increase the mean tip force to ``force`` [N].
 
-        A hand that already grips goes to that force and stays in its mode. Set ``is_streamed`` if
-        the force may change again before it is reached.
+        If the hand is already gripping, only the force changes and the mode stays the same. Set
+        ``is_streamed`` if the force may change again before it is reached.
         """
         state = self.state
         if isinstance(state, Gripping):
@@ -276,7 +280,7 @@ class Control:
             self._enter(Approaching(GraspCommand(force, is_streamed)))
 
     def rotate(self, angle: float) -> None:
-        """Turn the object to ``angle`` [rad]; during a grasp, wait until the grip has settled."""
+        """Rotate the object to ``angle`` [rad]; during a grasp, wait until the grip has settled."""
         state = self.state
         if isinstance(state, Approaching | Pressing):
             state.command.angle = angle
@@ -286,15 +290,15 @@ class Control:
             self._enter(Turning(state.history))
 
     def hold(self, force: float | None = None, angle: float | None = None) -> float | None:
-        """Follow streamed setpoints of the grip ``force`` [N] and the object's ``angle`` [rad].
+        """Follow streamed setpoints for the grip ``force`` [N] and the object ``angle`` [rad].
 
-        A hand that does not grip yet grasps first, with ``force``. The setpoints move smoothly, the
-        angle at `control.rotate_speed` and the force within `control.force_time`.
+        If the hand is not gripping yet, it first grasps with ``force``. The setpoints move
+        smoothly: the angle at `control.rotate_speed`, the force within `control.force_time`.
 
         Returns
         -------
         float | None
-            Target angle, limited to the range of this grip; None until the grip has one.
+            Target angle, limited to the range of this grip; None if no target has been set yet.
         """
         repeated = isinstance(self.state, Gripping) and force == self.grip.commanded
         if force is not None and not repeated:
@@ -313,13 +317,13 @@ class Control:
         return None
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the grip force to ``force_max`` [N], and reach it within ``duration`` [s]."""
+        """Limit the grip force to ``force_max`` [N] and reach it within ``duration`` [s]."""
         if isinstance(self.state, Gripping):
             self.grip.limit_force(force_max, duration)
             self._change(self.state)
 
     def set(self, compliance: float) -> None:
-        """Set the rotational compliance of the grip [rad/(N·m)]."""
+        """Set the grip's rotational compliance [rad/(N·m)]."""
         self.grip.set_joint_stiffness(1.0 / compliance)
 
     def _change(self, state: Gripping) -> None:
@@ -334,12 +338,12 @@ class Control:
     # One tick
 
     def step(self, dt: float, goal: Goal) -> None:
-        """Set ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
+        """Set ``goal`` for this tick; ``goal.valid`` is False while torque must be off."""
         goal.valid = self.torque
         goal.force = goal.angle = math.nan
         if not goal.valid:
             return
-        current = self._current()  # of the state before any transition in this tick
+        current = self._current()  # for the state before any transition on this tick
         if isinstance(self.state, Armed) and self.state.following_count:
             self.state.following_count -= 1
             self.fingers.hold_here()
@@ -347,7 +351,7 @@ class Control:
             self._travel(self.state, dt)
         elif isinstance(self.state, Approaching):
             self._approach(self.state, dt)
-        if isinstance(self.state, Gripping):  # also if it began in this tick
+        if isinstance(self.state, Gripping):  # also if the grip began on this tick
             self._step_grip(self.state, dt, goal)
         else:
             self.fingers.follow_setpoints(goal, current)
@@ -359,7 +363,7 @@ class Control:
     def hold_goal(self, goal: Goal) -> None:
         """Hold the goals while frames are late; called instead of :meth:`step`.
 
-        The goals of a grip are torques: the joints stay damped, and a turn comes to rest.
+        The goals of a grip are torques: the joints stay damped, and any rotation comes to rest.
         """
         if goal.valid and isinstance(self.state, Gripping) and self.state.history.loss is None:
             self.fingers.apply_torques(goal, self.grip.hold_goal(self.fingers.reading))
@@ -371,11 +375,11 @@ class Control:
             return state.current
         if not isinstance(state, Approaching):
             return self._settings.safety.current_move
-        # A tip that reaches the object before the sensor detects contact must not exceed the
-        # commanded force.
+        # The tip must not exceed the commanded force if it reaches the object before the sensor
+        # detects contact.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
-        # A joint that does not move under this torque, without contact, has more friction than in
-        # the settings; `free_torque` is the measured torque.
+        # If this torque does not move a joint in free motion, its friction exceeds the setting.
+        # `free_torque` is the measured value.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 
@@ -407,10 +411,10 @@ class Control:
                 self._enter_armed()
 
     def _empty_for(self, before: float, dt: float) -> float:
-        """Return how long [s] the tips have seemed to touch each other; release after _EMPTY_TIME.
+        """Return the duration [s] of apparent tip-to-tip contact; release after _EMPTY_TIME.
 
-        Tips that press against each other would roll off to one side. Both sensors then measure the
-        same contact, so the estimated object width is 0 within its error.
+        Tips that press against each other would roll off to one side. Both sensors measure the same
+        contact in this case, so the estimated object width is 0 within its error.
         """
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:
@@ -429,7 +433,7 @@ class Control:
         if not fingers.in_contact:
             self._handle_contact_loss(history, dt, goal)
             return
-        if history.loss is not None:  # while the force builds up again, joint motion is not a load
+        if history.loss is not None:  # Joint motion is not a load while the force increases again.
             history.loss, state.reached_for = None, 0.0
             if isinstance(state, Settled):
                 self._enter(state := Changing(history))
@@ -444,7 +448,7 @@ class Control:
         """Hold the joints while a contact is missing; end the grip after _CONTACT_LOSS_TIME."""
         if history.loss is None:
             self.fingers.hold_here()
-            # A sensor that fails must not make the joints press harder than before.
+            # A sensor failure must not increase the joints' pressing force.
             pressed = max(goal.current[index] for index in self.fingers.indices)
             history.loss = ContactLoss(min(pressed, self._settings.safety.current_move))
         loss = history.loss
@@ -455,7 +459,7 @@ class Control:
             self._enter(Armed(loss.current))
 
     def _check_settled(self, state: Gripping, dt: float) -> None:
-        """Enter Settled once force and angle have stayed at their targets for _SETTLING_TIME."""
+        """Enter Settled when force and angle have stayed at their targets for _SETTLING_TIME."""
         grip, pose, history = self.grip, self.fingers.pose, state.history
         is_reached = True
         if not isinstance(state, Pressing):
@@ -482,9 +486,9 @@ class Control:
                 self.rotate(angle)
 
     def _is_force_reached(self, is_streamed: bool) -> bool:
-        """Return True if the mean tip force is at its target, or at a streamed setpoint near it.
+        """Return True if the mean tip force has reached its target or a streamed setpoint near it.
 
-        The mean is used because friction of the object on its support may unbalance the tip forces.
+        The mean is used because friction between object and support may unbalance the tip forces.
         """
         grip = self.grip
         wanted = grip.force.value if is_streamed else grip.target
@@ -495,7 +499,7 @@ class Control:
         return is_near and is_there and not grip.is_dithering
 
     def _end_turn_before_slip(self, history: GripHistory) -> None:
-        """End a turn at the present angle if the tips would slip beyond it."""
+        """End a rotation at the current angle if the tips would slip beyond it."""
         law, angle = self._settings.control, self.fingers.pose.angle
         shear_max = law.tip_friction * (1.0 - law.slip_margin)
         if self.fingers.grasp.shear * self.grip.stopping_ratio > shear_max:
@@ -506,7 +510,7 @@ class Control:
             self.grip.steer(angle, angle)
 
     def _report_increase(self, history: GripHistory) -> None:
-        """Report slip, and the begin of each force increase against it."""
+        """Report slip and the start of each force increase that counteracts it."""
         grip = self.grip
         if grip.has_slipped:
             self._warn("slip", "the object turns in the grip")

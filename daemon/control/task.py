@@ -1,6 +1,6 @@
-"""Tasks: scripts of commands that the daemon runs after start.
+"""Run tasks: command scripts that the daemon executes after startup.
 
-They use the same commands as clients, with the same checks.
+Tasks use the same commands as clients, with the same checks.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
 
-Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, pause after it [s]
+Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, subsequent pause [s]
 
-_STEP_TIMEOUT = 10.0  # s, timeout of a step
-_RESTART_PAUSE = 2.0  # s before a restart, so that a user can read the message
+_STEP_TIMEOUT = 10.0  # s
+_RESTART_PAUSE = 2.0  # s before a restart, to give the user time to read the message
 
 
 class TaskEnded(SoftfingerError):
-    """The task can't continue. The message gives the reason."""
+    """Raised when the task can't continue. The message says why."""
 
 
 class Task:
-    """Issue the commands of a script, each once the hand has reached the mode of the last one.
+    """Issue a script's commands, each after the hand has reached the previous command's mode.
 
-    With ``restarts`` the script restarts after a fault. Only simulated hands do so, because real
-    hardware must not start moving by itself after a fault.
+    If ``restarts`` is set, the script restarts after a fault. This applies only to simulated hands,
+    because real hardware must not start moving by itself after a fault.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._script = partial(demo, settings.task.force, settings.task.angle)
         self.restarts = settings.simulated
         self._steps = self._script()
-        self._end_mode: str = Mode.DISARMED  # mode that ends the present step
+        self._end_mode: str = Mode.DISARMED  # mode that ends the current step
         self._pause = 0.5
         self._remaining = self._pause
         self._waited = 0.0
@@ -47,12 +47,12 @@ class Task:
         return None if settings.task.name == "none" else Task(settings)
 
     def next(self, state: State, dt: float) -> dict[str, Any] | None:
-        """Return the command that is due in this tick, or None.
+        """Return the command that is due on this tick, or None.
 
         Raises
         ------
         TaskEnded
-            After a fault, after the hand was disarmed, or when a step times out.
+            If the hand is in a fault, has been disarmed, or a step times out.
         """
         if state.mode != self._end_mode:
             if state.mode in (Mode.FAULT, Mode.DISARMED):
@@ -70,7 +70,7 @@ class Task:
         return request
 
     def restart(self, state: State, reason: str) -> str:
-        """Pause, leave the present mode and restart the script; return the event's text."""
+        """Pause, leave the current mode and restart the script; return the event text."""
         way_out, says = ("clear", "clears it") if state.mode == Mode.FAULT else ("stop", "stops it")
         self._steps = chain([({"command": way_out}, Mode.DISARMED, 0.5)], self._script())
         self._end_mode = state.mode
@@ -80,7 +80,7 @@ class Task:
 
 
 def demo(force: float, angle: float) -> Iterator[Step]:
-    """Grasp with ``force`` [N], turn by ``angle`` [rad] to both sides, release, and repeat."""
+    """Grasp with ``force`` [N], rotate by ±``angle`` [rad], release, and repeat."""
     yield {"command": "arm"}, Mode.ARMED, 0.5
     yield from cycle(
         [

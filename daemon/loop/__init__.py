@@ -1,4 +1,4 @@
-"""Real-time loop: start-up of the daemon, the tick, client requests, publishing and timing.
+"""Real-time loop: daemon startup, tick, client requests, publishing and timing.
 
-This package connects the others. It contains no control law, limit or protocol.
+This package connects the other packages. Control laws, limits and protocols are defined there.
 """

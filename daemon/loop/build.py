@@ -1,7 +1,7 @@
 """Build, connect and warm up a daemon from its settings.
 
-Sockets are bound before any hardware is touched, so a second daemon exits without disturbing the
-first. All kernels are compiled before the loop exists and therefore before torque can be on.
+Sockets are bound before any hardware is accessed, so a second daemon exits without disturbing the
+first. All kernels are compiled before the loop is created, and therefore before torque can be on.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
-_RETRY_INTERVAL = 0.2  # s between two connection attempts
+_RETRY_INTERVAL = 0.2  # s between connection attempts
 
 if TYPE_CHECKING:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
 
 class Daemon:
-    """Hold a hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
+    """A hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
 
     Raises
     ------
     SettingsError, AddressError, ServoError, TactileError
-        The hand cannot be made ready. AddressError also reports unusable keys. Everything opened
-        so far is closed again.
+        If the hand cannot be prepared. AddressError also reports unusable keys. Resources that have
+        already been opened are closed again.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Daemon:
         self._hand_settings = settings if hand is None else hand
         self.clock: LoopClock = make_clock(settings)
         self._closers: list[Callable[[], None]] = []
-        self.gateway: Gateway | None = None  # the process that serves clients
+        self.gateway: Gateway | None = None  # process that serves clients
         try:
             self._build(on_event, wire)
         except BaseException:
@@ -86,7 +86,7 @@ class Daemon:
         self.servos = make_servos(settings, self.clock, self.hand)
         perception = Perception(settings, self._make_sensors(), self.models)
         if self.gateway is not None:
-            self.gateway.wait()  # a second daemon exits here, before it touches hardware
+            self.gateway.wait()  # A second daemon exits here, before it accesses hardware.
         if self.servos is not None:
             self._closers.append(self.servos.close)
             self._connect(self.servos, on_event)
@@ -101,7 +101,7 @@ class Daemon:
             )
 
     def _connect(self, servos: Servos, on_event: EventSink | None) -> None:
-        """Connect, retrying for up to ``servos.open_timeout`` while servos do not answer."""
+        """Connect, retrying for up to ``servos.open_timeout`` while servos do not respond."""
         patience = self.settings.servos.open_timeout
         began = time.monotonic()
         was_reported = False
@@ -141,9 +141,9 @@ class Daemon:
         return Publisher(gateway.link), CommandServer(gateway.link, local)
 
     def _make_hand(self) -> SimulatedHand | None:
-        """Return the simulated hand, or None if no backend needs one.
+        """Return the simulated hand, or None if no backend requires one.
 
-        Its tips use the material from the settings, even if a calibration has its own material.
+        Its tips use the material from the settings, even if a calibration defines another material.
         """
         settings = self.settings
         if not needs_hand(settings.servos.backend, settings.tactile.backend):
@@ -172,16 +172,16 @@ class Daemon:
 
     @property
     def tables(self) -> tuple[ContactTable, ContactTable]:
-        """Contact tables of both tips; the same object if the tips share a material."""
+        """Contact tables of both tips; identical objects if the tips share a material."""
         return self.models[0].table, self.models[1].table
 
     def close(self) -> None:
-        """Turn torque off and close everything in reverse order of opening. Never raises."""
+        """Turn torque off and close everything in reverse order. Never raises."""
         while self._closers:
             closer = self._closers.pop()
             try:
                 closer()
-            except Exception as error:  # the other closers, including torque off, must still run
+            except Exception as error:  # The other closers, including torque off, must still run.
                 logging.getLogger(__name__).error("closing: %s", error)
 
     def __enter__(self) -> Daemon:
@@ -192,7 +192,7 @@ class Daemon:
 
 
 def hand_info(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandInfo:
-    """Return the settings, calibrations and table errors that each subscriber receives once."""
+    """Return the settings, calibrations and table errors, which each subscriber receives once."""
     calibrations = [
         "" if model.calibration is None else model.calibration.model_dump_json() for model in models
     ]

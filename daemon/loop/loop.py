@@ -1,7 +1,7 @@
 """Run the control tick: read, estimate, decide, limit, write, publish.
 
-The loop defines the order of the stages and the clock defines the time. `loop.build` has built,
-connected and warmed up everything that the loop calls.
+The loop defines the order of the stages, and the clock defines the time. `loop.build` builds,
+connects and warms up everything that the loop calls.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-# s, age limit of commands that stiffen or move the hand, except holds in a grip.
+# s, age limit for commands that stiffen or move the hand, except ``hold`` during a grip.
 _START_AGE_MAX = 0.2
 
 
 def command_age_max(settings: Settings, waits: bool) -> float:
     """Return the maximum age [s] of a command that stiffens or moves the hand.
 
-    An older command may predate a stop by the servo watchdog, which leaves the hand in another
-    state. With ``waits``, the servos' time and their watchdog pause while this machine is late.
+    An older command may have been sent before the servo watchdog stopped the hand. If ``waits``,
+    the servos' clock and watchdog pause while this machine is late.
     """
     watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
     return min(_START_AGE_MAX, watchdog or _START_AGE_MAX)
 
 
 class Commands(Protocol):
-    """A source of commands: `wire.command_server.CommandServer`, or a recording."""
+    """Command source: `wire.command_server.CommandServer` or a recording."""
 
     notices: deque[str]  # messages from the gateway process, emitted as events
 
@@ -55,14 +55,14 @@ class Commands(Protocol):
         """Number of commands that exceeded the rate limit."""
 
     def serve(self, handler: Handler) -> None:
-        """Pass each request that is due at this tick to ``handler``."""
+        """Pass each request that is due on this tick to ``handler``."""
 
     def raise_fence(self) -> None:
-        """Reject all commands received so far, except stop and status, after a stop."""
+        """After a stop, reject all commands received so far except stop and status."""
 
 
 class Loop:
-    """Run the pipeline on a clock, entirely in the thread that calls `run`."""
+    """The pipeline, driven by a clock and run entirely in the thread that calls `run`."""
 
     def __init__(
         self,
@@ -100,31 +100,31 @@ class Loop:
             self.emit,
             command_age_max(settings, clock.pauses_when_late),
         )
-        self._after_opening: Breach | None = None  # fault to latch once the hand is open
+        self._after_opening: Breach | None = None  # fault to latch when the hand is open
         self.statistics = Statistics()
         self._lateness = Lateness(settings, self.state.timing, clock.pauses_when_late)
         self._publishing = None
         if publisher is not None:
             self._publishing = Publishing(settings, publisher, sensors, self.statistics)
         self.heartbeat: Callable[[float], None] | None = None  # called with each tick's end time
-        self._reports: deque[tuple[str, str, str]] = deque()  # events from outside the tick
+        self._reports: deque[tuple[str, str, str]] = deque()  # events raised outside the tick
         self._ending = False
         self._stopping = False
         self._began = -math.inf  # start of the current tick, machine time [s]
-        self._commanded = False  # a command ran in this tick and may have taken long
+        self._commanded = False  # a command, possibly slow, was executed on this tick
 
-    # The following methods may be called from outside the tick, also by a signal handler.
+    # The following methods may be called from outside the tick, including from signal handlers.
 
     def end(self) -> None:
         """Leave `run` after this tick and turn torque off."""
         self._ending = True
 
     def stop(self) -> None:
-        """Turn torque off at the next tick, like the ``stop`` command."""
+        """Turn torque off on the next tick, like the ``stop`` command."""
         self._stopping = True
 
     def report(self, level: str, kind: str, text: str) -> None:
-        """Emit an event at the next tick. Thread-safe."""
+        """Emit an event on the next tick. Thread-safe."""
         self._reports.append((level, kind, text))
 
     def publish_truth(self, truth: Truth | None) -> None:
@@ -135,7 +135,7 @@ class Loop:
     # Time
 
     def run(self, duration: float | None = None) -> None:
-        """Tick until `end` is called or ``duration`` s have passed, then turn torque off."""
+        """Run ticks until `end` is called or ``duration`` [s] has elapsed, then turn torque off."""
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
         self.emit("info", "start", "running, disarmed")
@@ -150,14 +150,14 @@ class Loop:
                 self.emit("info", "end", "ended, torque off")
 
     def advance(self, duration: float | None = None) -> None:
-        """Tick for ``duration`` s of machine time or until `end`, and leave torque unchanged.
+        """Run ticks for ``duration`` [s] of machine time or until `end`; leave torque unchanged.
 
-        Deadlines are absolute. After a late tick the next deadline is set to now, so that no burst
-        of ticks follows. Real hardware has moved on by then, whereas the time of a simulated hand
-        has paused.
+        Deadlines are absolute. After a late tick, the next deadline is set to the current time to
+        avoid a burst of ticks. Real hardware has continued moving in the meantime, whereas the
+        clock of a simulated hand has paused.
         """
         clock, timing = self._clock, self.state.timing
-        clock.sleep_until(clock.now())  # time before the first tick does not count as lateness
+        clock.sleep_until(clock.now())  # Time before the first tick does not count as a delay.
         before = clock.behind - timing.behind_s
         deadline = clock.now()
         last = clock.host() - self.period
@@ -271,7 +271,7 @@ class Loop:
             self.emit(*self._reports.popleft())
 
     def _react(self, breach: Breach | None) -> None:
-        """Report new warnings, and open the hand or turn torque off for a fault."""
+        """Report new warnings; after a fault, open the hand or turn torque off."""
         state, control, safety = self.state, self._control, self._safety
         for warning in safety.warnings:
             self.emit("warning", *warning)
@@ -295,9 +295,9 @@ class Loop:
     def command(
         self, request: dict[str, Any], age: float = 0.0, by_task: bool = False
     ) -> dict[str, Any]:
-        """Execute one request in the current tick.
+        """Execute one request on the current tick.
 
-        A request that does not come from the running task ends that task.
+        A request from any other source ends the running task.
 
         Parameters
         ----------
@@ -308,7 +308,7 @@ class Loop:
         Raises
         ------
         Refused
-            The request was rejected. The message gives the reason.
+            If the request is rejected. The message says why.
         """
         name = request["command"]
         if name == "status":
@@ -336,7 +336,7 @@ class Loop:
             self._publisher.command(state.wall, state.t, state.seq, request, error)
 
     def _follow(self, task: Task) -> None:
-        """Execute the task's next request; if the task fails, end it or restart it."""
+        """Execute the task's next request; if the task fails, end or restart it."""
         try:
             request = task.next(self.state, self.period)
             if request is not None:
@@ -359,7 +359,8 @@ class Loop:
             self._on_event(level, kind, text)
 
     def _with_cause(self, name: str, text: str) -> str:
-        # A command may occupy the bus for long, which is not a busy machine.
+        # A command may occupy the bus for a long time, which does not mean that the machine is
+        # busy.
         at_work = 0.0 if self._commanded else self._clock.host() - self._began
         return self._lateness.with_cause(name, text, at_work)
 
@@ -373,5 +374,5 @@ class Loop:
             self.state.mode = self._control.mode
 
     def _latch(self, reason: str, name: str) -> None:
-        """Write the latched fault; empty texts clear it. All other code only reads it."""
+        """Set the latched fault, or clear it with empty texts. All other code only reads it."""
         self.state.fault, self.state.fault_name = reason, name

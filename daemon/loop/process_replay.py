@@ -1,8 +1,8 @@
 """Re-run a recording's readings, frames and commands through the current code, tick by tick.
 
-The servos, sensors, clock and commands come from the recording. The estimator, tables, filter,
-control and limits are the installed code. With all inputs from the first tick on and the same code
-and settings, the states are reproduced bit for bit.
+The servos, sensors, clock and commands are replayed from the recording. The estimator, tables,
+filter, control and limits are those of the installed code. If the recording contains all inputs
+from the first tick, and code and settings are the same, the states are reproduced bit for bit.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from softfinger.daemon.wire.command_server import Handler
 
 
 class ProcessReplay:
-    """Run a loop on recorded inputs."""
+    """A loop that runs on recorded inputs."""
 
     def __init__(self, settings: Settings, calibrations: Sequence[str]) -> None:
         """Build the loop from recorded settings.
@@ -34,17 +34,17 @@ class ProcessReplay:
         Parameters
         ----------
         settings : settings of the recording
-        calibrations : calibration of each finger as JSON text, empty without one
+        calibrations : calibration of each finger as JSON text, empty if uncalibrated
 
         Raises
         ------
         SettingsError, TactileError
-            The settings and calibrations do not match.
+            If the settings and calibrations do not match.
         """
         with tempfile.TemporaryDirectory() as folder:
             settings = with_calibrations(settings, calibrations, Path(folder))
             models = make_models(settings)
-        settings = settings.model_copy(update={"task": TaskSettings()})  # its commands are recorded
+        settings = settings.model_copy(update={"task": TaskSettings()})  # replayed instead
         self._clock = _Clock()
         self._commands = _Commands()
         self._servos = _Servos() if settings.servos.backend != "none" else None
@@ -63,7 +63,7 @@ class ProcessReplay:
 
     @property
     def fingers(self) -> tuple[int, ...]:
-        """Fingers whose frames must be supplied."""
+        """Fingers for which frames must be supplied."""
         return tuple(self._sensors)
 
     def tick(
@@ -72,7 +72,7 @@ class ProcessReplay:
         frames: Mapping[int, Frame],
         commands: Sequence[dict[str, Any]],
     ) -> State:
-        """Run one tick and return the loop's own state, which the next call changes.
+        """Run one tick and return the loop's own state, which the next call modifies.
 
         Parameters
         ----------
@@ -96,7 +96,7 @@ class ProcessReplay:
 
 
 def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
-    """Write calibrations (JSON texts) to ``folder`` and return settings that name these files."""
+    """Write calibrations (JSON texts) to ``folder``; return settings that refer to these files."""
     files = ["", ""]
     for finger, text in enumerate(calibrations):
         if text:
@@ -108,7 +108,7 @@ def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: P
 
 
 class _Clock(VirtualClock):
-    """Clock that returns the recorded times."""
+    """Clock that returns recorded times."""
 
     unix = 0.0
 
@@ -118,7 +118,7 @@ class _Clock(VirtualClock):
 
 
 class _Servos:
-    """Servos that replay recorded readings and failures, and discard everything written."""
+    """Servos that replay recorded readings and failures and discard all writes."""
 
     def __init__(self) -> None:
         self.taken: Mapping[str, Any] = {}
@@ -169,7 +169,7 @@ class _Servos:
 
 
 class _Commands:
-    """Command source that replays the commands of a tick."""
+    """Command source that replays the recorded commands of a tick."""
 
     refused_by_pace = 0
 
@@ -182,7 +182,7 @@ class _Commands:
             try:
                 handler(request, 0.0)
             except Refused:
-                pass  # the comparison of states shows the difference
+                pass  # The state comparison will show the difference.
         self.waiting = []
 
     def raise_fence(self) -> None:

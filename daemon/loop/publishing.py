@@ -1,9 +1,9 @@
-"""Decide which topics to publish at a tick, and measure the actual rates.
+"""Decide which topics to publish on each tick, and measure the actual rates.
 
-Each topic is published on every n-th tick, counted by ``seq``, where n gives the rate closest to
-the requested one. Statistics are offset by a few ticks where n allows it, so that no tick publishes
-everything. One of every n frames is published. `wire.publisher` does the sending; this module
-changes no state.
+Each topic is published on every n-th tick (counted by ``seq``), where n gives the rate closest to
+the requested rate. If n allows, statistics are offset by a few ticks to avoid publishing everything
+on the same tick. One of every n frames is published. `wire.publisher` sends the messages; this
+module does not change the state.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
     bit, (schema.STATE, schema.TACTILE, schema.STATS, schema.INPUT, schema.TRUTH)
 )
 _STATS_RATE = 1.0  # Hz
-_STATS_PHASE = 3  # ticks after the state, so that both rarely share a tick
+_STATS_PHASE = 3  # ticks of delay after the state, to avoid publishing both on one tick
 
 
 def every(rate: float, wanted: float) -> int:
@@ -29,7 +29,7 @@ def every(rate: float, wanted: float) -> int:
 
 
 def parts(settings: Settings) -> SceneParts:
-    """Return the parts that the scene of these settings has."""
+    """Return the parts of the scene defined by these settings."""
     return SceneParts(
         fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
         has_servos=settings.servos.backend != "none",
@@ -38,7 +38,7 @@ def parts(settings: Settings) -> SceneParts:
 
 
 class Publishing:
-    """Publish the topics that are due at a tick and have subscribers."""
+    """Publisher of the topics that are due on a tick and have subscribers."""
 
     def __init__(
         self,
@@ -57,23 +57,23 @@ class Publishing:
         self._stats_phase = _STATS_PHASE % self._stats_every
         self._frames_every = every(settings.tactile.rate, stream.tactile_rate)
         self._scene = parts(settings)
-        self.truth: Truth | None = None  # of a simulated hand
-        self._numbers = [0, 0]  # published frames by finger
-        self._seen: list[Frame | None] = [None, None]  # newest frame by finger
-        self._published = [-1, -1]  # last published group of n frames, by finger
-        self._states = self._maps = 0  # published messages
-        # Time [s] and counts when the rates were last published.
+        self.truth: Truth | None = None  # for simulated hands only
+        self._numbers = [0, 0]  # number of published frames per finger
+        self._seen: list[Frame | None] = [None, None]  # newest frame per finger
+        self._published = [-1, -1]  # last published group of n frames, per finger
+        self._states = self._maps = 0  # numbers of published messages
+        # Time [s] and counts at the last publication of rates.
         self._counted: tuple[float, ...] = (0.0,) * 6
 
     def __call__(self, state: State) -> None:
-        """Publish everything that is due at this tick."""
+        """Publish everything that is due on this tick."""
         publisher, seq = self._publisher, state.seq
         wanted = publisher.wanted
         if wanted & _TACTILE:
             for perception in self._perceptions:
                 if perception.frame is not self._seen[perception.finger]:
                     self._frame(state, perception)
-        if wanted & _INPUT:  # after the frames that it refers to
+        if wanted & _INPUT:  # must follow the frames that it refers to
             frames: list[Frame | None] = [None, None]
             for perception in self._perceptions:
                 frames[perception.finger] = perception.frame
@@ -106,7 +106,7 @@ class Publishing:
         self._publisher.send(schema.TACTILE, frame, data, *sensor, wall, n, number)
 
     def _rates(self, state: State) -> Rates:
-        """Return the rates [Hz] since the previous call, by machine time."""
+        """Return the rates [Hz] in machine time since the previous call."""
         frames = [0, 0]
         for perception in self._perceptions:
             frames[perception.finger] = perception.frame_count

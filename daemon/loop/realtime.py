@@ -1,9 +1,9 @@
 """Configure scheduling, memory and timers for a steady tick, and notify systemd.
 
-The measures of the ``[realtime]`` settings are applied once, after warm-up. All of them are
-optional: if the system refuses one, a warning states the consequence and the command that grants
-it. `daemon.clock` implements the spin before a deadline. The `Service` class reports ready, alive
-and stopping to systemd with sd_notify.
+The measures in the ``[realtime]`` settings are applied once after warm-up. All of them are
+optional: if the system refuses one, a warning explains the consequence and gives the command that
+grants it. `daemon.clock` implements the spin before a deadline. The `Service` class sends the
+READY, WATCHDOG and STOPPING notifications to systemd with sd_notify.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from functools import partial
 from softfinger.daemon.profile.settings import Settings
 
 _SWITCH_INTERVAL = 2e-4  # s
-_KEEP_ALIVE_FRACTION = 0.25  # interval of keep-alive messages, as a fraction of the watchdog time
+_KEEP_ALIVE_FRACTION = 0.25  # keep-alive interval as a fraction of the watchdog time
 _NEVER = float("inf")
 _LATENCY_DEVICE = "/dev/cpu_dma_latency"
 
-# Commands that grant a user the requested permissions.
+# Commands that grant the requested permissions to a user.
 _LIMITS_FILE = "/etc/security/limits.d/softfinger.conf"
 _UDEV_RULE_FILE = "/etc/udev/rules.d/99-softfinger.rules"
 _LATENCY_UDEV_RULE = 'KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"'
@@ -44,24 +44,25 @@ GRANT_LATENCY = (
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
-# System calls sched_setattr and sched_getattr by machine, which the C library does not wrap, and
-# their argument struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period.
+# Numbers of the system calls sched_setattr and sched_getattr per machine type; the C library does
+# not wrap them. Their argument is struct sched_attr: size, policy, flags, nice, priority, runtime,
+# deadline, period.
 _ATTRIBUTE_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 _ATTRIBUTES = struct.Struct("=IIQiIQQQ")
-_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # ns, range of slices that the kernel accepts
+_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # ns, slice range accepted by the kernel
 
 
 class RealTime:
-    """Apply the real-time measures while open: ``with RealTime(settings): loop.run()``.
+    """Real-time measures, active while open: ``with RealTime(settings): loop.run()``.
 
-    Open it after warm-up, in the thread that ticks. It never raises; ``granted`` and ``refused``
-    list the outcome of each measure. On virtual time, only the garbage collector and the thread
-    switch interval are adjusted.
+    Open it after warm-up in the loop thread. It never raises; ``granted`` and ``refused`` list the
+    outcomes of the measures. On virtual time, only the garbage collector and the thread switch
+    interval are adjusted.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.granted: list[str] = []
-        self.refused: list[str] = []  # with the consequence and the command that grants it
+        self.refused: list[str] = []  # with consequence and remedy
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
@@ -83,7 +84,7 @@ class RealTime:
             self._granted(f"spin of {wanted.spin * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
-        """Return events: one for all granted measures and one for each refusal."""
+        """Return one event for all granted measures and one for each refusal."""
         events = [("info", "realtime", ", ".join(self.granted))] if self.granted else []
         return events + [("warning", "realtime", text) for text in self.refused]
 
@@ -93,7 +94,7 @@ class RealTime:
             try:
                 self._undo.pop()()
             except OSError:
-                pass  # for example, the thread has ended
+                pass  # For example, the thread may have ended.
 
     def __enter__(self) -> RealTime:
         return self
@@ -111,9 +112,9 @@ class RealTime:
     def _keep_interpreter(self, freeze: bool) -> None:
         """Keep the garbage collector and other threads from delaying the loop.
 
-        A full collection over all objects of numpy and numba takes tens of milliseconds, so
-        existing objects are frozen. Another thread may hold the interpreter for one switch
-        interval, which is 5 ms by default.
+        A full collection of all NumPy and Numba objects takes tens of milliseconds, so existing
+        objects are frozen. Another thread may hold the interpreter for one switch interval, which
+        is 5 ms by default.
         """
         self._undo += [gc.unfreeze, partial(sys.setswitchinterval, sys.getswitchinterval())]
         if freeze:
@@ -123,10 +124,10 @@ class RealTime:
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
     def _schedule(self, priority: int) -> None:
-        """Set SCHED_FIFO for the loop, and one level lower for the interpreter's other threads.
+        """Set SCHED_FIFO for the loop thread, and one level lower for other interpreter threads.
 
         A reader thread that is preempted while it holds the interpreter lock delays the loop.
-        Threads outside the interpreter, such as ZeroMQ's, and child processes keep normal
+        Threads outside the interpreter, such as ZeroMQ threads, and child processes keep normal
         scheduling.
         """
         undo: list[Callable[[], object]] = []
@@ -150,10 +151,10 @@ class RealTime:
             self._granted(f"SCHED_FIFO {priority}", *undo)
 
     def _shorten_slice(self, nanoseconds: int) -> None:
-        """Without SCHED_FIFO, shorten the time slice of the interpreter's threads.
+        """Shorten the time slice of the interpreter's threads if SCHED_FIFO is not in use.
 
-        Since version 6.12, Linux runs the thread whose slice ends first, so a thread with a short
-        slice is scheduled sooner.
+        Since version 6.12, Linux runs the thread with the earliest slice end, so threads with short
+        slices are scheduled sooner.
         """
         usual = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
         calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
@@ -161,12 +162,12 @@ class RealTime:
             return
         threads = _threads()
         shortened = [_set_slice(calls, thread, nanoseconds) for thread in threads]
-        if any(shortened):  # older kernels ignore the request
+        if any(shortened):  # Older kernels ignore the request.
             undo = [partial(_set_slice, calls, thread, 0) for thread in threads]
             self._granted(f"slices of {nanoseconds * 1e-6:g} ms", *undo)
 
     def _keep_to_processors(self, cpus: tuple[int, ...]) -> None:
-        """Pin the loop's thread to processors; other threads may also run on them."""
+        """Pin the loop thread to processors, which other threads may also use."""
         names = ", ".join(map(str, cpus))
         before = os.sched_getaffinity(0)
         try:
@@ -181,11 +182,11 @@ class RealTime:
             self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))
 
     def _lock_memory(self) -> None:
-        """Lock pages in memory once they are touched, which warm-up has done for the loop's pages.
+        """Lock pages in memory when they are touched. Warm-up has already touched the loop's pages.
 
         Two thirds of the compiler libraries' pages are never touched, and loading them would take
-        most of a second. Under a memory limit only existing mappings are locked, because later
-        mappings would fail otherwise.
+        most of a second. If memory locking is limited, only existing mappings are locked, because
+        later mappings would otherwise fail.
         """
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         flags = _MCL_CURRENT | _MCL_ONFAULT
@@ -200,7 +201,7 @@ class RealTime:
             self._granted("memory locked", libc.munlockall)
 
     def _hold_latency(self) -> None:
-        """Keep processors out of deep idle states while the file stays open."""
+        """Prevent deep processor idle states while the file stays open."""
         try:
             descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -218,23 +219,23 @@ class RealTime:
             self._granted("idle states held off", partial(os.close, descriptor))
 
     def _sharpen_timer(self, nanoseconds: int) -> None:
-        """Reduce the timer slack, by which the kernel may delay a wake-up to merge several."""
+        """Reduce the timer slack by which the kernel may delay wake-ups to merge them."""
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
             why = os.strerror(ctypes.get_errno())
             self._refused(f"timer slack refused ({why}): wake-ups come 50 µs later")
-        else:  # 0 restores the thread's initial slack
+        else:  # 0 restores the thread's initial slack.
             undo = partial(libc.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
             self._granted(f"timer slack {nanoseconds} ns", undo)
 
 
 def _threads() -> list[int]:
-    """Return the system's thread IDs of all threads of this interpreter."""
+    """Return the native IDs of all threads of this interpreter."""
     return [each.native_id for each in threading.enumerate() if each.native_id is not None]
 
 
 def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
-    """Set the thread's time slice (0: system default). Return True if it took effect."""
+    """Set a thread's time slice (0: system default); return True if it took effect."""
     set_call, get_call = calls
     libc = ctypes.CDLL(None, use_errno=True)
     size = _ATTRIBUTES.size
@@ -249,18 +250,18 @@ def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
 
 
 class Service:
-    """Notify systemd through the socket in ``NOTIFY_SOCKET``. Never blocks and never raises.
+    """Notifier for systemd via the socket in ``NOTIFY_SOCKET``. Never blocks or raises.
 
-    Each notification is one datagram. The loop calls `alive` at every tick; most calls only compare
-    times, and a few messages are sent within each watchdog period.
+    Each notification is one datagram. The loop calls `alive` on every tick. Most calls only compare
+    times; a few messages are sent per watchdog period.
     """
 
     def __init__(self, address: str, watchdog: float = 0.0) -> None:
         """Open the socket.
 
-        ``watchdog`` [s] is the time without a message after which systemd acts; 0 disables it.
+        If no message arrives for ``watchdog`` [s], systemd acts; 0 disables this.
         """
-        # A name that begins with @ denotes an abstract socket, whose first byte is zero.
+        # A name starting with @ denotes an abstract socket, whose first byte is zero.
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._every = watchdog * _KEEP_ALIVE_FRACTION if watchdog > 0.0 else _NEVER
         self._due = -_NEVER
@@ -270,7 +271,7 @@ class Service:
 
     @classmethod
     def of_environment(cls, environment: Mapping[str, str] = os.environ) -> Service | None:
-        """Return the systemd service described by the environment, or None outside systemd."""
+        """Return the service described by the environment, or None if not started by systemd."""
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@") or len(address) < 2:
             return None
@@ -280,7 +281,7 @@ class Service:
         return cls(address, watchdog)
 
     def alive(self, t: float) -> None:
-        """Send a keep-alive message if one is due at time ``t`` [s]; the first reports ready."""
+        """Send a keep-alive message if due at time ``t`` [s]; the first one also reports READY."""
         if t < self._due:
             return
         self._due = t + self._every
@@ -299,4 +300,4 @@ class Service:
         try:
             self._socket.sendto(message, self._address)
         except OSError:
-            pass  # systemd is not listening or its queue is full
+            pass  # systemd is not listening, or its queue is full.

@@ -1,6 +1,6 @@
 """Validate requests to a running hand and execute them.
 
-The gateway has already limited the size and rate of requests (`gateway.commands`), and
+The gateway has already limited the size and rate of the requests (`gateway.commands`), and
 `wire.command_server` has unpacked them. `control.modes` lists the commands allowed in each mode,
 and `control.state_machine` defines the resulting motion.
 """
@@ -28,14 +28,14 @@ from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, State
 
-AGE_MAX = 1.0  # s, age limit of every command except status and stop
+AGE_MAX = 1.0  # s, age limit for all commands except status and stop
 _COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE_KEYS = frozenset({"command", "client"})
 _MODE_REMEDIES = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
 
 
 class Command(NamedTuple):
-    """Hold a well-formed request that is allowed in the current mode."""
+    """Well-formed request that is allowed in the current mode."""
 
     name: str
     numbers: dict[str, float]
@@ -43,7 +43,7 @@ class Command(NamedTuple):
 
 
 def parse(request: dict[str, Any], mode: Mode) -> Command:
-    """Validate a request against the command table. Raises Refused with found and expected."""
+    """Validate a request against the command table. Raises Refused if it is invalid."""
     name = request["command"]
     if name not in COMMANDS:
         raise _malformed(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")
@@ -93,9 +93,9 @@ def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
 
 
 class Lease:
-    """Give one client exclusive command for a time after its last command.
+    """Exclusive control of the hand by one client for a time after its last command.
 
-    All clients without a name share one lease. Commands that can only make the hand safer need no
+    All unnamed clients share one lease. Commands that can only make the hand safer require no
     lease.
     """
 
@@ -105,7 +105,7 @@ class Lease:
         self._until = -math.inf
 
     def check(self, command: Command, now: float) -> None:
-        """Raise Refused while another client has the lease."""
+        """Raise Refused if another client holds the lease."""
         if command.name in NO_LEASE_COMMANDS:
             return
         if now < self._until and command.client != self._owner:
@@ -114,9 +114,9 @@ class Lease:
             raise Refused(text, Reason.LEASE)
 
     def lapses(self, now: float) -> str:
-        """Return the name of the client whose lease just expired, otherwise an empty text.
+        """Return the name of the client whose lease has just expired, otherwise "".
 
-        Each expiry is returned once.
+        Each expiry is reported once.
         """
         if not -math.inf < self._until <= now:
             return ""
@@ -124,14 +124,14 @@ class Lease:
         return self._owner or "the commander"
 
     def renew(self, command: Command, now: float) -> None:
-        """Take or extend the lease after a command was executed."""
+        """Take or extend the lease after the execution of a command."""
         if command.name not in NO_LEASE_COMMANDS:
             self._owner = command.client
             self._until = now + self.seconds
 
 
 class Requests:
-    """Execute requests between two stages of a tick. Only the loop's thread may call it."""
+    """Executor of requests between two stages of a tick. Only the loop thread may call it."""
 
     def __init__(
         self,
@@ -144,7 +144,7 @@ class Requests:
         emit: Callable[[str, str, str], None],
         command_age_max: float = math.inf,
     ) -> None:
-        """Prepare to execute requests.
+        """Create the executor.
 
         Parameters
         ----------
@@ -170,14 +170,14 @@ class Requests:
             "release": control.release,
             "set": control.set,
             "clear": control.disarm,
-            "demo": lambda: None,  # the loop starts its task
+            "demo": lambda: None,  # the loop starts the task
             "status": lambda: None,
         }
         self._lease = Lease(settings.commands.lease)
         self._envelope = Envelope(settings)
 
     def carry_out(self, request: dict[str, Any], age: float = 0.0) -> dict[str, Any]:
-        """Execute a request in the current tick and return the reply.
+        """Execute a request on the current tick and return the reply.
 
         Parameters
         ----------
@@ -187,10 +187,10 @@ class Requests:
         Raises
         ------
         Refused
-            The request was rejected. The message gives the reason.
+            If the request is rejected. The message says why.
         """
         state, control = self._state, self._control
-        if request["command"] == "stop":  # in every mode, from every client, with any fields
+        if request["command"] == "stop":  # accepted in every mode, from any client, with any fields
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}
         command = name, numbers, _ = parse(request, control.mode)
@@ -229,7 +229,7 @@ class Requests:
             self._emit("warning", "silence", text)
 
     def end_grip(self, action: str) -> bool:
-        """Perform ``stop`` or ``release``. Return False if it does not apply in this state."""
+        """Perform ``stop`` or ``release``; return False if it does not apply in this state."""
         control = self._control
         if action == "stop" and control.torque:
             control.stop()
@@ -241,10 +241,10 @@ class Requests:
         return True
 
     def _check_age(self, name: str, age: float) -> None:
-        """Raise Refused for a command that is too old.
+        """Raise Refused if a command is too old.
 
-        After a stall the client may no longer want the hand to move. Setpoints during a grip and
-        harmless commands are accepted up to a greater age.
+        After a stall, the client may no longer want the hand to move. The age limit is higher for
+        setpoints during a grip and for harmless commands.
         """
         if name == "status":
             return
@@ -255,7 +255,7 @@ class Requests:
             raise Refused(f"{text}; send it again", Reason.LATE)
 
     def _check(self, name: str, numbers: dict[str, float]) -> None:
-        """Raise Refused if the state, the scene or the limits prevent an accepted command."""
+        """Raise Refused if the state, scene or limits prevent a valid command."""
 
         def refuse_if(condition: object, reason: Reason, text: str) -> None:
             if condition:
@@ -322,19 +322,19 @@ class Requests:
                 raise Refused(f"move: {name}: {range_text(q, low, high)}", Reason.BOUNDS)
 
     def _reconnect(self) -> None:
-        """Reconnect servos that have stopped answering. Only a ``clear`` command does this.
+        """Reconnect servos that have stopped responding. Only ``clear`` does this.
 
         Raises
         ------
         Refused
-            The servos cannot be connected. The message lists all problems found.
+            If the servos cannot be connected. The message lists all problems found.
         """
         state = self._state
         silent = state.t - state.reading.t > self._settings.servos.fault_after
         if self._torque.servos is None or not silent:
             return
         if self._torque.pending and not state.read_error:
-            return  # the port works; connecting would end the bus silence that stops the servos
+            return  # The port works. Connecting would end the bus silence that stops the servos.
         try:
             self._torque.reconnect()
         except ServoError as error:
@@ -342,12 +342,12 @@ class Requests:
         self._emit("info", "servos", "connected anew")
 
     def _reopen(self, name: str) -> None:
-        """Reopen sensors whose port was lost. Only ``clear`` and ``arm`` with torque off do this.
+        """Reopen sensors with a lost port. Only ``clear`` and ``arm`` do this, with torque off.
 
         Raises
         ------
         Refused
-            A sensor cannot be opened on ``clear``. A hand may be armed without sensors.
+            If a sensor cannot be opened on ``clear``. A hand may be armed without sensors.
         """
         if self._state.torque:
             return

@@ -1,11 +1,11 @@
-"""Measure the loop's timing: histograms of its stages, and the lateness of its ticks.
+"""Measure loop timing: histograms of the stages, and tick delays.
 
-One kernel call per tick updates the histograms, which are published once a second. Each octave from
-1 ns is divided into 32 bins. A quantile is reported as the upper edge of its bin, so it is never
-too small and at most 3.2 % too large. The maximum is exact.
+One kernel call per tick updates the histograms, which are published once per second. Each octave
+above 1 ns is divided into 32 bins. A quantile is reported as the upper edge of its bin, so it is
+never too small and at most 3.2 % too large. The maximum is exact.
 
-Lateness is reported by an occasional event and as the possible cause of a fault, in machine time.
-While a tick is late, real hardware is uncontrolled, whereas a simulated hand on its own clock waits
+Delays in machine time are reported by occasional events and as the possible cause of a fault. While
+a tick is late, real hardware is uncontrolled, whereas a simulated hand on its own clock waits
 (`daemon.clock.HandClock`).
 """
 
@@ -23,23 +23,23 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 TIMES = ("wake", "compute", "bus", "publish")
 QUANTILES = (0.5, 0.99, 0.999)
 
-# Lower edge of the first bin, 2^-30 s = 0.93 ns; shorter times are counted there.
+# Exponent of the first bin's lower edge, 2^-30 s = 0.93 ns. Shorter times are counted there.
 _LOWEST_EXPONENT = -29
-_OCTAVES = 36  # up to 64 s; longer times are counted in the last bin
-_BINS_PER_OCTAVE = 32  # bins per octave
+_OCTAVES = 36  # up to 64 s; the last bin also counts longer times
+_BINS_PER_OCTAVE = 32
 _BIN_COUNT = _OCTAVES * _BINS_PER_OCTAVE
 _BIN_EDGES = np.ldexp(
     0.5 + 0.5 * np.arange(1, _BINS_PER_OCTAVE + 1) / _BINS_PER_OCTAVE,
     np.arange(_OCTAVES)[:, None] + _LOWEST_EXPONENT,
 )
-# Upper edge of each bin; the last bin is unbounded.
+# Upper edges of the bins; the last bin is unbounded.
 _UPPER_EDGES = np.append(_BIN_EDGES.ravel()[:-1], np.inf)
 
-LATENESS_MIN = 0.05  # s, smallest lateness that is reported
-# s, minimum time between reports; the reported lateness at least doubles each time.
+LATENESS_MIN = 0.05  # s, minimum delay that is reported
+# s, minimum time between reports. In addition, the reported delay must at least double each time.
 REPORT_INTERVAL = 60.0
-ATTRIBUTION_TIME = 0.25  # s after a late tick during which a fault may be attributed to it
-# Limits that a late tick alone can break.
+ATTRIBUTION_TIME = 0.25  # s after a late tick during which faults may be attributed to it
+# Limits that a late tick alone can violate.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
 Event = tuple[str, str, str]
@@ -60,7 +60,7 @@ def _bin(value: float) -> int:
 
 @kernel
 def record(counts: Counts, largest: FloatArray, times: tuple[float, float, float, float]) -> None:
-    """Count the times [s] of one tick, in the order of `TIMES`.
+    """Count one tick's times [s], in the order of `TIMES`.
 
     ``counts`` int64 [times, bins] and ``largest`` float64 [times] are updated in place.
     """
@@ -70,12 +70,12 @@ def record(counts: Counts, largest: FloatArray, times: tuple[float, float, float
 
 
 class Statistics:
-    """Hold the histograms of one loop. The loop passes both arrays to `record` once per tick."""
+    """Histograms of one loop, which passes both arrays to `record` once per tick."""
 
     def __init__(self) -> None:
         self.counts: Counts = np.zeros((len(TIMES), _BIN_COUNT), np.int64)
         self.largest: FloatArray = np.zeros(len(TIMES))
-        record(self.counts, self.largest, (0.0, 0.0, 0.0, 0.0))  # compiles before the first tick
+        record(self.counts, self.largest, (0.0, 0.0, 0.0, 0.0))  # compile now
         self.counts[:] = 0
 
     @property
@@ -84,7 +84,7 @@ class Statistics:
         return int(self.counts[0].sum())
 
     def spreads(self) -> dict[str, TimeSpread]:
-        """Return quantiles and maximum by the names in `TIMES`; all 0 before the first tick."""
+        """Return quantiles and maximum for each name in `TIMES`; all 0 before the first tick."""
         spreads = {}
         for name, until, largest in zip(
             TIMES, self.counts.cumsum(axis=1), self.largest, strict=True
@@ -95,7 +95,7 @@ class Statistics:
         return spreads
 
     def table(self) -> list[str]:
-        """Return the spreads as a readable table in µs."""
+        """Format the spreads as a table in µs."""
         lines = [f"{'':8} {'p50':>9} {'p99':>9} {'p99.9':>9} {'max':>9}  µs"]
         for name, spread in self.spreads().items():
             cells = " ".join(f"{1e6 * value:9.1f}" for value in spread)
@@ -104,25 +104,25 @@ class Statistics:
 
 
 class Lateness:
-    """Track the lateness of one loop's ticks."""
+    """Delay monitor for one loop's ticks."""
 
     def __init__(self, settings: Settings, timing: Timing, waits: bool) -> None:
-        """Start tracking; only ``timing.busy_s`` of the loop's ``timing`` is written.
+        """Create the monitor; it writes only ``busy_s`` of the loop's ``timing``.
 
-        ``waits`` is True if the hand's time pauses while the machine is late.
+        ``waits`` is True if the hand's clock pauses while the machine is late.
         """
         self._timing = timing
         self._period = 1.0 / settings.loop.rate
         self._waits = waits
-        self._sum = 0.0  # total lateness of ticks, or total time that the hand has waited [s]
-        self._reported = (0.0, -math.inf)  # total lateness and time of the last report [s]
+        self._sum = 0.0  # total tick delay, or total time the hand has waited [s]
+        self._reported = (0.0, -math.inf)  # total delay and time of the last report [s]
         self._busy_until = -math.inf
 
     def look(self, t: float, own_doing: bool) -> Event | None:
         """Evaluate the tick that began at ``t`` [s]; return an event to emit, or None.
 
-        ``timing`` must be filled in up to the start of this tick. ``own_doing`` is True if a
-        command delayed the previous tick.
+        ``timing`` must already contain the start of this tick. ``own_doing`` is True if a command
+        delayed the previous tick.
         """
         timing = self._timing
         gap = 0.0 if own_doing else timing.tick_s - self._period
@@ -130,7 +130,7 @@ class Lateness:
             timing.busy_s, self._busy_until = gap, t + ATTRIBUTION_TIME
         elif t > self._busy_until:
             timing.busy_s = 0.0
-        if self._waits:  # the hand will also wait for this tick's lateness before the next one
+        if self._waits:  # The hand will also wait for this tick's delay before the next tick.
             self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
         elif gap > LATENESS_MIN:
             self._sum += gap
@@ -145,7 +145,7 @@ class Lateness:
         return f"this machine is busy: {did}, {self._sum:.1f} s in all"
 
     def with_cause(self, name: str, text: str, at_work: float) -> str:
-        """Return the fault's text, prefixed with "this machine was busy" if that may be its cause.
+        """Return the fault text, prefixed with "this machine was busy" if this may be the cause.
 
         Parameters
         ----------

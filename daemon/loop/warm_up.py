@@ -1,9 +1,9 @@
-"""Compile the kernels of a scene by running each part of the pipeline once before the first tick.
+"""Compile a scene's kernels by running each part of the pipeline once before the first tick.
 
-`loop.build` runs all parts before the loop exists and therefore before torque can be on. On first
-use, `processes.compile` compiles parts in parallel processes beforehand. A part builds the objects
-it needs, runs them on an invented contact and discards them. Components that a scene lacks are
-skipped.
+`loop.build` runs all parts before the loop is created, and therefore before torque can be on. On
+first use, `processes.compile` has already compiled parts in parallel processes. A part builds the
+objects it needs, runs them on a made-up contact and discards them. Components that are not in the
+scene are skipped.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from softfinger.kinematics.hand.servo_heat import (
 
 
 class WantedScene:
-    """Describe a scene to compile for; ``on_event`` receives events about its finger models."""
+    """Scene to compile for; ``on_event`` receives events about its finger models."""
 
     def __init__(
         self, settings: Settings, on_event: Callable[[str, str, str], None] | None = None
@@ -49,27 +49,27 @@ class WantedScene:
 
     @property
     def sensing(self) -> list[int]:
-        """Indices of the fingers that have a sensor."""
+        """Indices of the fingers with a sensor."""
         if self.settings.tactile.backend == "none":
             return []
         return sorted(FINGERS.index(name) for name in self.settings.scene.fingers)
 
 
 class Part(NamedTuple):
-    """Describe one part of the pipeline and its kernels."""
+    """One part of the pipeline and its kernels."""
 
     name: str
-    kernels: int  # approximate number of kernels, for a progress bar
+    kernels: int  # approximate number of kernels, for the progress bar
     run: Callable[[WantedScene], None]
-    after: str = ""  # part that must be built before this one
+    after: str = ""  # name of a part that must be built first
 
 
 def parts(settings: Settings) -> list[Part]:
-    """Return the parts with kernels that ``settings`` need, in an order that suits two processes.
+    """Return the parts required by ``settings``, in a suitable order for two processes.
 
-    One process compiles the estimator and then the simulated sensor, which shares kernels with it.
-    The other compiles the contact table and then the simulated hand and the filter, which use the
-    table. The shorter parts balance the two.
+    One process compiles the estimator and then the simulated sensor, which share kernels. The other
+    compiles the contact table and then the simulated hand and the filter, which use the table. The
+    shorter parts balance the load.
     """
     simulated = needs_hand(settings.servos.backend, settings.tactile.backend)
     servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"
@@ -86,18 +86,18 @@ def parts(settings: Settings) -> list[Part]:
 
 
 def named(name: str) -> Part:
-    """Return a part by its name. Raises KeyError for an unknown name."""
+    """Return the part with this name. Raises KeyError if the name is unknown."""
     return {each.name: each for each in ALL}[name]
 
 
 def is_built(part: Part, settings: Settings) -> bool:
-    """Return True if ``part`` is cached, compiled from the current sources for this tip type."""
+    """Return True if the cache contains ``part`` for this tip type and the current sources."""
     folder = kernel_folder()
     return folder is not None and is_marked(folder, _kind(part, settings))
 
 
 def mark_built(part: Part, settings: Settings) -> None:
-    """Mark ``part`` as compiled and cached; does nothing without a cache folder."""
+    """Mark ``part`` as compiled and cached; do nothing if there is no cache folder."""
     folder = kernel_folder()
     if folder is not None:
         mark(folder, _kind(part, settings))
@@ -108,7 +108,7 @@ def _kind(part: Part, settings: Settings) -> str:
 
 
 def warm_up(scene: WantedScene) -> None:
-    """Run every part of ``scene``. Raises the errors of `profile.factory` for unusable settings."""
+    """Run every part of ``scene``. Raises the same errors as `profile.factory`."""
     for part in parts(scene.settings):
         part.run(scene)
         mark_built(part, scene.settings)
@@ -215,5 +215,5 @@ _JOINTS = Part("joints and timing", 13, _joints)
 _MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _JOINTS, _MANY)
 EMULATED = (_TABLE, _HAND, _SENSOR)  # for `softfinger emulate`
-LANDSCAPE = (_TABLE, _MANY)  # for a plot of the energy
-FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # for the analysis of frames
+LANDSCAPE = (_TABLE, _MANY)  # for the energy plot
+FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # for frame analysis

@@ -1,1 +1,1 @@
-"""Perception: from tactile frames to contacts, with calibration, estimation and filtering."""
+"""Perception: calibrate tactile frames, estimate contacts and filter them."""

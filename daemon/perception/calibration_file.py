@@ -1,7 +1,7 @@
-"""Calibration file of one sensor: read it, check it against the sensor, write and apply it.
+"""Read, check, write and apply the calibration file of a sensor.
 
-Each sensor has one JSON file. A calibration step that was not done yet is null, and the value of
-the settings is used instead. `kinematics.calibration` explains the numbers.
+Each sensor has one JSON file. A calibration step that has not been run yet is null; the settings
+then provide the value. `kinematics.calibration` explains the numbers.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
-_PITCH = 1e-9  # m, tolerance of equal pitches
+_PITCH = 1e-9  # m, tolerance for equal pitches
 _MONOTONE_POINTS = 257
-_FAULTY = 0.2  # of the median range; a cell with less is nearly saturated without load
+_FAULTY = 0.2  # fraction of the median range below which an unloaded cell is nearly saturated
 
 
 class CalibrationFileError(TactileError):
-    """The file can't be used or belongs to another sensor. The message gives the reason."""
+    """Raised for a file that can't be used or belongs to another sensor. The message says why."""
 
 
 class _StepModel(BaseModel):
@@ -42,7 +42,7 @@ class _StepModel(BaseModel):
 
 
 class Sensor(_StepModel):
-    """Identity of a sensor: its finger, its label or serial number, and its grid."""
+    """Identity of a sensor: finger, label or serial number, and grid."""
 
     finger: Literal["left", "right"]
     label: str
@@ -53,11 +53,12 @@ class Sensor(_StepModel):
 
 
 class TareStep(_StepModel):
-    """Mean count of each unloaded cell, and typical standard deviation of a cell [counts].
+    """Mean reading of each unloaded cell and the typical cell noise (standard deviation) [counts].
 
-    ``correlation`` is the noise correlation of two cells by their distance in rows and columns; it
-    is empty for independent noise. ``drift`` is the standard deviation of the common change of all
-    cells. ``excess`` is the mean reading above zero, since readings are clipped at 0 [counts].
+    ``correlation[i][j]`` is the noise correlation of two cells that are i rows and j columns apart;
+    it is empty for independent noise. ``drift`` is the standard deviation of the common-mode change
+    of all cells. ``excess`` is the mean reading above the zero offset: it is positive because
+    readings are clipped at 0 [counts].
     """
 
     date: str
@@ -70,7 +71,7 @@ class TareStep(_StepModel):
 
 
 class EquilibrateStep(_StepModel):
-    """Gain of each cell, 0 for a dead cell; relative spread before and after correction."""
+    """Gain of each cell (0 for dead cells) and relative spread before and after correction."""
 
     date: str
     gain: list[list[Finite]]
@@ -80,7 +81,7 @@ class EquilibrateStep(_StepModel):
 
 
 class CurveStep(_StepModel):
-    """Coefficients (b, c_1, c_2, c_3) of p = c_1 x^b + c_2 x² + c_3 x³ [Pa], relative residual."""
+    """Curve p = c_1 x^b + c_2 x² + c_3 x³ [Pa] with coefficients (b, c_1, c_2, c_3); residual."""
 
     date: str
     kind: Literal["power", "cubic"]
@@ -89,7 +90,7 @@ class CurveStep(_StepModel):
 
 
 class CentreStep(_StepModel):
-    """Centre of the tip on the sensor and its ``std`` [m]; rotation [rad], null if not measured."""
+    """Tip centre on the sensor and its ``std`` [m]; rotation [rad], or null if not measured."""
 
     date: str
     centre: tuple[Finite, Finite]
@@ -100,7 +101,7 @@ class CentreStep(_StepModel):
 
 
 class ModulusStep(_StepModel):
-    """Modulus E [Pa], or points of a stress-strain law [Pa]; relative residual of E."""
+    """Modulus E [Pa] with its relative residual, or points of a stress-strain law [Pa]."""
 
     date: str
     modulus: Positive
@@ -110,17 +111,17 @@ class ModulusStep(_StepModel):
     residual: Finite
 
     def material(self) -> Material:
-        """Return the stress-strain law of the tip. Raises ValueError for unsuitable points."""
+        """Return the tip's stress-strain law. Raises ValueError for unsuitable points."""
         if self.strain:
             return Material.from_points(self.strain, self.stress)
         return Material.constant(self.modulus)
 
 
 class ScalesStep(_StepModel):
-    """Calibration factors of the finger from grips: mean and relative standard deviation of each.
+    """Finger calibration factors measured in grips, each as (mean, relative standard deviation).
 
-    The factors are the modulus relative to this file or the settings, the gain of the sensor, and
-    the torque constant of the joint.
+    The factors are the modulus relative to this file or the settings, the sensor gain, and the
+    joint's torque constant.
     """
 
     date: str
@@ -132,7 +133,8 @@ class ScalesStep(_StepModel):
 class Calibration(_StepModel):
     """All calibration steps of one sensor. Add a step with ``model_copy(update=…)``.
 
-    ``wants`` has the settings of ``[tip]`` that the presses of `calibrate law` require, by name.
+    ``wants`` maps the names of ``[tip]`` settings to the values that `calibrate law` requires for
+    its measurements.
     """
 
     format: Literal[1] = 1
@@ -149,22 +151,22 @@ class Calibration(_StepModel):
 
     @property
     def identity(self) -> str:
-        """Label of the sensor, or its finger, and the date of the file."""
+        """Sensor label (or finger name if there is no label) and date of the file."""
         return f"{self.sensor.label or self.sensor.finger} {self.date}"
 
     def summary(self) -> str:
-        """Return the identity and the completed steps in one line."""
+        """Return the identity and the completed steps on one line."""
         steps = [name for name in _STEPS if getattr(self, name) is not None]
         return f"{self.identity}: {', '.join(steps) or 'no step'}"
 
 
 def now() -> str:
-    """Return the present date and time in the format of the file."""
+    """Return the current date and time in the format of the file."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def sensor_of(settings: Settings, finger: int) -> Sensor:
-    """Return the sensor of ``finger``; without a label, the USB serial number is its label."""
+    """Return the sensor of ``finger``. If it has no label, its USB serial number is used."""
     tactile = settings.tactile
     return Sensor(
         finger=_NAMES[finger],
@@ -211,7 +213,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """Return the differences between the sensor of a file and the sensor ``there``, or ""."""
+    """Describe how the sensor of a file differs from ``there``; return "" if they are equal."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "no name", there.label or "no name"),
@@ -226,7 +228,10 @@ def difference(file: Sensor, there: Sensor) -> str:
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Write the file atomically. Raises CalibrationFileError and then keeps the old file."""
+    """Write the file atomically.
+
+    If writing fails, keep the old file and raise CalibrationFileError.
+    """
     text = json.dumps(calibration.model_dump(mode="json"), ensure_ascii=False) + "\n"
     try:
         write_whole(path, text.encode())
@@ -235,7 +240,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 class Converter:
-    """Conversion of one sensor's counts to pressures [Pa]."""
+    """Converter from one sensor's counts to pressures [Pa]."""
 
     def __init__(
         self, calibration: Calibration, pascal_per_count: float, full_count: int | None = None
@@ -247,9 +252,9 @@ class Converter:
         calibration
             Calibration of the sensor.
         pascal_per_count
-            Scale that is used without a measured curve.
+            Scale factor to use if no curve has been measured.
         full_count
-            Reading of saturated cells; None for that of the calibrated sensor.
+            Reading of a saturated cell; None means the value in the calibration.
         """
         sensor = calibration.sensor
         shape = (sensor.rows, sensor.cols)
@@ -272,17 +277,20 @@ class Converter:
         return self.pressure(self.readings(counts))
 
     def readings(self, counts: NDArray[Any]) -> FloatArray:
-        """Return x = max(counts − zero, 0)·gain of (mean) counts, the argument of the curve."""
+        """Return x = max(counts − zero, 0)·gain, the argument of the curve, for (mean) counts."""
         return np.asarray(np.maximum(counts - self.zero, 0.0) * self.gain)
 
     def pressure(self, readings: FloatArray) -> FloatArray:
-        """Return the pressure [Pa] of readings. Noise may make them negative; the curve is odd."""
+        """Convert readings to pressure [Pa].
+
+        The curve is odd because noise may make readings negative.
+        """
         exponent, c1, c2, c3 = self._curve.tolist()
         x = np.abs(readings)
         return np.asarray(np.sign(readings) * (c1 * x**exponent + c2 * x**2 + c3 * x**3))
 
     def at(self, count: int) -> FloatArray:
-        """Return a new array with the pressure [Pa] of each cell that reads ``count``."""
+        """Return a new array with each cell's pressure [Pa] at a reading of ``count``."""
         return self(np.full(self.zero.shape, count, np.uint16))
 
     @property
@@ -293,26 +301,26 @@ class Converter:
 
     @property
     def largest(self) -> float:
-        """Highest pressure [Pa] that any cell can read."""
+        """Highest pressure [Pa] that any cell can measure."""
         return float(self.at(self._full).max())
 
     @property
     def quantum(self) -> float:
-        """Typical pressure of one count [Pa]: the mean slope of the curve."""
+        """Typical pressure per count [Pa]: the mean slope of the curve."""
         return self.saturation / self._full
 
 
 def least_end(ends: FloatArray) -> float:
-    """Return the smallest reading, above the cell's own zero, at which a cell saturates.
+    """Return the smallest reading above a cell's own zero offset at which a cell saturates.
 
-    Cells that are nearly saturated without load are ignored. Otherwise all other cells would count
-    as saturated.
+    Cells that are nearly saturated without load are ignored, because their low limit would make all
+    other cells count as saturated.
     """
     return float(ends[ends >= _FAULTY * np.median(ends)].min())
 
 
 def _contradiction(calibration: Calibration) -> str:
-    """Return a message if values contradict each other, or an empty text."""
+    """Return a message if values contradict each other, otherwise ""."""
     sensor = calibration.sensor
     tables = {}
     if calibration.tare:
@@ -344,7 +352,7 @@ def _contradiction(calibration: Calibration) -> str:
 
 
 def _usb_serial(settings: Settings, finger: int) -> str:
-    """Return the serial number of the USB adapter at the finger's port, or an empty text."""
+    """Return the serial number of the USB adapter on the finger's port, or "" if there is none."""
     tactile = settings.tactile
     if tactile.backend in ("simulated", "replay", "none"):
         return ""

@@ -1,4 +1,4 @@
-"""Model of a finger's tip and sensor, from the settings and the calibration file."""
+"""Build the model of a finger's tip and sensor from the settings and the calibration file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 @dataclass(frozen=True)
 class FingerModel:
-    """Material, contact table and grid of one finger, and its calibration if there is one."""
+    """Material, contact table, sensor grid and optional calibration of one finger."""
 
     finger: int
     material: Material
@@ -44,7 +44,7 @@ class FingerModel:
 
     @property
     def own_material(self) -> bool:
-        """True if the stress-strain law of the tip comes from its calibration."""
+        """True if the tip's stress-strain law comes from its calibration."""
         return self.calibration is not None and self.calibration.modulus is not None
 
 
@@ -53,10 +53,11 @@ def make_models(
 ) -> tuple[FingerModel, FingerModel]:
     """Create the models of both fingers.
 
-    Without a calibrated modulus, a tip has the stress-strain law of the settings. A finger that is
-    not in the scene or has no sensor uses the settings alone.
+    If the modulus of a tip is not calibrated, its stress-strain law comes from the settings. A
+    finger that is not in the scene or has no sensor uses only the settings.
 
-    Raises the exceptions of `profile.factory.make_table` and `calibration_file.calibration_for`.
+    Raises the same exceptions as `profile.factory.make_table` and
+    `calibration_file.calibration_for`.
     """
     if on_event is not None:
         for warning in plausibility_warnings(settings):
@@ -70,7 +71,7 @@ def make_models(
             calibration = calibration_for(settings, finger)
         if measured:
             if name not in settings.scene.fingers:
-                continue  # it gets the model of the other finger
+                continue  # It gets the other finger's model below.
             material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
             table = make_table(settings, material, tip)
         elif calibration is not None and calibration.modulus is not None:
@@ -100,10 +101,10 @@ def make_models(
 
 
 def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
-    """Return the prior of a finger: from `calibrate scales`, otherwise from the settings."""
+    """Return a finger's prior from `calibrate scales`, or else from the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales
-        # A gain changes with temperature and load, so its calibration does not make it certain.
+        # The gain changes with temperature and load, so it remains uncertain after calibration.
         gain = found.gain[0], max(found.gain[1], settings.tactile.gain_error)
         return Prior(found.modulus, gain, found.torque)
     error = settings.material.modulus_error or MODULUS_ERROR
@@ -116,9 +117,9 @@ def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
 
 
 def _measured_tip(settings: Settings, finger: int, calibration: Calibration | None) -> Fingertip:
-    """Return the tip with the curves of its calibration file.
+    """Return the tip with the measured curves of its calibration file.
 
-    Raises SettingsError if there are none or they do not fit the settings.
+    Raises SettingsError if the file has no curves or they do not match the settings.
     """
     law = None if calibration is None else calibration.law
     file = settings.tactile.calibration[finger]
@@ -141,7 +142,7 @@ def _measured_tip(settings: Settings, finger: int, calibration: Calibration | No
 
 
 def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | None) -> SensorGrid:
-    """Return the grid of a sensor, with the calibrated centre and rotation if there are any."""
+    """Return a sensor's grid, with the calibrated centre and rotation if available."""
     if settings.tip.physics == "measured" and calibration is not None and calibration.law:
         return make_grid(settings, finger, calibration.law.centre, calibration.law.rotation)
     if calibration is None or calibration.centre is None:
@@ -156,16 +157,18 @@ def make_estimator(
     active: NDArray[np.bool_] | None = None,
     calibration: Calibration | None = None,
 ) -> ContactEstimator | MeasuredEstimator:
-    """Create the estimator of a finger. Fingers can't share one, since it keeps its last estimate.
+    """Create a finger's estimator. It keeps the last estimate, so fingers can't share one.
 
     Parameters
     ----------
     settings, material, finger
-        Settings of the hand, material of the tip, and index of the finger.
+        Settings of the hand, material of the tip, and finger index.
     active
-        Cells that exist [rows, cols]; dead cells of the settings are excluded in addition.
+        True for cells that exist [rows, cols]. The dead cells listed in the settings are also
+        excluded.
     calibration
-        With a calibration, frames are the pressures [Pa] of a `Converter`; without, counts.
+        With a calibration, frames are pressures [Pa] from a `Converter`; without one, they are
+        counts.
     """
     tactile = settings.tactile
     alive = np.ones((tactile.rows, tactile.cols), np.bool_) if active is None else active.copy()
@@ -176,7 +179,7 @@ def make_estimator(
         converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
         alive &= converter.live
         saturation, quantum = converter.saturation, converter.quantum
-        # The estimator subtracts 0.5 from a threshold, in the unit of the frame.
+        # The estimator subtracts 0.5 (in the unit of the frame) from a threshold.
         threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0
     if settings.tip.physics == "measured":
         return MeasuredEstimator(
@@ -199,7 +202,7 @@ def make_estimator(
 
 
 def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertainty:
-    """Return the systematic uncertainties, from the settings or the calibration."""
+    """Return the systematic uncertainties from the settings or the calibration."""
     tactile = settings.tactile
     baseline, centre, pitch = tactile.baseline_error, tactile.centre_error, tactile.pitch_error
     modulus, correlation = settings.material.modulus_error, None

@@ -1,14 +1,15 @@
-"""Updates of the hand's state by a tactile frame: angle, footprint and amplitude.
+"""Update the hand's state with a tactile frame: angle, footprint and amplitude channels.
 
 Channel     Measures                                                   Noise
-angle       φ ∓ α/2 ± ENCODER + ANGLE_BIAS − θ̇ LATENCY                 covariance of the frame
-footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain                  covariance of the frame
+angle       φ ∓ α/2 ± ENCODER + ANGLE_BIAS − θ̇ LATENCY                 frame covariance
+footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain:                 frame covariance
             ln F(D, θ) + MODULUS + GAIN − (∂ ln F/∂d) ḋ LATENCY
-amplitude   MODULUS + GAIN, if the gain was fitted                     2 % and the frame's
+amplitude   MODULUS + GAIN, if the gain was fitted                     2 %, frame covariance
 
-A frame shows the hand at the time of its scan, so it is compared with the state of that time by
-the history of the joints. `estimate.systematic`, the covariance that all frames share, is not part
-of the noise: it widens the published deviations and is never estimated.
+A frame shows the hand at the time of its scan. It is therefore compared with the state at that
+time, which is reconstructed from the joint history. `estimate.systematic`, the covariance that all
+frames share, is not part of the noise and is never estimated; it only increases the published
+standard deviations.
 """
 
 from __future__ import annotations
@@ -52,31 +53,31 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 FloatArray = NDArray[np.float64]
 
 GATE = 3.0  # standard deviations at which an innovation is clipped
-D_MIN = 1e-5  # m, least displacement of a tip that touches
-# A frame is an outlier beyond _OUTLIER_GATE standard deviations and one of these:
-ANGLE_JUMP = 0.12  # rad; correct frames stay within 0.04 of the prediction
+D_MIN = 1e-5  # m, minimum displacement of a tip in contact
+# A frame is an outlier if it exceeds _OUTLIER_GATE standard deviations and one of these limits.
+ANGLE_JUMP = 0.12  # rad; correct frames deviate from the prediction by at most 0.04
 D_JUMP = 1e-3  # m
-REJECTED_MAX = 2  # rejected frames in a row before the sensor is reported
+REJECTED_MAX = 2  # consecutive rejected frames that are tolerated before a sensor fault
 _OUTLIER_GATE = 5.0
-_JUMP_SUPPORT = 0.5  # part of a jump that the other tip must show as well to support it
-_SPEED_SUPPORT = 0.1  # rad/s, speed of the joints that supports a rotation
-_CONTINUED_ROTATION = 0.06  # rad from frame to frame, a rotation that goes on
-_RESTART_COUNT = 50  # rejected frames after which the contact starts again from the frames
-_NORMAL_FORCE_MIN = 1.0  # N on each tip; below, an object may rock between the tips
-_RATE_INTERVAL_MIN = 0.005  # s, least interval over which rates of d and θ are computed
-# A footprint that grows within the response of the cells looks wider and flatter: relative change
-# per var(d)/d², from the fit of a paraboloid to a mean of paraboloids.
+_JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must also show to confirm it
+_SPEED_SUPPORT = 0.1  # rad/s, joint speed that confirms a jump
+_CONTINUED_ROTATION = 0.06  # rad per frame, minimum step of a continuing rotation
+_RESTART_COUNT = 50  # consecutive rejected frames after which frames are accepted again
+_NORMAL_FORCE_MIN = 1.0  # N per tip; below this, an object may rock between the tips
+_RATE_INTERVAL_MIN = 0.005  # s, minimum interval for the rates of d and θ
+# A footprint that grows during the response time of the cells looks wider and flatter. These are
+# the relative changes per var(d)/d², from fitting a paraboloid to a mean of paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
-_SLOPE_SMOOTHING = 0.9  # low-pass filter of ∂ ln F/∂d from frame to frame
-_AMPLITUDE_ERROR = 0.02  # relative, of the pressure model
-_AMPLITUDE_RANGE = 1e-3, 1e3  # bounds of a frame's amplitude over the model's
-_FIRST_D_ERROR = 0.5  # prior of the first d of a contact, relative
-_FIRST_ANGLE_ERROR = 1.0  # rad, prior of the first angle
-_LOAD_STD = 0.05  # N·m, standard deviation of a load on the object before it is gripped
+_SLOPE_SMOOTHING = 0.9  # low-pass coefficient per frame for ∂ ln F/∂d
+_AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
+_AMPLITUDE_RANGE = 1e-3, 1e3  # bounds of the measured amplitude relative to the model
+_FIRST_D_ERROR = 0.5  # relative standard deviation of d at first contact
+_FIRST_ANGLE_ERROR = 1.0  # rad, standard deviation of the first angle
+_LOAD_STD = 0.05  # N·m, standard deviation due to a load on the object before it is gripped
 
 
 class FrameContact(NamedTuple):
-    """Contact found in one frame [m, rad, rad, -, N]."""
+    """Contact estimated from one frame [m, rad, rad, -, N]."""
 
     d: float
     theta: float
@@ -86,7 +87,7 @@ class FrameContact(NamedTuple):
 
 
 class FingerMotion(NamedTuple):
-    """Integrals of the predicted motion of one finger at one time."""
+    """Integrated predicted motion of one finger at one time."""
 
     d: float
     spread: float
@@ -97,13 +98,13 @@ class FingerMotion(NamedTuple):
 
 @inner_kernel
 def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int) -> FingerMotion:
-    """Interpolate the history at time ``t``; beyond its ends, return the end."""
+    """Interpolate the history at time ``t``, clamped to its ends."""
     size = len(history)
     before = after = newest
     fraction = 0.0
     for back in range(size):
         row = (newest - back) % size
-        if history[row].t == -math.inf:  # the frame is older than the first reading
+        if history[row].t == -math.inf:  # The frame is older than the first reading.
             before = after
             break
         before = row
@@ -127,10 +128,10 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
 def _rates(
     h: HandFilter, history: Records[HistoryRow], finger: int, scan: float, sense: float
 ) -> tuple[float, float]:
-    """Return the rates of d [m/s] and θ [rad/s] at the ``scan``: their slopes by the latency.
+    """Return the rates of d [m/s] and θ [rad/s] at the ``scan``, for the latency slopes.
 
-    They are secants over one standard deviation of the latency, since the joints may have stopped
-    meanwhile. Rates within the resolution of the velocities are 0.
+    The rates are secants over ±1 standard deviation of the latency, since the joints may have
+    stopped in between. Rates below the velocity resolution are set to 0.
     """
     span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_INTERVAL_MIN)
     first = _motion_at(history, h.newest_row, scan - span, finger)
@@ -178,10 +179,10 @@ def update(
     systematic: FloatArray,
     table: FloatArray,
 ) -> bool:
-    """Update by one finger's frame of time ``t``; return False if the frame is rejected.
+    """Update with one finger's frame from time ``t``; return False if the frame is rejected.
 
-    ``covariance`` [4, 4] of d, θ, tilt_y and gain; ``systematic`` is the part of it that all frames
-    share. A covariance of the gain above 0 means that the gain was fitted.
+    ``covariance`` is the [4, 4] covariance of d, θ, tilt_y and gain; ``systematic`` is the part of
+    it that all frames share. A gain variance above 0 means that the gain was fitted.
     """
     h = hands[0]
     tip = h.tip[finger]
@@ -198,7 +199,7 @@ def update(
     d_since = tip.travel[0] - at_scan.d
     q_since = tip.travel[1] - at_scan.q
     rotation_since = h.rotation - at_scan.angle
-    face = found.theta + sense * (tip.q - q_since)  # angle of the face at the scan
+    face = found.theta + sense * (tip.q - q_since)  # face angle at the scan [rad]
     is_fitted = covariance[3, 3] > 0.0
     gain_is_fixed = not (is_fitted or h.gain_is_known)
     tilt = total_tilt(found.theta, found.tilt_y)
@@ -216,7 +217,8 @@ def update(
     if is_new_contact:
         tip.touch_time = h.t
         _begin_contact(h, finger, sense, face + rotation_since)
-    # Cells that still respond to the touch show motion from before it, which no history has.
+    # While the cells still respond to the touch, they show motion that precedes the contact
+    # history.
     cells_respond = h.t - tip.touch_time < h.response
     if is_new_contact or cells_respond:
         reset(h, D + finger, d + d_since, (_FIRST_D_ERROR * d) ** 2)
@@ -243,7 +245,7 @@ def update(
     tip.shear = found.shear
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
-    if gain_is_fixed:  # GAIN is a state, so its part of the error is not shared
+    if gain_is_fixed:  # GAIN is a state, so its part of the error is not shared.
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = not cells_respond
@@ -262,7 +264,8 @@ def update(
         _set_footprint_slopes(h, finger, d_rate)
         _update_footprint(h, finger, d_innovation, d_noise)
     if is_fitted and not h.gain_is_known:
-        # The errors of d and gain are correlated: the footprint has used the common part.
+        # The errors of d and gain are correlated, and the footprint has already used the common
+        # part.
         ratio = (covariance[0, 3] - systematic[0, 3]) / (d_noise * gain)
         gain_noise = (covariance[3, 3] - systematic[3, 3]) / (gain * gain)
         own_noise = max(gain_noise - ratio * ratio * d_noise, 0.0)
@@ -290,9 +293,9 @@ def _is_finite(h: HandFilter) -> bool:
 
 @inner_kernel
 def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> None:
-    """Reset one finger's states at its touch; ``face`` is the angle in its first frame [rad].
+    """Reset one finger's states at touch; ``face`` is the angle in its first frame [rad].
 
-    If the other tip does not touch, all states start again.
+    If the other tip is not in contact, all states are reset.
     """
     for state in (MODULUS, GAIN, TORQUE):
         reset(h, state + finger, h.prior_mean[state + finger], h.prior_variance[state + finger])
@@ -322,7 +325,7 @@ def _update_angle(
     theta_rate: float,
     is_new_contact: bool,
 ) -> None:
-    """Update by the angle of a frame. Beyond the gate the object has turned, unpredicted."""
+    """Update with a frame's angle. Beyond the gate, the object has rotated unexpectedly."""
     before = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger]
     _set_angle_slopes(h, finger, sense, theta_rate)
     if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
@@ -335,10 +338,10 @@ def _update_angle(
 
 @inner_kernel
 def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: float) -> None:
-    """Update by the footprint with the slopes that are set.
+    """Update with the footprint, using the current slopes.
 
-    Beyond the gate, opposite innovations of the tips mean that the object has moved sideways. With
-    a fixed gain, equal ones mean that the gain has changed.
+    Innovations of opposite sign beyond the gate mean that the object has moved sideways. With a
+    fixed gain, innovations of the same sign mean that the gain has changed.
     """
     d_innovation = innovation / h.slopes[D + finger]
     other = h.tip[1 - finger].d_innovation
@@ -366,11 +369,12 @@ def _is_rejected(
 ) -> bool:
     """Return True if the frame of a held object is an outlier.
 
-    ``angle`` and ``d`` are (innovation, variance), ``speed`` is that of both joints [rad/s]. A jump
-    of one frame is an outlier unless the other tip and the joints support it. A rotation is real if
-    both tips show it and the joints move or the rotation continues. A displacement is real if the
-    joints move, or if both tips show it: a blow presses the object into one tip and away from the
-    other. The first frame of a real jump is rejected too, because the other tip is not known yet.
+    ``angle`` and ``d`` are (innovation, variance); ``speed`` is the sum of both joint speeds
+    [rad/s]. A jump is an outlier unless the other tip or the joints confirm it. A rotation is
+    accepted if both tips show it and either the joints move or the rotation continues. A
+    displacement is accepted if the joints move or both tips show it: a blow presses the object into
+    one tip and away from the other. The first frame of a real jump is also rejected, because the
+    other tip's frame has not arrived yet.
     """
     angle_innovation, angle_variance = angle
     d_innovation, d_variance = d

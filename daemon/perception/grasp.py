@@ -1,4 +1,4 @@
-"""The held object in this tick: the result of perception that control and safety read."""
+"""State of the held object on this tick, written by perception and read by control and safety."""
 
 from __future__ import annotations
 
@@ -24,49 +24,49 @@ CHANNELS = (
 
 
 class GraspState(Record):
-    """Forces and lever arms of the held object, and the consistency of each channel.
+    """Forces and lever arms on the held object, and consistency of each channel.
 
     Pairs are (left, right). SI units.
     """
 
-    t: float  # when the joints were read [s]
+    t: float  # time of the joint reading [s]
     q: Pair  # joint angles [rad]
-    d: Pair  # displacements of the tips [m]
-    force: Pair  # elastic forces of the tips [N]
+    d: Pair  # tip displacements [m]
+    force: Pair  # elastic tip forces [N]
     stiffness: Pair  # ∂F/∂d [N/m]
     normal: Pair  # normal forces [N]
-    shear: float  # shear force over normal force in the balance without a load
-    angle_std: float  # standard deviation of the object's angle [rad]
-    taper: float  # angle α between the object's faces [rad]
-    tilt_moment_ratio: float  # ∂U/∂θ over F θ d of an upright tip; constant
+    shear: float  # ratio of shear to normal force at equilibrium without a load
+    angle_std: float  # standard deviation of the object angle [rad]
+    taper: float  # angle α between the object faces [rad]
+    tilt_moment_ratio: float  # (∂U/∂θ)/(F θ d) of an upright tip, a constant
 
     # Lever arms
     moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
-    jacobian_rotation: Pair  # r1, r2 of φ̇ = r1 q̇1 − r2 q̇2
+    jacobian_rotation: Pair  # r1, r2 in φ̇ = r1 q̇1 − r2 q̇2
     jacobian_slide: float  # ∂(d1 + d2)/∂φ [m/rad]
-    energy_arm: Pair  # joint torque over force, by the gradient of the energy [m]
+    energy_arm: Pair  # joint torque over force, from the energy gradient [m]
 
-    # Load along the faces: it causes the mean residual load_arm L + load_curvature L².
-    torque_residual: Pair  # joint torque that only a load along the faces explains [N·m]
-    load_arm: float  # [m]; 0: the torques show no load
+    # A load L along the faces causes the mean residual load_arm L + load_curvature L².
+    torque_residual: Pair  # joint torque attributed to a load along the faces [N·m]
+    load_arm: float  # [m], 0 if the torques show no load
     load_curvature: float  # [m/N]
-    pull_shear: float  # shear of a pull in the newest frames of solid tips [N]
-    twist_shear: float  # shear of a twist, likewise [N]
-    free_torque: Pair  # largest torque of each joint in the free approach [N·m]
-    unexplained_rotation: Pair  # rotation of the object that no joint caused, summed [rad]
+    pull_shear: float  # shear due to a pull, newest frames of solid tips [N]
+    twist_shear: float  # shear due to a twist, newest frames of solid tips [N]
+    free_torque: Pair  # maximum torque of each joint during free approach [N·m]
+    unexplained_rotation: Pair  # accumulated object rotation not caused by the joints [rad]
 
     # Consistency
-    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # averaged, 1 is expected
-    angle_innovation: Pair  # of the newest frame's angle [rad]
-    d_innovation: Pair  # of the newest frame's displacement [m]
-    rejected_count: Pair  # frames rejected in a row
+    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running average, expected value 1
+    angle_innovation: Pair  # innovation of the newest angle [rad]
+    d_innovation: Pair  # innovation of the newest displacement [m]
+    rejected_count: Pair  # consecutive rejected frames
     d_bias: Pair  # [m]
     d_bias_std: Pair
     angle_bias: Pair  # [rad]
     angle_bias_std: Pair
-    has_bias: Pair  # 1 if one of the biases of a sensor is significant
-    gain_change: Pair  # logarithm of the gain over its prior
+    has_bias: Pair  # 1 if the sensor has a significant bias
+    gain_change: Pair  # log ratio of gain to its prior
     gain_std: Pair
     gain_prior_std: Pair
-    current_off_time: Pair  # for how long a joint's current has differed from its goal [s]
-    sensor_fault: bool  # one of the channels is faulty: no reason to increase the force
+    current_off_time: Pair  # duration of the deviation of a joint's current from its goal [s]
+    sensor_fault: bool  # a channel is faulty, so the grip force must not increase

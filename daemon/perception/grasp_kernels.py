@@ -1,11 +1,11 @@
-"""The grasp by the estimated state, and the updates by torques and by the balance of the tips.
+"""Compute the grasp from the estimated state; update with joint torques and tip force balance.
 
 Channel   Measures                                                         Noise
-torque    mean of (1 + TORQUE) times the moment of the tips' forces,       0.05 N·m, and what the
-          + FRICTION + inertia, while the joints close                     gears may hold
-balance   ln N1 − ln N2 = 0, with the normal forces N                      5 % and 0.4 N
+torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05 N·m and torque
+          while the joints close                                           held by the gears
+balance   ln N1 − ln N2 = 0, where N are the normal forces                 5 % and 0.4 N
 
-The force of a tip is ρ e^MODULUS F(D, θ), with its contact table F and its relaxation factor ρ.
+The force of a tip is ρ e^MODULUS F(D, θ), where F is its contact table and ρ its relaxation factor.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ from softfinger.kinematics.hand.grasp_state import holding_moment_arms, load_tor
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_NOISE = 0.05  # N·m of moving joints
-_CLOSING_MIN = 0.03  # rad/s, above the resolution of the velocity: the friction opposes closing
-_BALANCE_ERROR = 0.05  # relative, of the normal forces, and …
-_SUPPORT_FRICTION = 0.4  # N, friction of the object on a table, …
-_BALANCE_TIME = 0.1  # s, correlation time of both
-# A bias is significant beyond all of these
+_TORQUE_NOISE = 0.05  # N·m, noise of moving joints
+_CLOSING_MIN = 0.03  # rad/s, minimum closing speed at which friction opposes the motion
+_BALANCE_ERROR = 0.05  # relative error of the normal forces
+_SUPPORT_FRICTION = 0.4  # N, friction between object and table
+_BALANCE_TIME = 0.1  # s, correlation time of both errors
+# A bias is significant if it exceeds all of these limits.
 _BIAS_GATE = 5.0  # standard deviations
-_BIAS_RATIO_MIN = 0.8  # of the other sensor's bias, because a part of a bias appears in both
-_D_BIAS_MIN, ANGLE_BIAS_MIN = 0.1, 0.06  # of d; rad
+_BIAS_RATIO_MIN = 0.8  # fraction of the other sensor's bias, because a bias partly appears in both
+_D_BIAS_MIN, ANGLE_BIAS_MIN = 0.1, 0.06  # fraction of d; rad
 
 
 class TipResult(NamedTuple):
-    """Result of one tip [m, rad, N, J] with its standard deviations."""
+    """Result for one tip with standard deviations [m, rad, N, J]."""
 
     d: float
     theta: float
@@ -67,11 +67,11 @@ class TipResult(NamedTuple):
     d_std: float
     theta_std: float
     force_std: float
-    inside: bool  # the contact table covers it
+    inside: bool  # within the contact table
 
 
 class GraspResult(NamedTuple):
-    """Result of both tips and the object [rad, m]."""
+    """Result for both tips and the object [rad, m]."""
 
     left: TipResult
     right: TipResult
@@ -83,8 +83,8 @@ class GraspResult(NamedTuple):
 def _log_slope(h: HandFilter, finger: int) -> float:
     """Return ∂ ln F/∂d [1/m] of a tip.
 
-    With a fixed gain this is the slope of the footprint channel. Two different slopes would make
-    unobservable directions look observed.
+    With a fixed gain, this is the slope of the footprint channel. Using two different slopes would
+    make unobservable directions appear observable.
     """
     tip = h.tip[finger]
     slope: float = tip.log_slope
@@ -95,7 +95,7 @@ def _log_slope(h: HandFilter, finger: int) -> float:
 
 @inner_kernel
 def _set_torque_slopes(h: HandFilter) -> float:
-    """Set the slopes of both joints' mean torque by the tips' forces; return that torque [N·m]."""
+    """Set the slopes for the mean joint torque due to the tip forces; return that torque [N·m]."""
     expected = 0.0
     for k in range(2):
         scale = 1.0 + h.mean[TORQUE + k]
@@ -109,18 +109,18 @@ def _set_torque_slopes(h: HandFilter) -> float:
 
 @inner_kernel
 def _update_by_torques(h: HandFilter, dt: float) -> None:
-    """Update by the joints' mean torque while they close, and by the balance of the tips."""
+    """Update with the mean joint torque while the joints close, and with the tip force balance."""
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
     h.torque_max = max(h.torque_max, torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
     if h.closing_speed > _CLOSING_MIN:
         innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
-        # After the torque has decreased, the gears hold between nothing and all of the decrease.
+        # After a decrease in torque, the gears may hold any part of the decrease.
         held_torque = min(h.torque_max - torque, h.load_held * torque)
         variance = _TORQUE_NOISE * _TORQUE_NOISE + held_torque * held_torque
         if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
-            h.covariance[FRICTION, FRICTION] += innovation * innovation  # a load has gone
+            h.covariance[FRICTION, FRICTION] += innovation * innovation  # A load has been removed.
         correct(h, TORQUES, innovation, variance, GATE)
     h.slopes[:] = 0.0
     normal = h.grasp.normal
@@ -138,7 +138,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _relative_law_error(tip: TrackedTip, fraction: float) -> float:
-    """Return the relative error of F by table and law; ``fraction`` is d over the radius."""
+    """Return the relative error of F due to table and law at ``fraction`` = d/radius."""
     t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)
     return interpolate(tip.law_error[k], tip.law_error[k + 1], t - k)
@@ -185,7 +185,7 @@ def _write_tip(h: HandFilter, finger: int, theta: float, table: FloatArray) -> T
 
 @kernel
 def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArray) -> GraspResult:
-    """Write the grasp of the present state, then update the state by the joints' torques."""
+    """Write the grasp for the current state, then update the state with the joint torques."""
     h = hands[0]
     grasp = h.grasp
     left = h.tip[0]
@@ -245,7 +245,7 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
 
 @inner_kernel
 def _write_shear(h: HandFilter) -> None:
-    """Split the shear of solid tips: a pull is opposite on the two faces, a twist alike."""
+    """Split the shear of solid tips into a pull (opposite signs) and a twist (same sign)."""
     left = h.tip[0].shear
     right = h.tip[1].shear
     common = math.copysign(min(abs(left), abs(right)), left)
@@ -255,7 +255,7 @@ def _write_shear(h: HandFilter) -> None:
 
 @inner_kernel
 def _write_consistency(h: HandFilter) -> None:
-    """Write the biases, and whether a channel is faulty."""
+    """Write the biases and set `sensor_fault` if a channel is faulty."""
     grasp = h.grasp
     grasp.sensor_fault = False
     for k in range(2):
@@ -279,7 +279,7 @@ def _write_consistency(h: HandFilter) -> None:
 
 @inner_kernel
 def _has_bias(grasp: GraspState, finger: int) -> bool:
-    """Return True if a sensor's zero or image has moved significantly."""
+    """Return True if a sensor's zero offset or image has shifted significantly."""
     if not (grasp.d_bias_std[finger] > 0.0 and grasp.d[finger] > 0.0):
         return False
     in_d: bool = abs(grasp.d_bias[finger]) > max(

@@ -1,21 +1,21 @@
-"""The estimator of the hand: contacts and object pose in each tick.
+"""Estimate the contacts and the object pose on each tick.
 
-Frames are precise, but late and rare; joint readings are frequent, but coarse. While an object is
-held, the joints move d and the object's angle φ by the rolling constraints (`hand.grasp_state`),
-and each frame corrects them. `hand_state` has the state and its prediction, `frame_channels` and
-`grasp_kernels` have the measurements.
+Frames are precise but late and infrequent; joint readings are frequent but coarse. While an object
+is held, the joint motion predicts d and the object angle φ through the rolling constraints
+(`hand.grasp_state`), and each frame corrects them. `hand_state` contains the state and its
+prediction; `frame_channels` and `grasp_kernels` contain the measurements.
 
-φ is the angle of the bisector of the object's faces. The taper α between the faces is estimated
-from the frames of both tips and starts at ``object.taper``. A shifted sensor looks like a taper;
-the limit ``hand.angle`` compares the frames with ``object.taper`` for that reason.
+φ is the angle of the bisector of the object faces. The taper α between the faces is estimated from
+the frames of both tips, starting from ``object.taper``. A shifted sensor looks like a taper, so the
+limit ``hand.angle`` compares the frames with ``object.taper``.
 
-A disc has no faces: φ is then the direction of the line between the contacts, and ``rotate`` acts
-on this line. It turns by 2 L sin q/(2R + 2a − d1 − d2) per joint angle, 0.4 for a radius R of
-20 mm and the default hand, where the prediction for faces is 1.5. The frames correct the rest, so
-turning takes longer and the disc rolls further than commanded. A curved contact looks less tilted
-than it is, which makes φ some 5 % too small. If the fingers stand straight or lean outwards, the
-line does not follow the joints: a disc with R ≥ 30 mm can be held, but turning it ends at the
-limits of the tips.
+A disc has no faces. φ is then the direction of the line between the contacts, and ``rotate`` acts
+on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per joint angle, which is 0.4 for a
+radius R of 20 mm and the default hand; the prediction for faces is 1.5. The frames correct the
+difference, so a rotation takes longer and the disc rolls further than commanded. A curved contact
+looks less tilted than it is, which makes φ about 5 % too small. If the fingers are straight or lean
+outwards, the line does not follow the joints: a disc with R ≥ 30 mm can be held, but its rotation
+stops at the tip limits.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
 
-# Standard deviations of settings
+# Standard deviations of the settings.
 _TAPER_ERROR = 0.1  # rad, `object.taper`
 _LATENCY_ERROR = 0.03  # s, `tactile.latency`
 _FRICTION_ERROR = 0.05  # N·m, `control.joint_friction`
-_GOAL_DISTANCE = 0.25  # rad; a joint this far from its goal takes all the current of the goal
+_GOAL_DISTANCE = 0.25  # rad; a joint farther than this from its goal draws the full goal current
 
 
 class HandEstimator:
-    """Estimator of one hand. Without a contact it costs one comparison a tick."""
+    """Estimator for one hand. Without contact, it costs one comparison per tick."""
 
     def __init__(
         self,
@@ -60,7 +60,11 @@ class HandEstimator:
         materials: tuple[Material, Material] | None = None,
         priors: tuple[Prior, Prior] = (UNKNOWN, UNKNOWN),
     ) -> None:
-        """Take each tip's table, its material, whose law has an error, and its priors."""
+        """Create the estimator.
+
+        Each tip has a contact table, priors, and a material that provides the error of its
+        stress-strain law.
+        """
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._estimates_object = settings.scene.object_model
@@ -101,12 +105,12 @@ class HandEstimator:
             _tilt_moment_ratio(table, state.radius) for table in tables
         )
         self._joints_read = False
-        self._factors_outdated = True  # a frame came since the calibration factors were written
+        self._factors_outdated = True  # a frame arrived after the factors were last written
         self._in_contact = [False, False]
-        self._invalid = [Invalid.NO_FRAME] * 2  # reason why the newest estimate is not used
+        self._invalid = [Invalid.NO_FRAME] * 2  # why the newest estimate is not used
 
     def _set_prior(self, settings: Settings, priors: tuple[Prior, Prior]) -> None:
-        """Write the priors and start with them."""
+        """Set the priors and reset the state to them."""
         state = self._state
         for finger, prior in enumerate(priors):
             for at, (mean, error) in (
@@ -131,7 +135,7 @@ class HandEstimator:
     def predict(self, reading: Reading, goal: Goal | None = None) -> None:
         """Predict the state at the time of a valid reading.
 
-        ``goal`` is the goal that the servos had, if a grip set their currents.
+        If a grip sets the servo currents, ``goal`` is the goal that was active during the reading.
         """
         self._joints_read = True
         q1, q2 = reading.q
@@ -158,16 +162,16 @@ class HandEstimator:
         contact: Contact,
         has_changed: bool = True,
     ) -> None:
-        """Update by a finger's new ``frame`` and its ``estimate``; write both into ``contact``.
+        """Update with a finger's new ``frame`` and its ``estimate``; write both to ``contact``.
 
-        A frame that repeats an earlier one bit by bit has not changed. In a contact it comes from a
-        board that is frozen or sends old data, so it is not used.
+        ``has_changed`` is False for a frame that is identical to an earlier one. During contact,
+        such a frame comes from a board that is frozen or sends old data, so it is not used.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
-            return  # the joints carry the contact on, and its age grows
-        # Without a reading of the joints, the frame is used alone.
+            return  # Joint motion still predicts the contact, whose age increases.
+        # Without a joint reading, only the frame is used.
         in_contact = estimate.contact and self._joints_read
         if in_contact and self._in_contact[finger] and not has_changed:
             contact.t_valid = frame.t_arrival
@@ -195,7 +199,7 @@ class HandEstimator:
         if not in_contact:
             tip = self._state.tip[finger]
             if tip.in_contact:
-                self.grasp.free_torque[finger] = 0.0  # measured again in the next approach
+                self.grasp.free_torque[finger] = 0.0  # measured again during the next approach
                 tip.free_torque_max[:] = 0.0
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0
@@ -209,7 +213,7 @@ class HandEstimator:
             )
 
     def write_contacts(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
-        """Write the estimates of time ``t`` into contacts and pose."""
+        """Write the estimates at time ``t`` to ``contacts`` and ``pose``."""
         in_contact = self._in_contact
         pose.valid = in_contact[0] and in_contact[1] and self._estimates_object
         pose.angle = pose.width = 0.0
@@ -260,12 +264,12 @@ class HandEstimator:
 
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:
-    """Return the current [A] of a goal that is out of reach, so that the current is limited."""
+    """Return the goal current [A] if the joint is too far from its goal to draw less, else 0."""
     return goal.current[finger] if goal.q[finger] - q > _GOAL_DISTANCE else 0.0
 
 
 def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
-    """Return ∂U/∂θ over F θ d near upright: 2/3 for springs, about 0 for solid rubber."""
+    """Return (∂U/∂θ)/(F θ d) near upright: 2/3 for springs, about 0 for solid rubber."""
     d, theta = 0.15 * radius, 0.05
     contact = table(d, theta)
     return float(contact.energy_theta / (contact.force * d)) / theta
@@ -279,16 +283,16 @@ def _fill_from_frame(
     prior: Prior,
     radius: float,
 ) -> None:
-    """Fill ``contact`` from one frame alone; ``table`` and ``law`` are those of its tip.
+    """Fill ``contact`` from a single frame, using the tip's contact ``table`` and ``law`` error.
 
-    The priors divide the frame's amplitude between modulus and gain.
+    The frame amplitude is divided between modulus and gain according to their priors.
     """
     contact.d, contact.theta = estimate.d, estimate.tilt_x
     contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
     contact.force = contact.energy = contact.force_std = 0.0
     contact.inside = True
     if not estimate.contact:
-        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # of a contact below the noise
+        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # a contact hidden by noise
         return
     tilt = total_tilt(contact.theta, contact.tilt_y)
     force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)

@@ -1,21 +1,22 @@
-"""The state of the hand, its prediction by the joints, and the update by one measurement.
+"""State of the hand, its prediction from joint motion, and its update with one measurement.
 
-`docs/estimation.md` derives the model and says which manoeuvre makes which state observable.
+`docs/estimation.md` derives the model and lists the manoeuvres that make each state observable.
 
-State           Unit   Meaning                                      Changes by
-D               m      displacement of each tip                     joint motion, a sideways shift
-ENCODER         rad    true minus tracked joint angle               resolution of the velocity
-D_BIAS          m      bias of d in the frames, as by a zero        warming up
-ANGLE_BIAS      rad    bias of the angle in the frames              a shifting image
-MODULUS         –      ln of the tip's modulus over the settings'   constant in a grip
-GAIN            –      ln of the sensor's gain                      temperature
-TORQUE          –      relative error of the torque constant        constant in a grip
-ANGLE, TAPER    rad    of the object's faces                        rolling
-LATENCY         s      age of frames beyond `tactile.latency`       constant in a grip
-FRICTION        N·m    mean joint torque that the grip force        slowly
-                       does not explain
+State           Unit   Meaning                                      Changes due to
+D               m      displacement of each tip                     joint motion, sideways shift
+ENCODER         rad    true minus tracked joint angle               velocity resolution
+D_BIAS          m      d bias in frames, e.g. from a zero offset    sensor warm-up
+ANGLE_BIAS      rad    angle bias in frames                         image shift
+MODULUS         –      ln of tip modulus relative to the settings   (constant in a grip)
+GAIN            –      ln of sensor gain                            temperature
+TORQUE          –      relative error of the torque constant        (constant in a grip)
+ANGLE, TAPER    rad    angle and taper of the object faces          rolling
+LATENCY         s      frame age beyond `tactile.latency`           (constant in a grip)
+FRICTION        N·m    mean joint torque not explained by the       slow drift
+                       grip force
 
-States up to TORQUE are pairs: the left one at the index, the right one after it. SI units.
+States up to TORQUE are pairs: the left finger is at the index, the right finger at the next index.
+SI units.
 """
 
 from __future__ import annotations
@@ -39,105 +40,105 @@ ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 # Measurement channels, in the order of `grasp.CHANNELS`; the first four are pairs.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-HISTORY_TIME = 0.5  # s of joint motion that is stored; an older frame is treated as this old
-CURRENT_OFF_TIME_MAX = 0.1  # s for which a current may differ from its goal
-LAW_POINTS = 17  # nodes over d, from 0 to the radius
+HISTORY_TIME = 0.5  # s of stored joint motion; older frames are treated as this old
+CURRENT_OFF_TIME_MAX = 0.1  # s, maximum time for which a current may differ from its goal
+LAW_POINTS = 17  # nodes in d from 0 to the radius
 
-# Random walks in a grip, per √s. The sources are in docs/estimation.md.
-_WALK_CLOSING = 2e-5  # m, d1 + d2: the width of the object is constant
-_WALK_SIDEWAYS = 3e-4  # m, d1 − d2: the object is free to move between the tips
-_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # m, d1 − d2 if the frames do not measure d by themselves
-_WALK_LOOSE_D = 5e-3  # m, object touched by one of two fingers
-_WALK_LOOSE_ANGLE = 2e-2  # rad, likewise
-_WALK_ANGLE = 2e-4  # rad, creep of the tips
-_WALK_D_BIAS = 1e-4  # m, zero of a sensor that warms up
+# Random walks during a grip, per √s. docs/estimation.md gives the sources.
+_WALK_CLOSING = 2e-5  # m, for d1 + d2; small because the object width is constant
+_WALK_SIDEWAYS = 3e-4  # m, for d1 − d2; the object can move between the tips
+_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # m, for d1 − d2 if frames do not measure d independently
+_WALK_LOOSE_D = 5e-3  # m, object in contact with only one of two fingers
+_WALK_LOOSE_ANGLE = 2e-2  # rad, same case
+_WALK_ANGLE = 2e-4  # rad, tip creep
+_WALK_D_BIAS = 1e-4  # m, zero drift during sensor warm-up
 _WALK_ANGLE_BIAS = 1e-3  # rad
-_WALK_GAIN = 0.05  # gain of a sensor that warms up
-_WALK_GAIN_FIXED_GAIN = 0.01  # if the frames measure only force times gain
+_WALK_GAIN = 0.05  # gain drift during sensor warm-up
+_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times gain
 _WALK_FRICTION = 0.05  # N·m
 _MOTION_ERROR = 0.05  # relative error of the predicted rotation and closing
-_SIDEWAYS_ERROR = 0.1  # part of the fingers' sideways motion that shifts the object in the grip
-_MOTION_TIME = 0.1  # s, correlation time of these two
-_VELOCITY_TIME = 0.02  # s, correlation time of the velocity's rounding
-_VARIANCE_MIN = 1e-6  # smallest ratio of the variances after and before one measurement
+_SIDEWAYS_ERROR = 0.1  # fraction of sideways finger motion that shifts the object in the grip
+_MOTION_TIME = 0.1  # s, correlation time of these two errors
+_VELOCITY_TIME = 0.02  # s, correlation time of velocity rounding
+_VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to that before it
 _TORQUE_ERROR_MAX = 0.3  # bound of |TORQUE|
 _LATENCY_MAX = 0.15  # s, bound of LATENCY
-_ROTATION_MAX = 1.0  # rad between two readings; a larger prediction is dropped as impossible
-_FREE_TORQUE_TIME = 0.02  # s over which the torque of a free joint is averaged
-_TOUCH_DELAY = 0.1  # s from a touch until a frame shows it
-_CURRENT_ERROR = 0.25  # allowed deviation of a current from its goal, relative …
-_CURRENT_NOISE = 0.02  # … and in A
+_ROTATION_MAX = 1.0  # rad between two readings; larger predictions are discarded as impossible
+_FREE_TORQUE_TIME = 0.02  # s, averaging time for the torque of a free joint
+_TOUCH_DELAY = 0.1  # s, delay from a touch until a frame shows it
+_CURRENT_ERROR = 0.25  # allowed relative deviation of a current from its goal
+_CURRENT_NOISE = 0.02  # A, additional allowed deviation
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
-_NIS_SAMPLES = 100.0  # measurements over which the squared innovations are averaged
+_NIS_SAMPLES = 100.0  # number of measurements averaged for squared innovations
 
 
 class TrackedTip(Record):
-    """Data of one finger beside the state."""
+    """Per-finger data that is not part of the state vector."""
 
     in_contact: bool
     touch_time: float  # start of the contact [s]
-    has_new_frame: bool  # a frame came after the last update by torques
-    gain_is_fixed: bool  # its frames measure force times gain, and no displacement
+    has_new_frame: bool  # a frame arrived after the last torque update
+    gain_is_fixed: bool  # its frames measure force times gain but not displacement
     tilt_y: float  # [rad]
-    shear: float  # along the face in the hand's plane, in the newest frame of a solid tip [N]
+    shear: float  # shear along the face in the hand plane, newest frame of a solid tip [N]
     log_slope: float  # ∂ ln F/∂d, low-pass filtered [1/m]
-    d_innovation: float  # of the newest frame [m]
-    shared_variance: Pair  # of d and θ, common to all frames
+    d_innovation: float  # innovation of the newest frame [m]
+    shared_variance: Pair  # variance of d and θ common to all frames
     q: float  # tracked joint angle [rad]
     encoder: float  # last encoder reading [rad]
-    speed: float  # of the joint [rad/s]
-    torque: float  # of the joint [N·m]
-    free_torque: float  # torque without a contact, averaged [N·m]
-    free_torque_max: Pair  # maxima in the present window of _TOUCH_DELAY and in the one before
+    speed: float  # joint speed [rad/s]
+    torque: float  # joint torque [N·m]
+    free_torque: float  # average torque without contact [N·m]
+    free_torque_max: Pair  # maxima in the current and the previous _TOUCH_DELAY window
     window_start: float  # [s]
-    travel: Pair  # integrals of predicted motion: of d [m], of the joint [rad]
-    law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F by table and law, over d
-    relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered lasting forces [N]
-    relaxation: float  # factor ρ of the tip's force over its lasting force
+    travel: Pair  # integrated predicted motion of d [m] and the joint [rad]
+    law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F due to table and law
+    relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered long-term forces [N]
+    relaxation: float  # relaxation factor ρ: tip force over long-term force
 
 
 class HistoryRow(Record):
-    """Predicted motion at one instant, as the cells show it: a row of the history."""
+    """History row: predicted motion at one instant, filtered by the cell response."""
 
     t: float
     d: Pair
-    spread: Pair  # variance of the values of d that the cells average [m²]
+    spread: Pair  # variance of d within the cell response time [m²]
     angle: float
     q: Pair
     relaxation: Pair
 
 
 class HandFilter(Record):
-    """State, covariance, constants and results of the estimator."""
+    """Estimator state, covariance, constants and results."""
 
     mean: Annotated[FloatArray, STATES]
     covariance: Annotated[FloatArray, STATES, STATES]
-    prior_mean: Annotated[FloatArray, STATES]  # means before a contact, and …
-    prior_variance: Annotated[FloatArray, STATES]  # … variances
-    slopes: Annotated[FloatArray, STATES]  # of the measurement; 0 between two updates
+    prior_mean: Annotated[FloatArray, STATES]  # means before a contact
+    prior_variance: Annotated[FloatArray, STATES]  # variances before a contact
+    slopes: Annotated[FloatArray, STATES]  # measurement row H, 0 between updates
     scratch: Annotated[FloatArray, STATES]
-    half_separation: float  # of the pivots [m]
-    length: float  # of a finger [m]
-    offset: float  # of a fingertip [m]
-    radius: float  # of a tip [m]
-    encoder_resolution: float  # of an encoder [rad]
+    half_separation: float  # half the pivot separation [m]
+    length: float  # finger length [m]
+    offset: float  # fingertip offset [m]
+    radius: float  # tip radius [m]
+    encoder_resolution: float  # encoder resolution [rad]
     velocity_unit: float  # [rad/s]
     latency: float  # `tactile.latency` [s]
     response: float  # `tactile.response` [s]
-    relaxation: Annotated[FloatArray, 3]  # `tip.relaxation` and …
-    relaxation_time: Annotated[FloatArray, 3]  # … `tip.relaxation_times` [s]
-    torque_constant: float  # torque at the tip of a closing joint over its current [N·m/A]
-    inertia: float  # of a joint [kg·m²]
-    load_held: float  # share of the tips' moment that gears hold when the torque decreases
-    is_single: bool  # the hand has one finger
+    relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
+    relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
+    torque_constant: float  # output torque of a closing joint per current [N·m/A]
+    inertia: float  # joint inertia [kg·m²]
+    load_held: float  # fraction of the tip moment held by the gears when torque decreases
+    is_single: bool  # one-finger hand
     gain_is_known: bool  # `estimator.free_gain` is false
-    t: float  # of the last reading [s]
-    newest_row: int  # row of the history
-    rotation: float  # integral of the predicted rotation [rad]
-    closing_speed: float  # mean speed of both joints, averaged [rad/s]
-    last_closing_speed: float  # in the tick before
-    torque_max: float  # largest mean torque in this grip [N·m]
-    balance_time: float  # of the last update by torques and balance [s]
+    t: float  # time of the last reading [s]
+    newest_row: int  # index in the history
+    rotation: float  # integrated predicted rotation [rad]
+    closing_speed: float  # mean speed of both joints, low-pass filtered [rad/s]
+    last_closing_speed: float  # on the previous tick [rad/s]
+    torque_max: float  # maximum mean torque during this grip [N·m]
+    balance_time: float  # time of the last torque and balance update [s]
     tip: Annotated[Records[TrackedTip], 2]
     grasp: GraspState
 
@@ -147,7 +148,7 @@ class HandFilter(Record):
 
 @inner_kernel
 def predicted_variance(h: HandFilter) -> float:
-    """Return the variance slopesᵀ P slopes; write P slopes into `scratch`."""
+    """Return the variance slopesᵀ P slopes and store P slopes in `scratch`."""
     expected = 0.0
     for i in range(STATES):
         total = 0.0
@@ -160,11 +161,11 @@ def predicted_variance(h: HandFilter) -> float:
 
 @inner_kernel
 def correct(h: HandFilter, channel: int, innovation: float, variance: float, gate: float) -> None:
-    """Update the state by one scalar measurement with the `slopes`; set the slopes to 0.
+    """Update the state with one scalar measurement, using `slopes`, then set the slopes to 0.
 
-    ``variance`` is that of the noise. An innovation beyond ``gate`` standard deviations is clipped
-    there (Huber), and one that is not finite is ignored. `grasp.nis` averages the normalised
-    squared innovation of each ``channel``.
+    ``variance`` is the noise variance. The innovation is clipped at ``gate`` standard deviations
+    (Huber) and ignored if it is not finite. `grasp.nis` averages the normalised innovation squared
+    of each ``channel``.
     """
     expected = predicted_variance(h)
     square = innovation * innovation
@@ -190,7 +191,7 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
 
 @inner_kernel
 def reset(h: HandFilter, state: int, mean: float, variance: float) -> None:
-    """Replace one state by ``mean`` and ``variance``, independent of the other states."""
+    """Set one state to ``mean`` and ``variance``, uncorrelated with the other states."""
     h.covariance[state, :] = 0.0
     h.covariance[:, state] = 0.0
     h.covariance[state, state] = variance
@@ -210,7 +211,7 @@ def reset_all(h: HandFilter) -> None:
 
 @inner_kernel
 def motion_of(h: HandFilter) -> Motion:
-    """Return the Jacobian of the held object, as `hand.grasp_state.held_motion`."""
+    """Return the Jacobian of the held object; see `hand.grasp_state.held_motion`."""
     q = h.tip[0].q, h.tip[1].q
     d = h.mean[D], h.mean[D + 1]
     lengths = h.half_separation, h.length, h.offset, h.radius
@@ -224,7 +225,7 @@ def _walk(h: HandFilter, state: int, per_root_second: float, dt: float) -> None:
 
 @inner_kernel
 def _walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: float) -> None:
-    """Add process noise to a pair: ``common`` to the mean, ``opposite`` to the difference."""
+    """Add process noise to a pair: ``common`` to its mean, ``opposite`` to its difference."""
     alike = common * common * dt
     other = opposite * opposite * dt
     h.covariance[state, state] += alike + other
@@ -243,9 +244,9 @@ def predict(
     current: FloatPair,
     goal: FloatPair,
 ) -> None:
-    """Predict the state at time ``t`` by a reading of the joints [rad, rad/s, A].
+    """Predict the state at time ``t`` from a joint reading [rad, rad/s, A].
 
-    ``goal`` is the current that a grip commands [A], 0 without a grip.
+    ``goal`` is the current commanded by a grip [A], or 0 without a grip.
     """
     h = hands[0]
     dt = t - h.t
@@ -260,7 +261,7 @@ def predict(
         if not tip.in_contact:
             _measure_free_torque(h, k, t, dt, dq[k] - last_speed[k])
     h.t = t
-    if dt > HISTORY_TIME:  # after a pause the encoders are the only source
+    if dt > HISTORY_TIME:  # After a pause, the encoders are the only source.
         dt = 0.0
         for k in range(2):
             h.tip[k].q = h.tip[k].encoder = q[k]
@@ -277,7 +278,7 @@ def predict(
 
 @inner_kernel
 def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> None:
-    """Store this tick's motion, low-pass filtered by the response of the cells."""
+    """Store this tick's motion, low-pass filtered by the cell response."""
     smoothing = math.exp(-dt / h.response) if h.response > 0.0 else 0.0
     last = history[h.newest_row]
     h.newest_row = (h.newest_row + 1) % len(history)
@@ -295,17 +296,17 @@ def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> 
 
 @inner_kernel
 def interpolate(first: float, last: float, fraction: float) -> float:
-    """Return the value between ``first`` and ``last``."""
+    """Interpolate linearly between ``first`` and ``last``."""
     return first + fraction * (last - first)
 
 
 @inner_kernel
 def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
-    """Move joints, tips and object with the measured velocities ``dq`` [rad/s]."""
+    """Advance joints, tips and object with the measured velocities ``dq`` [rad/s]."""
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
-    # A tip that does not touch yet approaches by as much as it would be pressed deeper.
+    # Before contact, a tip approaches at the rate at which it would later be compressed.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:
@@ -324,7 +325,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     right.q += step2
     left.travel[1] += step1
     right.travel[1] += step2
-    # An impossible step, as by a taper of half a turn, would stay in the state for ever.
+    # An impossible step, for example due to a taper of 180°, would stay in the state forever.
     if not (abs(d_step1) + abs(d_step2) < h.radius and abs(rotation) < _ROTATION_MAX):
         return
     left.travel[0] += d_step1
@@ -343,7 +344,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
         h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples
         _walk_pair(h, D, closing_error, sideways_error, samples)
     for k in range(2):
-        # The rounding of a velocity moves encoder, tips and object together.
+        # Velocity rounding affects encoder, tips and object together.
         variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
         h.scratch[:] = 0.0
         h.scratch[ENCODER + k] = 1.0
@@ -359,7 +360,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
 
 @inner_kernel
 def _add_process_noise(h: HandFilter, dt: float) -> None:
-    """Add the random walks of ``dt`` s of a contact."""
+    """Add ``dt`` seconds of random walk during a contact."""
     if h.is_single or (h.tip[0].in_contact and h.tip[1].in_contact):
         sideways = _WALK_SIDEWAYS
         if h.is_single:
@@ -381,9 +382,9 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
-    """Update by the encoder: at a change of its count precisely, otherwise within one count.
+    """Update with the encoder: precisely when its count changes, otherwise to within one count.
 
-    ``step`` is the joint's motion since the last reading, by its velocity [rad].
+    ``step`` is the joint motion since the last reading according to its velocity [rad].
     """
     tip = h.tip[finger]
     at = ENCODER + finger
@@ -392,8 +393,8 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
     resolution = h.encoder_resolution
     half = 0.5 * resolution
     if abs(jump) > half:
-        # The joint passed this edge since the last reading. After several counts at once, only
-        # the last count but one is certain.
+        # The joint has crossed this count edge since the last reading. After a jump of several
+        # counts, the joint angle is only known to within one count.
         found = q - math.copysign(half, jump)
         spread = max(step, 0.05 * resolution) if abs(jump) < 1.5 * resolution else resolution
     elif abs(q - tip.q) > half:
@@ -416,9 +417,9 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
 def _measure_free_torque(
     h: HandFilter, finger: int, t: float, dt: float, speed_change: float
 ) -> None:
-    """Measure the largest torque of a joint that moves freely: its friction.
+    """Measure the maximum torque of a freely moving joint, which is its friction.
 
-    The last _TOUCH_DELAY is left out, because the tip may touch already.
+    The last _TOUCH_DELAY is excluded, because the tip may already be in contact.
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
@@ -434,9 +435,9 @@ def _measure_free_torque(
 
 @inner_kernel
 def _check_current(grasp: GraspState, finger: int, current: float, goal: float, dt: float) -> float:
-    """Return a joint's current [A]: in a grip its ``goal``, otherwise the measured one.
+    """Return a joint's current [A]: its ``goal`` during a grip, otherwise the measured current.
 
-    Counts for how long the two differ by more than the controller of a servo lets them.
+    Also measures how long the two have differed by more than a servo's current controller allows.
     """
     if goal <= 0.0:
         grasp.current_off_time[finger] = 0.0
@@ -450,10 +451,10 @@ def _check_current(grasp: GraspState, finger: int, current: float, goal: float, 
 
 @inner_kernel
 def _relax(h: HandFilter, finger: int, dt: float) -> None:
-    """Relax a tip for ``dt`` s (Prony series) and set its relaxation factor."""
+    """Advance a tip's relaxation (Prony series) by ``dt`` seconds and set its relaxation factor."""
     tip = h.tip[finger]
     lasting = h.grasp.force[finger] / tip.relaxation if tip.in_contact else 0.0
-    if not lasting < math.inf:  # beyond the tip's law
+    if not lasting < math.inf:  # beyond the range of the tip's law
         lasting = 0.0
     factor = 1.0
     for k in range(3):

@@ -1,7 +1,7 @@
-"""Perception of the fingers: calibrate each new frame, estimate its contact, and filter.
+"""Process the fingers' frames: calibrate, estimate the contact, and filter.
 
-`FingerPerception` estimates each frame once. `hand_estimator` filters the estimates and predicts
-the contacts of every tick.
+`FingerPerception` processes each frame once. `hand_estimator` filters the estimates and predicts
+the contacts on every tick.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from softfinger.daemon.types import FINGERS, Event, Frame, SensorInfo, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAME_COUNT = 16
-_ZERO_INTERVAL = 8  # frames between updates of the zero; thermal drift takes seconds
+_ZERO_INTERVAL = 8  # frames between zero updates; thermal drift takes seconds
 _PRESSURE_STEPS = 65535  # quantisation steps of a published pressure
-_STORED_TIME = 2.0  # s of frames that are remembered
-_REPEATED_TIME = 0.1  # s of repeated frames that are no coincidence
-_REPEATED_COUNT_MIN = 5  # lower bound of the number of these frames
-_CHANGED_CELLS_MIN = 4  # between frames; one or two noisy cells repeat by chance
+_STORED_TIME = 2.0  # s of stored frames
+_REPEATED_TIME = 0.1  # s of repeated frames that indicate a fault
+_REPEATED_COUNT_MIN = 5  # minimum number of repeated frames for a fault
+_CHANGED_CELLS_MIN = 4  # minimum per frame; one or two noisy cells may repeat by chance
 
 
 class Perception:
-    """Tactile sensors of a hand and the filter of its contacts. Only the loop's thread calls it."""
+    """Tactile sensors and contact filter of a hand. Only the loop thread may call it."""
 
     def __init__(
         self,
@@ -41,8 +41,8 @@ class Perception:
         sensors: Mapping[int, TactileSensor],
         models: tuple[FingerModel, FingerModel],
     ) -> None:
-        """Create the perception of ``sensors``, a mapping by finger, which may be empty."""
-        self.events: list[Event] = []  # the loop publishes and removes them
+        """Create the perception; ``sensors`` maps finger indices to sensors and may be empty."""
+        self.events: list[Event] = []  # published and removed by the loop
         self.fingers = [
             FingerPerception(sensor, models[finger], settings, self.events)
             for finger, sensor in sorted(sensors.items())
@@ -55,12 +55,12 @@ class Perception:
         )
 
     def tare(self) -> None:
-        """Set the zero of each cell to its mean over the next frames."""
+        """Start a tare: set each cell's zero offset to its mean over the next frames."""
         for each in self.fingers:
             each.tare()
 
     def update(self, state: State) -> None:
-        """Process new frames, and write the contacts and the object pose of this tick."""
+        """Process new frames; write the contacts and the object pose for this tick."""
         if not self.fingers:
             return
         for each in self.fingers:
@@ -74,17 +74,17 @@ class Perception:
 
 
 class RepeatDetector:
-    """Detector of sequences of frames that are repeated in the same order.
+    """Detector for frame sequences that repeat in the same order.
 
-    A noisy sensor never repeats a frame. A sensor without noise may send the same frame for a long
-    time at rest, or alternate between two. That does not count as a repetition; constant frames are
-    handled by the check for a frozen sensor.
+    A noisy sensor never repeats a frame. At standstill, a noise-free sensor may send the same frame
+    for a long time or alternate between two frames. This does not count as a repetition; the
+    frozen-sensor check handles constant frames.
     """
 
     def __init__(self, rate: float, enabled: bool = True) -> None:
-        """Create a detector for a frame ``rate`` [Hz]; ``enabled`` if repetitions are faults."""
+        """Create a detector for a frame ``rate`` [Hz]; ``enabled`` makes repetition a fault."""
         self._enabled = enabled
-        self.period = 0  # period of the repetition in frames, 0 for none
+        self.period = 0  # repetition period in frames, 0 without repetition
         self._repeated_count = 0  # consecutive frames with this period
         self._fault_count = max(round(_REPEATED_TIME * rate), _REPEATED_COUNT_MIN)
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
@@ -92,7 +92,7 @@ class RepeatDetector:
 
     @property
     def is_repeating(self) -> bool:
-        """True if the last two frames arrived before in this order."""
+        """True if the last two frames have already arrived in this order."""
         return self._enabled and self._repeated_count > 1
 
     @property
@@ -101,7 +101,7 @@ class RepeatDetector:
         return self.is_repeating and self._repeated_count >= self._fault_count
 
     def update(self, data: NDArray[np.uint16]) -> bool:
-        """Process a frame; return True if it differs from the last one."""
+        """Process a frame; return True if it differs from the previous frame."""
         last, self._last = self._last, data.copy()
         changed = np.count_nonzero(data != last)
         if not changed:
@@ -117,13 +117,13 @@ class RepeatDetector:
 
 
 class FingerPerception:
-    """Sensor of one finger, its newest frame, and the contact estimate from that frame alone."""
+    """One finger's sensor, its newest frame, and the contact estimate from that frame alone."""
 
     def __init__(
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
-        """Create the perception of one finger; each tare appends to ``events``."""
-        full = getattr(sensor, "full_count", None)  # some recordings have their own
+        """Create the perception for one finger; each tare appends to ``events``."""
+        full = getattr(sensor, "full_count", None)  # Some recordings have their own value.
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
             settings = settings.model_copy(update={"tactile": own})
@@ -133,18 +133,18 @@ class FingerPerception:
         self.finger = model.finger
         self.sensor = sensor
         self.frame: Frame | None = None
-        self.frame_count = 0  # frames received
-        self.has_changed = True  # the newest frame is neither equal to the last nor a repetition
-        self.changed_time = 0.0  # arrival of the last frame that differed from its predecessor [s]
-        # A recording that plays in a loop repeats itself.
+        self.frame_count = 0  # number of received frames
+        self.has_changed = True  # the newest frame is not a repetition
+        self.changed_time = 0.0  # arrival time of the last frame that changed [s]
+        # A recording played in a loop repeats its frames.
         self.repeats = RepeatDetector(settings.tactile.rate, tactile.backend != "replay")
-        self.estimate = ContactEstimate()  # of the last valid frame
-        active = getattr(sensor, "live", None)  # some recordings lack cells
+        self.estimate = ContactEstimate()  # from the last valid frame
+        active = getattr(sensor, "live", None)  # Some recordings lack cells.
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration
         )
         self._full_count = float(tactile.full_count)
-        self._scale = tactile.pascal_per_count  # Pa per unit of the readings
+        self._scale = tactile.pascal_per_count  # Pa per unit of reading
         self._quantum = tactile.pascal_per_count  # Pa per count
         self._converter: Converter | None = None
         if calibration is not None:
@@ -158,13 +158,13 @@ class FingerPerception:
         self._zero: NDArray[np.uint16] | None = None  # used without a converter
         self._live = np.ones(model.grid.shape, np.bool_) if active is None else active
         self._unloaded = UnloadedCells(model.grid, settings.tip.radius, self._live)
-        self._noise = tactile.noise  # of a cell, from the settings [Pa]
+        self._noise = tactile.noise  # cell noise from the settings [Pa]
         self._tare_sum: NDArray[np.uint32] | int = 0
         self._tare_remaining_count = 0
 
     @property
     def noise(self) -> float:
-        """Measured standard deviation of a cell [Pa]; 0 if it is unknown."""
+        """Measured cell noise (standard deviation) [Pa]; 0 if unknown."""
         return self._unloaded.scatter * self._quantum
 
     @property
@@ -174,11 +174,11 @@ class FingerPerception:
 
     @property
     def is_taring(self) -> bool:
-        """True while the zero is being measured."""
+        """True while a tare is in progress."""
         return self._tare_remaining_count > 0
 
     def tare(self) -> None:
-        """Set the zero of each cell to its mean over the next frames."""
+        """Start a tare: set each cell's zero offset to its mean over the next frames."""
         self._tare_sum = 0
         self._tare_remaining_count = _TARE_FRAME_COUNT
         self._unloaded.reset_zero()
@@ -214,14 +214,15 @@ class FingerPerception:
         return frame
 
     def published(self) -> NDArray[np.uint16]:
-        """Return the newest frame's data [rows, cols] for subscribers, in the unit of ``info``."""
+        """Return the newest frame [rows, cols] for subscribers in the unit of ``info``."""
         assert self.frame is not None
         assert self._readings is not None
         if not self._publishes_pressure:
             return self.frame.data
         if self._converter is None:
             return self._readings
-        # With a zero below that of the calibration, a cell may exceed the range of the scale.
+        # If the zero offset is below its calibrated value, a cell may exceed the range of the
+        # scale.
         steps = np.minimum(self._readings * (1.0 / self.info.scale), _PRESSURE_STEPS)
         return np.rint(steps).astype(np.uint16)
 
@@ -251,7 +252,7 @@ class FingerPerception:
             return
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
-        if not np.median(ends) > 0.0:  # above such a zero no contact could be measured
+        if not np.median(ends) > 0.0:  # Above such a zero offset, no contact could be measured.
             text = f"{side} sensor's zero stays: most cells are full where nothing presses"
             self._events.append(("warning", "tare", text))
             return

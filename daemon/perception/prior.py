@@ -1,18 +1,18 @@
-"""Priors of a finger's calibration factors: tip modulus, sensor gain, torque constant."""
+"""Priors for a finger's calibration factors: tip modulus, sensor gain and torque constant."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-MODULUS_ERROR = 0.2  # relative, of a tip that was not calibrated
+MODULUS_ERROR = 0.2  # relative, uncalibrated tip
 CALIBRATED_ERROR = 0.05  # relative, after `softfinger calibrate modulus`
 
 
 class Prior(NamedTuple):
     """One finger's calibration factors as (mean, relative standard deviation).
 
-    Mounting a sensor again changes its gain by 5 to 32 % (DTIC ADP011007). A torque constant is
-    known to 10 %.
+    Remounting a sensor changes its gain by 5 to 32 % (DTIC ADP011007). A torque constant is known
+    to within 10 %.
     """
 
     modulus: tuple[float, float] = (1.0, MODULUS_ERROR)

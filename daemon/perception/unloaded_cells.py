@@ -1,9 +1,10 @@
-"""Zero and noise of a sensor, measured with the cells beyond the tip.
+"""Zero shift and noise of a sensor, measured with the cells beyond the tip.
 
-An unloaded cell reads its zero plus noise. With a tip of 20 mm, some 60 % of a 58 mm grid lies
-beyond the tip, so these cells show zero and noise during any contact of the tip. A second contact
-on a few of them does not change their median. Readings are clipped at 0, so a zero that falls below
-0 is not detected here, but by the closing of the joints (`perception.frame_channels`).
+An unloaded cell reads its zero offset plus noise. With a 20 mm tip, about 60 % of a 58 mm grid lies
+beyond the tip. These cells show the zero offset and noise during any contact of the tip. A second
+contact on a few of them does not change their median. Readings are clipped at 0, so a zero offset
+below 0 cannot be detected here. It is detected from the joint motion during closing
+(`perception.frame_channels`).
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_RIM_DISTANCE = 2.0  # pitches from the rim of the tip, beyond which a cell is unloaded
-_CELL_COUNT_MIN = 50  # cells; with fewer, zero and noise are not estimated
+_RIM_DISTANCE = 2.0  # pitches from the tip rim beyond which a cell is unloaded
+_CELL_COUNT_MIN = 50  # minimum number of cells for estimating zero shift and noise
 _AVERAGED_FRAME_COUNT = 8  # frames, time constant of the noise average
-_CLIPPED_FRACTION = 0.25  # fraction of cells that read 0, above which noise counts as clipped at 0
-_CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # part of the variance that clipping leaves
+_CLIPPED_FRACTION = 0.25  # fraction of cells at 0 above which noise is treated as clipped
+_CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping
 
 
 class UnloadedCells:
-    """Estimator of one sensor's zero shift and noise."""
+    """Estimator for one sensor's zero shift and noise."""
 
     def __init__(self, grid: SensorGrid, radius: float, live: NDArray[np.bool_]) -> None:
         """Create an estimator for a tip ``radius`` [m] and the working cells ``live``."""
@@ -36,22 +37,23 @@ class UnloadedCells:
         self._cells = cells if cells.size >= _CELL_COUNT_MIN else cells[:0]
         self._live = np.flatnonzero(live)
         self._last_readings: NDArray[np.float64] | None = None  # last readings of the live cells
-        self._squared_changes: NDArray[np.float64] | None = None  # their squared changes, averaged
+        self._squared_changes: NDArray[np.float64] | None = None  # running average
         self._zero_fraction = 0.0  # fraction of the live cells that read 0
         self._reference: float | None = None  # median of the unloaded cells at the tare
         self._variance: float | None = None
-        self.zero_shift = 0  # increase of the zero since the tare [counts]
+        self.zero_shift = 0  # increase in zero offset since the tare [counts]
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a cell [counts]; 0 if it is unknown."""
+        """Standard deviation of a cell [counts]; 0 if unknown."""
         return 0.0 if self._variance is None else math.sqrt(self._variance)
 
     @property
     def scatter(self) -> float:
-        """Noise [counts], from changes between frames if no cells lie beyond the tip.
+        """Cell noise [counts]; 0 if unknown.
 
-        Most cells are constant, except while a tip moves. The value is 0 if the noise is unknown.
+        If no cells lie beyond the tip, the noise is computed from the changes between frames. This
+        works because most cells are constant except while a tip moves.
         """
         if self._squared_changes is None:
             return self.noise

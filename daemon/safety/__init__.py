@@ -1,5 +1,5 @@
-"""Limits of the hand, their checks at each tick, and the torque state.
+"""Safety limits of the hand, their checks on each tick, and the torque state.
 
-A new limit is a row of `safety.limits.LIMITS` placed above its check function. This package does
+To add a limit, place its row for `safety.limits.LIMITS` above its check function. This package does
 not decide where the hand moves.
 """

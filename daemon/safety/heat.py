@@ -1,10 +1,11 @@
-"""Predict when each servo overheats, and reduce the grip force to a sustainable value in time.
+"""Predict when servos will overheat, and reduce the grip force to a sustainable value in time.
 
 If a servo is predicted to reach ``safety.temperature_max`` within ``heat_warn``, `safety.limits`
-warns and a grip is reduced to the largest force that never reaches the limit. The force stays at or
-above the value that the load needs, including the slip margin. If that is not enough, an error is
-reported _ERROR_TIME seconds before the limit, and ``heat_action`` is performed in the last
-_ACTION_TIME seconds. The reduction lasts until the grip ends, even if another force is commanded.
+warns, and the grip force is reduced to the maximum that can be sustained indefinitely. The force is
+not reduced below the value required for the load, including the slip margin. If this reduction is
+insufficient, an error is reported _ERROR_TIME seconds before the limit, and ``heat_action`` is
+performed in the last _ACTION_TIME seconds. The reduction lasts until the grip ends, even if another
+force is commanded.
 """
 
 from __future__ import annotations
@@ -28,25 +29,25 @@ from softfinger.kinematics.hand.servo_heat import (
     winding_std,
 )
 
-_UPDATE_INTERVAL = 0.5  # s between two updates of the thermal model
-_AVERAGING_TIME = 5.0  # s, averaging time of the squared current
-# °C, half a step of the thermometer, whose rounded reading reaches the limit early.
+_UPDATE_INTERVAL = 0.5  # s between thermal model updates
+_AVERAGING_TIME = 5.0  # s, averaging time for the squared current
+# °C, half a thermometer step, because the rounded reading reaches the limit early.
 _HALF_STEP = 0.5
-_TARGET_MARGIN = 3.0  # °C below the limit, target temperature of a reduced grip
-_FRACTION_MAX = 0.97  # a reduction to more than this fraction of the force is skipped
-_FRACTION_MIN = 0.6  # smallest fraction in one reduction, because the first estimate is uncertain
-_SETTLING_TIME = 10.0  # s after a reduction until the next evaluation
+_TARGET_MARGIN = 3.0  # °C below the limit, target temperature after a reduction
+_FRACTION_MAX = 0.97  # maximum force fraction for which a reduction is worthwhile
+_FRACTION_MIN = 0.6  # minimum force fraction per reduction, because the first estimate is uncertain
+_SETTLING_TIME = 10.0  # s from a reduction to the next evaluation
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
-# the winding's share of heat capacity and thermal resistance.
+# Winding fractions of the total heat capacity and thermal resistance.
 _WINDING_SHARE, _COUPLING_SHARE = 0.04, 0.4
 
 
 def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
-    """Fill in the thermal law from the servo model or its calibration.
+    """Set the thermal parameters from the servo model or its calibration.
 
     Returns
     -------
-    Temperature rise of the case [K/A²] and its time constant [s].
+    Case temperature rise [K/A²] and time constant [s].
     """
     servos = settings.servos
     model = by_name(servos.model)
@@ -60,10 +61,10 @@ def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
 
 
 class HeatWatch:
-    """Follow the temperatures of a scene's servos. Only the loop's thread may call it."""
+    """Temperature monitor for a scene's servos. Only the loop thread may call it."""
 
     def __init__(self, settings: Settings, state: State) -> None:
-        """``state`` provides the readings; its ``heat`` is updated."""
+        """Create the monitor; it reads ``state.reading`` and updates ``state.heat``."""
         self._limits = settings.safety
         self._state = state
         self._fingers = [FINGERS.index(name) for name in sorted(settings.scene.fingers)]
@@ -72,15 +73,15 @@ class HeatWatch:
             for each in self._states:
                 set_law(each.law, settings)
         self._heat = [0.0, 0.0]  # ∫ I² dt since the last update [A² s]
-        self._square = [0.0, 0.0]  # smoothed mean square of the current [A²]
+        self._square = [0.0, 0.0]  # smoothed squared current [A²]
         self._t = math.nan  # time of the last reading [s]
-        self._elapsed = 0.0  # s since the last update
+        self._elapsed = 0.0  # time since the last update [s]
         self._reduction_time = -math.inf  # time of the last force reduction [s]
-        self._error_reported = False  # the error that a reduction is not enough was reported
-        self.due = False  # the model was updated in this tick
+        self._error_reported = False  # an insufficient reduction has been reported
+        self.due = False  # the model was updated on this tick
 
     def update(self) -> None:
-        """Add this tick's reading, and update the model when an update is due."""
+        """Add this tick's reading; update the model if due."""
         reading = self._state.reading
         dt = reading.t - self._t
         self._t = reading.t
@@ -100,8 +101,8 @@ class HeatWatch:
             square, self._heat[i] = self._heat[i] / passed, 0.0
             self._square[i] += (square - self._square[i]) * min(passed / _AVERAGING_TIME, 1.0)
             if not self._state.reading.temperature[i]:
-                continue  # no temperature has been read yet
-            # Limit the step to suit the winding's time constant, also after a long gap without
+                continue  # No temperature has been read yet.
+            # Limit the step to suit the winding's time constant, even after a long gap in the
             # readings.
             for _ in range(max(round(passed / _UPDATE_INTERVAL), 1)):
                 step = min(passed, _UPDATE_INTERVAL)
@@ -115,7 +116,7 @@ class HeatWatch:
             estimate.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
     def act(self, control: Control, events: list[Event]) -> str:
-        """Reduce the force of a grip that gets too hot; return a ``heat_action`` due now, or ''."""
+        """Reduce the grip force if a servo gets too hot; return a ``heat_action`` due now or ""."""
         state = self._state
         if state.mode not in GRIPPING_MODES:
             self._error_reported = False
@@ -127,7 +128,7 @@ class HeatWatch:
             return ""
         who = f"{FINGERS[i]} servo at {self._limits.temperature_max:g} °C in {left:.0f} s"
         if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
-            return ""  # the last reduction has not taken effect yet
+            return ""  # The last reduction has not taken effect yet.
         now = state.goal.force
         square = sustained_square(
             self._states[i].array, self._limits.temperature_max - _TARGET_MARGIN

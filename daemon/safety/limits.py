@@ -1,12 +1,12 @@
-"""Define every limit of the hand in one table, ``LIMITS``: its check and its consequence.
+"""Define all limits of the hand, with their checks and consequences, in the table ``LIMITS``.
 
-- ``warn``: reported once on ``hand/event``, and again only after it has cleared for a while.
-- ``limit``: the goal is changed before it is sent; ``status`` counts the affected ticks.
+- ``warn``: reported once on ``hand/event``, and again only after it has been clear for a while.
+- ``limit``: the goal is modified before it is sent; ``status`` counts the affected ticks.
 - ``fault``: torque off, latched until ``clear``, which is refused while the cause persists.
 
-Each row stands above its check function, and the table keeps the order of this file. If several
-faults are present, the first one is reported. ``softfinger limits`` prints the table with a
-profile's numbers. A limit's name is the ``kind`` of its events and the ``fault_name`` of
+Each row is placed above its check function, and the table follows the order of this file. If
+several faults are present, the first one is reported. ``softfinger limits`` prints the table with a
+profile's values. The limit name is used as ``kind`` in events and as ``fault_name`` in
 ``hand/state``. `safety.safety` defines when each row is checked.
 """
 
@@ -30,49 +30,49 @@ from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 
-_NOISE_RATIO = 1.5  # times ``tactile.noise``; more noise is mentioned in the message
-_WARNING_FRACTION = 0.9  # fraction of a fault's bound at which a warning starts
-# A/rad, expected pull towards the goal; every servo model's own loop is stiffer.
+_NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention noise
+_WARNING_FRACTION = 0.9  # fraction of a fault limit at which a warning starts
+# A/rad, expected current per position error. The control loop of every servo model is stiffer.
 _CURRENT_PER_ERROR = 2.0
-_STANDSTILL_SPEED = 0.05  # rad/s, below which a joint counts as standing still
-# relative rise of the commanded force, and fraction of it that must be measured.
+_STANDSTILL_SPEED = 0.05  # rad/s, maximum speed of a joint at standstill
+# Minimum relative increase in commanded force, and fraction of it that must be measured.
 _FORCE_RISE_MIN = 0.2
-_RESPONSE_TIME = 0.3  # s in which the measured force must follow
-_STEP_TOLERANCE = 0.02  # rad, tolerance of one step beyond the distance at maximum velocity
-_DRIFT_MAX = 0.1  # rad, allowed difference between the angle and the integrated velocity
-_DRIFT_TIME = 0.1  # s, time window of that difference, because the velocity lags
-_LATE_TIME = 0.02  # s between two readings, or 3 ticks, after which the window restarts
-_FAILURE_TIME = 0.72  # s, time constant of the fraction of failed readings
-_FAILED_FRACTION_MAX = 0.75  # fraction that is reported; reached after 1 s without a good reading
-_GAP_TIME = 0.1  # s between two readings, after which the step is not checked either
+_RESPONSE_TIME = 0.3  # s, time allowed for the measured force to follow
+_STEP_TOLERANCE = 0.02  # rad, step tolerance beyond the distance at maximum velocity
+_DRIFT_MAX = 0.1  # rad, allowed difference between angle and integrated velocity
+_DRIFT_TIME = 0.1  # s, window for this difference, to allow for velocity lag
+_LATE_TIME = 0.02  # s or 3 ticks, interval between readings that restarts the window
+_FAILURE_TIME = 0.72  # s, time constant for the fraction of failed readings
+_FAILED_FRACTION_MAX = 0.75  # warning threshold, reached after 1 s without a valid reading
+_GAP_TIME = 0.1  # s, interval between readings above which steps are not checked
 
 
 class JointMotion:
-    """Check joint angles against measured velocities and against the maximum velocity.
+    """Consistency check of joint angles with measured velocities and the maximum velocity.
 
-    An encoder may jump, stand still while the joint turns, or drift while the joint rests. Its
-    angles then contradict its velocity, and the finger's bit is set in ``jumped``.
+    An encoder may jump, stop while the joint rotates, or drift while the joint is at standstill.
+    Its angles are then inconsistent with its velocity, and the finger's bit is set in ``jumped``.
     """
 
     def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:
-        """``period`` is the tick period [s]."""
+        """Create the check for a tick ``period`` [s]."""
         self.jumped = 0
         self._fingers = tuple(fingers)
         self._velocity_max = velocity_max
         self._late_time = max(_LATE_TIME, 3.0 * period)
         self._gap_time = max(_GAP_TIME, self._late_time)
-        self._request_time = -math.inf  # time of the request of the last good reading [s]
-        self._t = -math.inf  # time of the last good reading [s]
+        self._request_time = -math.inf  # request time of the last valid reading [s]
+        self._t = -math.inf  # time of the last valid reading [s]
         self._q = [0.0, 0.0]
-        self._drift = [0.0, 0.0]  # angle less integrated velocity [rad]
+        self._drift = [0.0, 0.0]  # angle minus integrated velocity [rad]
 
     def update(self, requested: float, reading: Reading) -> None:
-        """Check a reading that was requested at time ``requested``."""
+        """Check a reading requested at time ``requested``."""
         self.jumped = 0
         t = reading.t
         if not reading.valid or t == self._t:
             return
-        # Each reading was measured at some time between request and reply.
+        # Each reading is measured at an unknown time between request and reply.
         longest, dt = t - self._request_time, t - self._t
         q, before, apart = reading.q, self._q, self._drift
         if longest < self._gap_time:
@@ -92,7 +92,7 @@ class JointMotion:
 
 
 class View:
-    """Hold the scene that the limits are checked in, and the history that some checks need."""
+    """Scene in which limits are checked, and history required by some checks."""
 
     def __init__(
         self,
@@ -106,17 +106,17 @@ class View:
         self.grasp = GraspState() if grasp is None else grasp
         self.sensors = sensors
         self.wiring = WiringWatch(self.fingers)
-        self.failed = 0.0  # fraction of failed readings in about the last second
-        self._t = math.nan  # time of the last state [s]
+        self.failed = 0.0  # fraction of failed readings during about the last second
+        self._t = math.nan  # time of the previous state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
-        servos = settings.servos  # in current mode the daemon's own stiffness sets the pull
+        servos = settings.servos  # limited by the stiffness in current mode
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
             self.pull = min(self.pull, 0.5 * servos.stiffness)
-        self.bad_goal = False  # a goal since the last check was not finite
+        self.bad_goal = False  # a goal since the previous check was not finite
         self.grip_width = math.nan  # object width at the start of the grip [m]
-        self._target = math.nan  # commanded grip force at the last tick [N]
-        self.rise_t = math.inf  # time of a rise of the commanded force that is not measured yet [s]
+        self._target = math.nan  # commanded grip force on the previous tick [N]
+        self.rise_t = math.inf  # time of a commanded increase without a measured response [s]
         self.rise_felt = 0.0  # measured force at that time [N]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":
@@ -126,7 +126,7 @@ class View:
         self.voltage = (low, high)
 
     def update(self, state: State) -> None:
-        """Record the parts of this tick's state that later checks compare with."""
+        """Record parts of this tick's state for comparison in later checks."""
         self.motion.update(state.t, state.reading)
         self.wiring.update(state)
         passed, self._t = state.t - self._t, state.t
@@ -151,12 +151,12 @@ class View:
             self.rise_t = math.inf
 
     def touched(self, state: State) -> bool:
-        """Return True if both tips have valid contacts and the object's pose is valid."""
+        """Return True if both tips have valid contacts and the object pose is valid."""
         left, right = state.contacts
         return state.object.valid and _touches(left) and _touches(right)
 
     def holds(self, state: State) -> bool:
-        """Return True if `touched` is true in a grip that has settled."""
+        """Return True if `touched` is true and the grip has settled."""
         return state.mode in HOLDING_MODES and self.touched(state)
 
 
@@ -165,40 +165,40 @@ def _touches(contact: Contact) -> bool:
 
 
 # A check receives the fraction of the bound to apply. It returns a description of the violation, or
-# an empty text. Checks change nothing, and NaN violates every bound.
+# "" if there is none. Checks do not modify the state, and NaN violates every bound.
 Check = Callable[[View, State, float], str]
 FingerCheck = Callable[[View, State, float, int], str]
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """Describe one row of the table. Calling it adds the row with the check that it decorates.
+    """One row of the table. As a decorator, it adds the row with the decorated check.
 
-    A row without a check is added directly. Its limit is applied elsewhere: in `Safety.write`, on
-    the bus or in the gateway.
+    A row without a check is added directly; its limit is applied in `Safety.write`, on the bus or
+    in the gateway.
     """
 
     name: str
     quantity: str
     level: Literal["warn", "limit", "fault"]
-    keys: tuple[str, ...] = ()  # settings that it depends on
+    keys: tuple[str, ...] = ()  # settings that define the limit
     needs: Literal["", "servos", "sensors"] = ""
     check: Check | None = None
-    lasts: float | str = 0.0  # s that a violation must last, or the name of a setting
-    fraction: float = 1.0  # fraction of the bound that is applied
-    in_turn: bool = False  # one of these rows is checked per tick, the others at every tick
-    gripping: bool = False  # applies only while the hand grips
+    lasts: float | str = 0.0  # required duration of a violation [s], or a setting name
+    fraction: float = 1.0  # applied fraction of the bound
+    in_turn: bool = False  # only one of these rows is checked per tick
+    gripping: bool = False  # applies only while gripping
 
     def __call__(self, check: Check) -> Check:
         """Add the row with its check.
 
-        If several rows decorate one check, the lowest row is added first.
+        If several rows decorate the same check, the lowest row is added first.
         """
         LIMITS.append(replace(self, check=check))
         return check
 
     def each(self, check: FingerCheck) -> FingerCheck:
-        """Add the row with a check of one finger; the first violation found is reported."""
+        """Add the row with a per-finger check; the first violation found is reported."""
 
         def judge(view: View, state: State, fraction: float) -> str:
             for i in view.fingers:
@@ -295,7 +295,7 @@ def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
 
 # --- joints ---------------------------------------------------------------------------------------
 
-_STOP_TOLERANCE = 0.1  # rad, tolerance for a joint that is pushed beyond its limit
+_STOP_TOLERANCE = 0.1  # rad, tolerance for joints pushed beyond their limits
 
 
 @Limit("joint.angle", "joint angle, 0.1 rad past its limits", "fault", ("hand.q_min", "hand.q_max"),
@@ -324,18 +324,18 @@ def _joint_jump(view: View, _: State, __: float) -> str:
     )
 
 
-_POSITION_ERROR_MIN = 0.05  # rad, position error above which a current must pull the joint
-_EXPECTED_CURRENT_MIN = 0.04  # A, smallest expected current that is checked
-_CURRENT_FRACTION_MIN = 0.25  # required fraction of the expected current
+_POSITION_ERROR_MIN = 0.05  # rad, position error above which current is expected
+_EXPECTED_CURRENT_MIN = 0.04  # A, minimum expected current for the check
+_CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 
 
 @Limit("joint.dead", "joint that stands 0.05 rad off its goal without current for 0.05 s", "fault",
     needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
-    """Report a joint that stands off its goal while no current pulls it there.
+    """Report a joint that is stationary away from its goal without drawing current.
 
-    A joint that is held back by a load draws current. In position mode the expected current is
-    unknown, so the check is skipped.
+    A joint held back by a load draws current. In position mode, the expected current is unknown, so
+    the check is skipped.
     """
     goal, reading = state.goal, state.reading
     if not (state.torque and goal.valid) or view.settings.servos.mode == "position":
@@ -361,7 +361,7 @@ def _joint_current(view: View, state: State, _: float, i: int) -> str:
     return "" if well else f"{FINGERS[i]} joint takes {current:.2f} A, above {bound:g} A"
 
 
-_FULL_CURRENT = 0.9  # fraction of a goal's current limit at which no reserve is left
+_FULL_CURRENT = 0.9  # fraction of the goal's current limit that counts as saturated
 
 
 @Limit("joint.stall", "current at its bound, off the goal, and standing", "fault",
@@ -406,7 +406,7 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     )
 
 
-_CURRENT_FRACTION_MAX = 0.95  # fraction of the maximum current at which the grip force cannot rise
+_CURRENT_FRACTION_MAX = 0.95  # fraction of the maximum current that counts as saturated
 
 
 @Limit("joint.strained", "grip that takes all the current there may be", "warn",
@@ -483,7 +483,7 @@ _TILT_TEXT = "|θ| against asin(1 − d/a) less a margin"
 def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
     """|θ| ≤ fraction·(asin(1 − d/a) − margin).
 
-    At asin(1 − d/a) the object's plane reaches the rim of the tip's backing plate. The check uses
+    At asin(1 − d/a), the object plane reaches the rim of the tip's backing plate. The check uses
     the sine, which is defined for every finite angle.
     """
     radius, margin = view.settings.tip.radius, view.limits.theta_margin
@@ -533,7 +533,7 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
 
 
 def _sensor_fault(view: View, state: State, finger: int) -> str:
-    """Explain why a sensor's frames are rejected; empty text if they are accepted."""
+    """Explain why a sensor's frames are rejected; return "" if they are accepted."""
     side, found = FINGERS[finger], view.grasp
     if found.rejected_count[finger] > REJECTED_MAX:
         turned, deeper = found.angle_innovation[finger], 1e3 * found.d_innovation[finger]
@@ -560,11 +560,11 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
     return ""
 
 
-_GAIN_SIGMA = 1.5  # prior standard deviations of gain error at which it is reported
+_GAIN_SIGMA = 1.5  # prior standard deviations of gain error that trigger a report
 
 
 def _gain_fault(view: View, finger: int) -> str:
-    """Describe a gain error that is larger than usual; empty text if there is none."""
+    """Describe an unusually large gain error; return "" if there is none."""
     grasp = view.grasp
     off, unsure = grasp.gain_change[finger], grasp.gain_std[finger]
     if not abs(off) - unsure > _GAIN_SIGMA * grasp.gain_prior_std[finger]:
@@ -581,7 +581,7 @@ def _add_consistency_checks(finger: int, side: str) -> None:
     def _sensor(view: View, state: State, _: float) -> str:
         if finger not in view.fingers:
             return ""
-        # Check the gain only in a grip: after release the cells may relax more slowly than the
+        # Check the gain only during a grip: after release, the cells may relax more slowly than the
         # shape.
         return _sensor_fault(view, state, finger) or (
             _gain_fault(view, finger) if view.holds(state) else ""
@@ -653,7 +653,7 @@ def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
 
 # --- the hand and its grip ------------------------------------------------------------------------
 
-_ANGLE_SIGMA = 4.0  # smallest significant difference, in summed standard deviations of both tilts
+_ANGLE_SIGMA = 4.0  # minimum significant difference, in summed tilt standard deviations
 _ANGLE_TEXT = "object's angle by one finger against the other's"
 _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
@@ -665,7 +665,7 @@ _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
-    left, right = (sensor.estimate for sensor in view.sensors)  # of the newest frames only
+    left, right = (sensor.estimate for sensor in view.sensors)  # from the newest frames alone
     if not (left.contact and right.contact):
         return ""
     unsure = _ANGLE_SIGMA * (left.tilt_x_std + right.tilt_x_std)

@@ -1,8 +1,8 @@
-"""Check every state, limit every goal and send it to the servos.
+"""Check every state, limit every goal, and send the goals to the servos.
 
 Goals reach the bus only through `Safety.write`, which limits them. The table `safety.limits.LIMITS`
-defines the checks. This module schedules them, reports each warning once, and requires a violation
-to last before it becomes a fault.
+defines the checks. This module schedules them, reports each warning once, and raises a fault only
+after a violation has lasted long enough.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ from softfinger.daemon.safety.limits import LIMITS, Check, Limit, View
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Goal, State
 
-_REPEAT_TIME = 1.0  # s without violation before a warning may be repeated
-_HYSTERESIS = 0.95  # hysteresis: a reported warning clears below this fraction of its bound
+_REPEAT_TIME = 1.0  # s without a violation before a warning may be repeated
+_HYSTERESIS = 0.95  # fraction of the bound below which a reported warning clears
 
-BUS = "servos.bus"  # limit for errors raised by the servo backend
-TORQUE_OFF = "torque.off"  # limit for unconfirmed torque off, see `safety.torque_state`
+BUS = "servos.bus"  # limit name for servo backend errors
+TORQUE_OFF = "torque.off"  # limit name for unconfirmed torque off, see `safety.torque_state`
 
 
 class Breach(NamedTuple):
-    """Name a broken limit and describe the violation."""
+    """Name of a violated limit and description of the violation."""
 
     name: str
     text: str
 
 
 class _Watch:
-    """Track one limit of a scene and the time since when it is broken."""
+    """Monitor for one limit and the duration of its violation."""
 
     def __init__(self, limit: Limit, check: Check, view: View) -> None:
         self.limit = limit
         self.check = check
         lasts = limit.lasts
         self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
-        self.since = math.inf  # start of the violation [s], inf without one
+        self.since = math.inf  # start of the violation [s], inf if there is none
         self.reported = False
         self._ended = -math.inf
 
     def check_limit(
         self, view: View, state: State, faults: dict[_Watch, str], warnings: list[Breach]
     ) -> None:
-        """Run the check, and record a violation that has lasted long enough."""
+        """Run the check; record a violation that has lasted long enough."""
         limit = self.limit
         found = self.check(view, state, limit.fraction * (_HYSTERESIS if self.reported else 1.0))
         if not found:
@@ -71,7 +71,7 @@ class _Watch:
 
 
 class Safety:
-    """Check states and limit goals. Only the loop's thread may call it."""
+    """Checker for states and limiter for goals. Only the loop thread may call it."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class Safety:
         grasp: GraspState | None = None,
         sensors: Sequence[FingerPerception] = (),
     ) -> None:
-        """``grasp`` and ``sensors`` belong to the loop and are only read."""
+        """Create the checks; ``grasp`` and ``sensors`` belong to the loop and are only read."""
         view = self._view = View(settings, grasp, sensors)
         limits, hand = settings.safety, settings.hand
         self._limits = limits
@@ -94,17 +94,17 @@ class Safety:
         ]
         self._each_tick = [watch for watch in watches if not watch.limit.in_turn]
         self._in_turn = [watch for watch in watches if watch.limit.in_turn]
-        # In the order of the table, because the first violation names the fault.
+        # Keep the table order, because the first violation determines the fault name.
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
         self._found: dict[_Watch, str] = {}  # current violations of fault limits
-        self.must_hold = False  # frames are late in a grip, so the goal is held
-        self.warnings: list[Breach] = []  # new warnings, which the loop reports and removes
-        self.limited: Counter[str] = Counter()  # ticks in which a goal was changed, by limit
+        self.must_hold = False  # hold the goal because frames are late during a grip
+        self.warnings: list[Breach] = []  # new warnings, reported and removed by the loop
+        self.limited: Counter[str] = Counter()  # number of ticks with a modified goal, by limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
         dt = 1.0 / settings.loop.rate
         self._step = limits.goal_speed * dt
-        # In position mode no current limit bounds the effect of a jump of the goal.
+        # In position mode, no current limit bounds the effect of a goal jump.
         self._travel = 0.0 if settings.servos.mode == "position" else limits.goal_reach
         self._rise = limits.current_rate * dt
         self._ends = [(i, hand.q_min[i], hand.q_max[i]) for i in view.fingers]
@@ -115,7 +115,7 @@ class Safety:
     # Checks of the state
 
     def judge(self, state: State) -> Breach | None:
-        """Check this tick's state and return the first fault, or None.
+        """Check this tick's state; return the first fault, or None.
 
         New warnings are appended to ``warnings``.
         """
@@ -140,9 +140,9 @@ class Safety:
         return None
 
     def cause(self, state: State, gripping: bool = False) -> str:
-        """Return the first fault in this state, which blocks a command, or an empty text.
+        """Return the first fault that would block a command in this state, or "".
 
-        With ``gripping``, the limits of a grip are checked in every mode. Nothing is changed.
+        If ``gripping``, the limits for a grip are checked in every mode. The state is not modified.
         """
         gripping = gripping or state.mode in GRIPPING_MODES
         view = self._view
@@ -155,21 +155,21 @@ class Safety:
         return ""
 
     def opens_first(self, breach: Breach, mode: Mode | str) -> bool:
-        """Return True if the hand opens before this fault turns its torque off."""
+        """Return True if the hand must open before this fault turns torque off."""
         commanded = self._limits.frame_age_action == "open"
         return commanded and breach.name == "tactile.silent" and mode in GRIPPING_MODES
 
     # Goals
 
     def write(self, servos: Servos, state: State) -> None:
-        """Limit the state's goal in place and send it; a non-finite goal becomes invalid instead.
+        """Limit the goal in place and send it; a non-finite goal is marked invalid instead.
 
-        Raises ServoError as `Servos.write` does.
+        Raises ServoError like `Servos.write`.
         """
         goal = state.goal
         q, current = goal.q, goal.current
         present = state.reading.q
-        if state.seq - self._sent_seq != 1:  # torque was off: start here, without current
+        if state.seq - self._sent_seq != 1:  # torque was off: start from here without current
             self._sent_q[:] = present
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq
@@ -197,7 +197,7 @@ class Safety:
         near = min(max(inside, lowest), highest)
         if near != inside:
             self._count("goal.step")
-        # Apply the joint limits last, so that they always hold.
+        # Apply the joint limits last, so that they always take effect.
         goal.q[i] = min(max(near, low), high)
         limit = min(max(current, 0.0), self._limits.current_max)
         if limit != current:

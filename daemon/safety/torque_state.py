@@ -1,9 +1,9 @@
-"""Track the torque state: on from the request, off only after the servos confirm it.
+"""Track the torque state: on once requested, off only after the servos have confirmed it.
 
-Torque off is sent at every tick until the servos' registers confirm it. If they do not confirm
-within half of the bus watchdog's time, nothing is sent for as long as the watchdog needs to stop
-the motors. Otherwise a servo that receives read requests but loses all writes would keep driving.
-Afterwards torque off is tried again.
+Torque off is sent on every tick until the servo registers confirm it. Without confirmation within
+half the bus watchdog time, the bus stays silent until the watchdog has stopped the motors.
+Otherwise, a servo that receives read requests but loses all writes would keep driving. Torque off
+is then tried again.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 
-_TRY_FRACTION = 0.5  # fraction of the watchdog time for tries before the bus falls silent
-_TRY_TIME_UNGUARDED = 0.05  # s of tries before a report if servos.watchdog = 0
-_CLOSING_TRY_COUNT = 15  # tries when the daemon ends
+_TRY_FRACTION = 0.5  # fraction of the watchdog time for attempts before bus silence
+_TRY_TIME_UNGUARDED = 0.05  # s of attempts before a report if servos.watchdog = 0
+_CLOSING_TRY_COUNT = 15  # attempts at shutdown
 
 
 class TorqueState:
-    """Control torque; write ``torque``, ``torque_off`` and ``write_error`` of the state."""
+    """Torque controller that writes ``torque``, ``torque_off`` and ``write_error`` of the state."""
 
     def __init__(
         self,
@@ -35,7 +35,10 @@ class TorqueState:
         fail: Callable[[str, str], None],
         emit: Callable[[str, str, str], None],
     ) -> None:
-        """``fail`` latches a fault by reason and limit; ``emit`` sends an event."""
+        """Create the controller.
+
+        ``fail(reason, limit name)`` latches a fault; ``emit`` sends an event.
+        """
         self.servos = servos
         self._state = state
         self._safety = safety
@@ -43,26 +46,26 @@ class TorqueState:
         self._emit = emit
         watchdog = settings.watchdog
         self._try_time = _TRY_FRACTION * watchdog or _TRY_TIME_UNGUARDED
-        # The servo counts in whole units and may react one unit late.
+        # The servo counts whole units and may react one unit late.
         units = math.ceil(watchdog / WATCHDOG_UNIT - 1e-9) + 1 if watchdog else 0
         self._silence = units * WATCHDOG_UNIT
-        self._tried_since = math.inf  # start of the current series of tries [s]
+        self._tried_since = math.inf  # start of the current series of attempts [s]
         self._silent_until = -math.inf
-        self._first = math.inf  # time of the first request for torque off [s]
+        self._first = math.inf  # time of the first torque-off request [s]
         self._reported = False
-        self._port_gone = False  # the port is gone, so nothing can be sent
-        self._last_try = -1  # seq of the tick with the last try
-        self._unused = Reading()  # buffer for readings that this tick no longer uses
+        self._port_gone = False  # the port is lost, so sending is impossible
+        self._last_try = -1  # seq of the tick with the last attempt
+        self._unused = Reading()  # buffer for readings that are discarded
 
     @property
     def pending(self) -> bool:
-        """True while torque off is requested but not confirmed."""
+        """True while torque off has been requested but not confirmed."""
         return self._tried_since < math.inf
 
     def read(self, reading: Reading) -> None:
-        """Read the servos, repeating a pending torque off in the same exchange.
+        """Read the servos, repeating a pending torque-off request in the same exchange.
 
-        Raises ServoError as `Servos.read` does.
+        Raises ServoError like `Servos.read`.
         """
         state, servos = self._state, self.servos
         state.torque_off = False
@@ -76,7 +79,7 @@ class TorqueState:
             self._try(servos, reading)
 
     def write(self, requested: bool, now: float) -> None:
-        """Switch torque as ``requested`` for this tick, and send the goal while torque is on."""
+        """Switch torque as ``requested`` on this tick; send the goal while torque is on."""
         state, servos = self._state, self.servos
         if servos is None:
             return
@@ -94,17 +97,17 @@ class TorqueState:
                 self._fall(error)
 
     def off(self) -> str:
-        """Request torque off now and return "confirmed" or "unconfirmed".
+        """Request torque off immediately; return "confirmed" or "unconfirmed".
 
-        The call waits for at most one reply. Until the servos confirm, each tick repeats the
-        request.
+        The call waits for at most one reply. Each tick repeats the request until the servos confirm
+        it.
         """
         state, servos = self._state, self.servos
         if servos is None:
             return "confirmed"
         first = not self.pending
         if first:
-            state.torque = True  # assume torque is on, because another program may have enabled it
+            state.torque = True  # another program may have switched it on
             self._first = self._tried_since = state.t
             self._silent_until = -math.inf
         if self._last_try != state.seq and (first or not self._is_silent()):
@@ -115,7 +118,7 @@ class TorqueState:
         return "unconfirmed" if state.torque else "confirmed"
 
     def end(self) -> None:
-        """Turn torque off if it may be on; if that fails, the silent bus trips the watchdogs."""
+        """Turn torque off if it may be on. If this fails, bus silence trips the watchdogs."""
         for _ in range(_CLOSING_TRY_COUNT):
             if not self._state.torque:
                 return
@@ -123,7 +126,7 @@ class TorqueState:
             self.off()
 
     def reconnect(self) -> None:
-        """Reconnect servos that stopped answering, as after an unplug. Raises ServoError."""
+        """Reconnect servos that stopped responding, such as after an unplug. Raises ServoError."""
         if self.servos is None:
             return
         self.servos.connect()
@@ -134,7 +137,7 @@ class TorqueState:
             self.off()
 
     def _on(self, servos: Servos) -> None:
-        self._state.torque = True  # from here on torque may be on, whatever the servos reply
+        self._state.torque = True  # From here on, torque may be on, regardless of the reply.
         try:
             servos.torque_on()
         except ServoError as error:
@@ -163,7 +166,7 @@ class TorqueState:
             )
 
     def _is_silent(self) -> bool:
-        """Return True if nothing may be sent in this tick so that the servos' watchdogs act."""
+        """Return True if the bus must stay silent on this tick to trip the servo watchdogs."""
         t = self._state.t
         if t < self._silent_until:
             return True
@@ -175,7 +178,7 @@ class TorqueState:
         return silence > 0.0
 
     def _report(self) -> None:
-        """Report once that torque off is unconfirmed, as a fault unless one is latched."""
+        """Report once that torque off is unconfirmed; latch a fault unless one is latched."""
         if self._reported:
             return
         self._reported = True

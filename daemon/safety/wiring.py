@@ -1,8 +1,8 @@
-"""Detect swapped servo IDs: a joint of one finger moves the tip of the other finger.
+"""Detect swapped servo IDs, where the joint of one finger moves the tip of the other finger.
 
-Joint angles and currents are consistent in this case, because each servo reports its own. Only a
-tactile sensor shows the error. If a joint stands still while the other one moves, the wrong tip
-tilts or is pressed, and a commanded turn goes the wrong way.
+Joint angles and currents are consistent in this case, because each servo reports its own values.
+Only the tactile sensors show the error: when one joint is stationary and the other moves, the wrong
+tip tilts or is loaded, and the object rotates opposite to the command.
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ from collections.abc import Sequence
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.types import FINGERS, State
 
-_STANDING_MAX = 0.02  # rad, largest motion of a joint that waits for the other one
-_CLOSING_MIN = 0.05  # rad, smallest closing motion of the other joint
-# Smallest tilt of the tip as a fraction of that motion. With swapped IDs a tip tilts by about the
-# angle that its finger turns: 0.9 of it on a sliding object in the simulated hand. With correct
-# wiring the fraction is 0.25.
+_STANDING_MAX = 0.02  # rad, maximum motion of the joint that waits
+_CLOSING_MIN = 0.05  # rad, minimum closing motion of the other joint
+# Minimum tip tilt as a fraction of the closing motion. With swapped IDs, a tip tilts by about the
+# rotation angle of its finger: 0.9 of that angle on a sliding object in the simulated hand. With
+# correct wiring, the fraction is 0.25.
 _TILT_RATIO = 0.5
-_TILT_SIGMA = 2.0  # standard deviations of the tilt, added to the threshold
-_FORCE_RISE_MIN = 1.0  # N, smallest rise of the tip's force
-_SETTLING_TIME = 0.07  # s after a touch, for the frames' latency and the joint's stopping time
-_WRONG_ROTATION = math.radians(4.0)  # rad, rotation opposite to the command
-_TILT_SIGNS = (1.0, -1.0)  # sign of a tip's tilt when its finger closes
+_TILT_SIGMA = 2.0  # tilt standard deviations added to the threshold
+_FORCE_RISE_MIN = 1.0  # N, minimum tip force increase
+_SETTLING_TIME = 0.07  # s after a touch, to cover frame latency and joint stopping time
+_WRONG_ROTATION = math.radians(4.0)  # rad, minimum rotation opposite to the command
+_TILT_SIGNS = (1.0, -1.0)  # sign of tip tilt when the finger closes
 
 
 class WiringWatch:
-    """Compare joint motion with the tip that responds, in an approach and in a turn."""
+    """Comparison of joint motion with the responding tip, during approach and rotation."""
 
     def __init__(self, fingers: Sequence[int]) -> None:
-        self.swapped = ""  # description of the swap, empty if none was found
+        self.swapped = ""  # description of a detected swap, otherwise empty
         self._has_two_fingers = len(fingers) == len(FINGERS)
-        self._touching = -1  # the only finger in contact, -1 for none or both
+        self._touching = -1  # finger in contact, -1 if none or both
         self._since = 0.0  # start of that contact [s]
         self._q = [0.0, 0.0]  # joint angles after the touch [rad]
         self._tilt = math.nan  # tilt after the touch [rad]
         self._force = 0.0  # force after the touch [N]
-        self._turn = math.nan  # object angle at the start of a turn [rad]
+        self._turn = math.nan  # object angle at the start of a rotation [rad]
         self._goal = math.nan  # commanded object angle [rad]
-        self._sense = 0.0  # direction of that turn
+        self._sense = 0.0  # direction of the commanded rotation
 
     def update(self, state: State) -> None:
         """Check one tick's state."""
@@ -81,7 +81,7 @@ class WiringWatch:
 
     def _check_turn(self, state: State) -> None:
         angle, goal = state.object.angle, state.goal.angle
-        if goal != self._goal:  # also true for NaN; a streamed goal changes at each tick
+        if goal != self._goal:  # Also true for NaN. A streamed goal changes on each tick.
             self._goal, self._turn = goal, math.nan
         if math.isnan(self._turn):
             if state.object.valid and abs(goal - angle) > 0.5 * _WRONG_ROTATION:

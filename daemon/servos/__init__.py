@@ -1,4 +1,4 @@
-"""Servo backends: their common interface, simulated servos, and Dynamixel servos on a serial port.
+"""Servo backends: common interface, simulated servos, and Dynamixel servos on a serial port.
 
-`daemon.backends` maps the names in the settings to them.
+`daemon.backends` maps the backend names in the settings to these classes.
 """

@@ -1,7 +1,7 @@
-"""Check the servos before use: their replies, their registers and their limits.
+"""Check the servos before use: replies, registers and limits.
 
-The checks read registers and change nothing. The findings of all servos are collected in one list,
-with fixes.
+The checks read registers but do not change them. The findings for all servos, with fixes, are
+collected in one list.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-CHECKED = reg.BACKUP_READY  # registers 0 … 146 are read
+CHECKED = reg.BACKUP_READY  # number of registers to read, 0 … 146
 DRIVE_REVERSE = 0b0001
 FIX = "`softfinger doctor --fix`"
 REBOOT_FIX = "remove the cause, then `softfinger doctor --fix` reboots it"
@@ -32,32 +32,32 @@ OLD_PROTOCOL = (
 )
 _WATCHDOG_FIRMWARE = 38
 _FAULT_AFTER_LONG = 0.5  # s, value of servos.fault_after above which a notice is given
-_CONSTANT_RATIO_MAX = 1.3  # allowed ratio of a torque constant to the data sheet's
+_CONSTANT_RATIO_MAX = 1.3  # allowed ratio of a torque constant to the data sheet value
 _TEMPERATURE_MARGIN = 10  # °C below the temperature limit
-# rad beyond the hand's limits at which an angle is implausible. The cause is a wrong zero, or a
-# servo that lost its turn count when it was switched off.
+# rad beyond the hand's limits at which an angle is implausible. Causes are a wrong zero offset, or
+# a servo that lost its turn count when it was switched off.
 ANGLE_MARGIN = 0.25
 
 
 class Registers(bytes):
-    """A servo's registers from address 0 on; empty if they could not be read."""
+    """A servo's registers starting at address 0; empty if they could not be read."""
 
     def word(self, address: int) -> int:
-        """Return a register of two bytes."""
+        """Return the unsigned 2-byte register at ``address``."""
         return int.from_bytes(self[address : address + 2], "little")
 
     def long(self, address: int) -> int:
-        """Return a signed register of four bytes."""
+        """Return the signed 4-byte register at ``address``."""
         return int.from_bytes(self[address : address + 4], "little", signed=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """Result of the checks of one servo. It is unusable if ``errors`` is not empty."""
+    """Result of checking one servo, which is unusable if ``errors`` is not empty."""
 
     finger: int
     id: int
-    replies: bool  # answers a ping
+    replies: bool  # responds to a ping
     table: Registers = field(default_factory=Registers)
     errors: tuple[Finding, ...] = ()
     notices: tuple[Finding, ...] = ()
@@ -70,7 +70,7 @@ class Examined:
 
 
 def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Examined]:
-    """Ping, read and check each servo of the scene, in the scene's order."""
+    """Ping, read and check each servo in the scene, in scene order."""
     found = []
     for finger in map(FINGERS.index, settings.scene.fingers):
         servo_id = settings.servos.ids[finger]
@@ -99,7 +99,7 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
 
 
 def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
-    """Return a finding if the model lacks an operating mode, otherwise None."""
+    """Return a finding if the model does not support an operating mode, otherwise None."""
     if mode in model.modes:
         return None
     problem = f"an {model.name} has no {reg.MODE_NAMES[mode]} mode"
@@ -117,7 +117,7 @@ def check_servo(
     ----------
     name : name of the servo in reports
     model : model named in the settings
-    table : registers, at least up to the present temperature
+    table : registers, up to at least the present temperature
     settings : required configuration
     finger : 0 left, 1 right
     """
@@ -159,7 +159,7 @@ def check_servo(
 
 
 def other_model(number: int, model: ServoModel) -> tuple[str, str]:
-    """Describe a servo whose model differs from the settings', and the fix."""
+    """Describe a servo whose model differs from the settings, and how to fix it."""
     if reg.by_number(number) is not None:
         return f"is an {reg.name_of(number)}, not an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
@@ -177,7 +177,7 @@ def check_registers(
     finger: int,
     status: Status,
 ) -> list[Finding]:
-    """Return findings of one status about registers that do not hold the required value."""
+    """Return findings with this ``status`` for registers without the required value."""
     found = []
     for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
         wrong = row.wrong_in(table)
@@ -225,7 +225,7 @@ def notice_servo(
 
 
 def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Finding]:
-    """Return warnings about torque constant and friction that do not fit the model.
+    """Return warnings if torque constant or friction do not match the servo model.
 
     `profile.validation.plausibility_warnings` compares the forces with the model.
     """
@@ -247,8 +247,8 @@ def check_angle(
 ) -> Finding | None:
     """Return a finding if a joint is far outside the hand's limits, otherwise None.
 
-    Torque on would move such a joint back at once. After a reboot a servo counts from its first
-    turn again, which corrects a lost turn.
+    Switching torque on would immediately move such a joint back. After a reboot, the servo counts
+    from its first turn again, which corrects a lost turn.
     """
     low, high = hand.q_min[finger], hand.q_max[finger]
 
@@ -270,9 +270,9 @@ def check_angle(
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
-    """Compare a USB adapter's latency timer with the allowed reply time [s]; None without a timer.
+    """Check a USB adapter's latency timer against the reply time [s]; None if it has no timer.
 
-    The adapter holds a reply until the timer expires, so 16 ms limit reads to 60 Hz.
+    The adapter holds a reply until the timer expires, so a value of 16 ms limits reads to 60 Hz.
     """
     place = latency_file(path, *sysfs)
     if place is None:

@@ -1,8 +1,8 @@
-"""Define the control table of Dynamixel X servos: addresses, units, modes and models.
+"""Define the control table for Dynamixel X servos: addresses, units, modes and models.
 
-The data come from the manufacturer's manuals. `servos.joint` converts a joint's counts to rad,
-rad/s and A. The client and the emulated servos share this table and the packet CRC. This module
-does not communicate with servos.
+The data come from the manufacturer's manuals. `servos.joint` converts joint counts to rad, rad/s
+and A. The client and the emulated servos share this table and the packet CRC. This module does not
+communicate with servos.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Final
 
 # --- addresses -----------------------------------------------------------------------------------
 
-# EEPROM: kept over a reboot, writable only while torque is off.
+# EEPROM: retained over a reboot, writable only while torque is off.
 MODEL_NUMBER: Final = 0
 MODEL_INFORMATION: Final = 2
 FIRMWARE_VERSION: Final = 6
@@ -38,7 +38,7 @@ STARTUP_CONFIGURATION: Final = 60
 PWM_SLOPE: Final = 62
 SHUTDOWN: Final = 63
 
-# RAM: reset at every reboot.
+# RAM: reset on every reboot.
 RAM: Final = 64
 TORQUE_ENABLE: Final = 64
 LED: Final = 65
@@ -117,7 +117,7 @@ HARDWARE_ERRORS: Final = {
 
 
 def hardware_error_names(status: int) -> str:
-    """Return the meanings of the hardware error register's bits, joined by commas."""
+    """Return the names of the set hardware error bits, joined by commas."""
     names = [name for bit, name in HARDWARE_ERRORS.items() if status >> bit & 1]
     return ", ".join(names) or f"unknown error bits 0x{status:02X}"
 
@@ -125,17 +125,17 @@ def hardware_error_names(status: int) -> str:
 # --- models --------------------------------------------------------------------------------------
 
 _SPECIFIC_HEAT = 0.9  # J/(g K), approximation for plastic, aluminium and steel
-_CONVECTION = 10.0  # W/(m² K), a small body in still air
-SAG: Final = 0.35  # Ω, simulated supply with its cable
+_CONVECTION = 10.0  # W/(m² K), small body in still air
+SAG: Final = 0.35  # Ω, simulated supply including cable
 
 
 @dataclass(frozen=True, slots=True)
 class ServoModel:
-    """Data of one servo model, in register counts unless a unit is given, with factory defaults."""
+    """Data for one servo model with factory defaults, in register counts unless a unit is given."""
 
     name: str
     number: int
-    firmware: int  # the version the emulated servo reports
+    firmware: int  # version reported by the emulated servo
     highest_baud: int  # index into BAUD_RATES
     current_unit: float  # A per count, 0 without a current sensor
     current_limit: int  # default and upper bound
@@ -154,12 +154,12 @@ class ServoModel:
     size: tuple[float, float, float]  # mm
     modes: tuple[int, ...] = tuple(MODE_NAMES)
     pwm_slope: int | None = None  # default of register 62, None if the model lacks it
-    is_x330: bool = False  # X330 frame, whose indirect map moved with firmware 53
+    is_x330: bool = False  # X330 series, whose indirect map moved with firmware 53
     gear_loss: float = 0.0  # fraction of the gear torque lost to friction, if published
 
     @property
     def senses_current(self) -> bool:
-        """True if the model measures and limits motor current."""
+        """True if the model can measure and limit motor current."""
         return self.current_unit > 0.0
 
     @property
@@ -169,7 +169,7 @@ class ServoModel:
 
     @property
     def stall_current(self) -> float:
-        """Largest current that the model allows [A]; 1 A without a current sensor."""
+        """Maximum current allowed by the model [A]; 1 A without a current sensor."""
         return self.current_limit * self.current_unit if self.senses_current else 1.0
 
     @property
@@ -217,20 +217,20 @@ class ServoModel:
         return firmware >= self.fast_read_firmware
 
     def highest_address(self, firmware: int) -> int:
-        """Return the last address of the control table."""
+        """Return the last control table address."""
         return max(data + entries for _, data, entries in self.indirect_blocks(firmware)) - 1
 
 
 _ALL = tuple(MODE_NAMES)
 _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MODE)
-# One row per model, in the order of ServoModel's fields: name, number, firmware, highest baud, A
-# per count, current limit, velocity limit and its bound, °C, 0.1 V, gains, shutdown and the rest.
-# Sources: the model's page of ROBOTIS' e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or
-# …/mx/NAME-2/ (specifications and both areas of the control table), and for differing model numbers
-# (XD430) dynamixel-sdk's control_table/dynamixel.model. The velocity limits of XH430-V, XH540-V270,
-# XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's values apply to
-# firmware before 42. The XW430-T200 is omitted because its page prints another model's stall
-# torque.
+# One row per model, in the order of the ServoModel fields: name, number, firmware, highest baud, A
+# per count, current limit, velocity limit and its bound, °C, 0.1 V, gains, shutdown, etc. Sources:
+# the model's page in the ROBOTIS e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or …/mx/NAME-2/
+# (specifications and both areas of the control table). Where model numbers differ (XD430), the
+# source is control_table/dynamixel.model in dynamixel-sdk. The velocity limits for XH430-V,
+# XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's values
+# apply to firmware before 42. The XW430-T200 is omitted because its page lists the stall torque of
+# another model.
 _430 = 82, (28.5, 46.5, 34.0)  # g, mm
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)
@@ -305,7 +305,7 @@ def by_name(name: str) -> ServoModel:
     Raises
     ------
     KeyError
-        The model is unknown. The message lists the known models.
+        If the model is unknown. The message lists the known models.
     """
     plain = name.upper().removesuffix("-T").removesuffix("-R")
     model = MODELS.get(plain)
@@ -315,13 +315,13 @@ def by_name(name: str) -> ServoModel:
 
 
 def name_of(number: int) -> str:
-    """Return the name of the model with this ``number``, or the number if it is unknown."""
+    """Return the name of the model with this ``number``, or the number itself if unknown."""
     names = [model.name for model in MODELS.values() if model.number == number]
     return names[0] if names else f"model number {number}"
 
 
 def by_number(number: int) -> ServoModel | None:
-    """Return the model with this ``number``, or None if it is unknown."""
+    """Return the model with this ``number``, or None if unknown."""
     return next((model for model in MODELS.values() if model.number == number), None)
 
 

@@ -1,14 +1,14 @@
-"""Drive the joints through dynamixel-sdk: check at connect, then one read and one write per tick.
+"""Drive the joints through dynamixel-sdk with one read and one write per tick.
 
 One fast sync read returns the current, velocity, position and alert bit of all servos; older
-firmware uses the normal sync read. Some of these reads cover more registers, without an additional
-exchange. Every 10 ms a read includes the goals held by the servo, its bus watchdog and its own
-clock, which are 28 more bytes per servo. Four times a second a read includes supply voltage and
-temperature, which are 11 more bytes.
+firmware uses the normal sync read. Some of these reads cover additional registers without an extra
+exchange. Every 10 ms, a read includes the goals stored in the servo, its bus watchdog and its clock
+(28 more bytes per servo). Four times per second, a read includes supply voltage and temperature (11
+more bytes).
 
-One sync write sends goal current and goal position side by side (:mod:`servos.torque`). Current and
-position mode have a single goal and need no indirect addresses. Required EEPROM values are checked
-and never changed.
+One sync write sends goal current and goal position as adjacent registers (:mod:`servos.torque`).
+Current mode and position mode have a single goal and need no indirect addresses. Required EEPROM
+values are checked but never changed.
 """
 
 from __future__ import annotations
@@ -54,20 +54,21 @@ _unpack_supply = struct.Struct("<HB").unpack_from  # voltage, temperature
 _unpack_clock = struct.Struct("<H").unpack_from
 _HEALTH_INTERVAL = 0.25  # s
 _CHECK_INTERVAL = 0.01  # s
-_CHECK_FRACTION = 0.05  # largest fraction of the line's capacity used by checks
-_RECENT_TIME = 0.035  # s for which a goal counts as recent
-_FROZEN_TIME = 0.1  # s in which a servo's 1 ms clock must advance
-_VARIED_READ_COUNT = 32  # requests with varying span lengths after a missing reply
-_CHECK_TIMEOUT = 0.2  # s for a reply during the checks; `clear` blocks the loop for this time
-# s for a reply of an emulated hand, which the machine may delay while the hand's time pauses
+_CHECK_FRACTION = 0.05  # maximum fraction of the line capacity used for checks
+_RECENT_TIME = 0.035  # s, maximum age of a recent goal
+_FROZEN_TIME = 0.1  # s, maximum time for which a servo's 1 ms clock may stand still
+_VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a missing reply
+_CHECK_TIMEOUT = 0.2  # s, reply timeout during the checks; `clear` blocks the loop for this time
+# s, reply timeout for an emulated hand, whose clock pauses while the machine is late.
 _BUSY_TIME = 0.04
-_CLOSING_TRY_COUNT = 10  # tries of torque off when closing
+_CLOSING_TRY_COUNT = 10  # torque-off attempts when closing
 
 
 class DynamixelServos:
     """Servo backend over a serial port; see :class:`servos.base.Servos`.
 
-    It must be used by a single thread. ``notices`` holds findings of `connect` that are not errors.
+    Use it from a single thread only. ``notices`` contains the findings of `connect` that are not
+    errors.
     """
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
@@ -81,10 +82,10 @@ class DynamixelServos:
         self._line: ServoLine | None = None
         self._torque: Torque | None = None
         self._reads: TickReads | None = None
-        self._waiting: SerialPort | None = None  # open port, waiting for the servos to answer
+        self._waiting: SerialPort | None = None  # open port, waiting for the servos to respond
         self._turn = 0  # index of the last span length
-        self._varied_reads = 0  # coming requests whose replies could be confused
-        self._next_health = self._next_check = -math.inf  # clock time of the next reads
+        self._varied_reads = 0  # remaining requests whose replies could be confused
+        self._next_health = self._next_check = -math.inf  # clock times of the next reads
         self._check_interval = _CHECK_INTERVAL
         self._retries = 0
         self._alerts = 0
@@ -97,10 +98,10 @@ class DynamixelServos:
         Raises
         ------
         ServoError
-            Problems were found; the message has one line for each. The port is closed again.
+            If problems were found; the message has one line per problem. The port is closed again.
         ServosSilent
-            Servos do not answer, with no other problem. The port stays open for the next call,
-            because reopening may restart an adapter that is still booting.
+            If the only problem is that servos do not respond. The port stays open for the next
+            call, because reopening may restart an adapter that is still booting.
         """
         waiting, self._waiting = self._waiting, None
         self.close()
@@ -134,7 +135,7 @@ class DynamixelServos:
         self._line, self._torque = line, torque
 
     def _check(self, line: ServoLine, model: ServoModel) -> TickReads:
-        """Check servos, adapter and group reads; set the joints' own limits and the notices."""
+        """Check servos, adapter and group reads; set the joint limits and the notices."""
         port = line.port
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _CHECK_TIMEOUT)
         try:
@@ -152,9 +153,9 @@ class DynamixelServos:
         return reads
 
     def _judge(self, found: list[Examined], port: SerialPort, allowed: float) -> None:
-        """Set limits and notices from the results; ``allowed`` is the reply time in a tick [s].
+        """Set limits and notices from the results; ``allowed`` is the reply time during a tick [s].
 
-        Raises ServoError with a list of all problems.
+        Raises ServoError listing all problems.
         """
         if not any(each.replies or each.errors for each in found):
             raise ServosSilent(
@@ -190,12 +191,12 @@ class DynamixelServos:
     # --- the tick --------------------------------------------------------------------------------
 
     def read(self, reading: Reading) -> None:
-        """Update ``reading`` from one group read, repeated once in time after a damaged reply.
+        """Update ``reading`` from one group read, which is repeated once if its reply is corrupted.
 
         Raises
         ------
         ServoError
-            The port is gone, or a servo's bus watchdog has stopped it.
+            If the port is lost, or a servo has been stopped by its bus watchdog.
         """
         now = self._clock.now()
         if now >= self._next_health:
@@ -212,7 +213,7 @@ class DynamixelServos:
             self._exchange(PRESENT, reading)
 
     def _exchange(self, span: Span, reading: Reading) -> GroupRead | None:
-        """Read a span that includes the joints' motion, and update ``reading``."""
+        """Read a span that includes the joint motion and update ``reading``."""
         if self._reads is None:
             raise ServoError("servos: not connected")
         reading.seq += 1
@@ -223,7 +224,7 @@ class DynamixelServos:
         group = self._reads.spans[span][turn]
         result = group.exchange()
         if result == COMM_RX_CORRUPT:
-            # Repeat the read within the deadline of the first exchange.
+            # Repeat the read within the first exchange's deadline.
             deadline = group.port.deadline
             if time.monotonic() < deadline:
                 self._retries += 1
@@ -258,7 +259,7 @@ class DynamixelServos:
             reading.temperature[joint.finger] = float(temperature)
 
     def _check_torque(self, group: GroupRead, reading: Reading, now: float) -> None:
-        """Check that each servo's clock advances and that it holds a recently sent goal."""
+        """Check that each servo's clock advances and that its goal is a recent one."""
         start, torque = group.start, self._torque
         assert torque is not None
         reading.lost = reading.frozen = 0
@@ -273,7 +274,7 @@ class DynamixelServos:
                 reading.lost |= 1 << joint.finger
 
     def _ask_errors(self, reading: Reading) -> None:
-        """Read the hardware error registers that explain an alert."""
+        """Read the hardware error registers to explain an alert."""
         assert self._reads is not None
         errors = self._reads.errors
         if errors.exchange() == COMM_SUCCESS:
@@ -281,7 +282,7 @@ class DynamixelServos:
                 reading.hardware[joint.finger] = errors.data[joint.id][0]
 
     def write(self, goal: Goal) -> None:
-        """Send goal angles and current limits; does nothing unless torque was switched on here.
+        """Send goal angles and current limits, but only if torque was switched on here.
 
         Raises
         ------
@@ -300,19 +301,19 @@ class DynamixelServos:
         torque.goals.send(values)
 
     def torque_on(self) -> None:
-        """Switch torque on at the present angle with zero current, and verify it.
+        """Switch torque on at the current angle with zero motor current, and verify it.
 
         Raises
         ------
         ServoError
-            Torque on failed or could not be verified. Torque may be on.
+            If switching on failed or could not be verified. Torque may be on.
         """
         if self._torque is None:
             raise ServoError("servos: not connected")
         self._torque.on()
 
     def torque_off(self, reading: Reading) -> bool:
-        """Request torque off and read; return True if every servo's register confirms it.
+        """Request torque off and read; return True if the registers of all servos confirm it.
 
         Raises
         ------
@@ -336,7 +337,7 @@ class DynamixelServos:
     # --- closing ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """Return the number of failed exchanges since connect, by kind."""
+        """Return the numbers of failed exchanges since connect by type."""
         handler = self._handler
         return {
             "timeouts": handler.timeouts,
@@ -350,7 +351,7 @@ class DynamixelServos:
         }
 
     def close(self) -> None:
-        """Switch torque off, verify it as far as the bus allows, and close. Never raises.
+        """Switch torque off, verify it if possible, and close. Never raises.
 
         Torque that another program switched on is left unchanged.
         """

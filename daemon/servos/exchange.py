@@ -1,4 +1,4 @@
-"""Perform the group reads of a tick, choose their kind, and measure their duration.
+"""Perform a tick's group reads, choose their type, and measure their duration.
 
 The daemon and `doctor` share this code, so `doctor` tests the exchanges that the daemon uses.
 """
@@ -19,26 +19,26 @@ from softfinger.daemon.servos.base import Finding, Status
 from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.servos.protocol import TRY_COUNT, FastGroupRead, GroupRead, PacketHandler
 
-Span = tuple[int, int]  # first and last register
-# Spans of one exchange: most ticks; with the goals and the bus watchdog; with the supply; from
-# torque enable on.
+Span = tuple[int, int]  # first and last address
+# Spans of one exchange: on most ticks; including goals and bus watchdog; including supply and
+# temperature; starting at torque enable.
 PRESENT: Span = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
 CHECK: Span = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
 HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
-# A late reply could be mistaken for the reply to the next request. After a request without a reply,
-# the next requests therefore use spans of different lengths, which distinguishes the replies.
-LENGTH_COUNT = 11  # per span: the shortest one and up to ten registers before it
+# A late reply could be mistaken for the reply to the next request. After a missing reply, the next
+# requests therefore use spans of different lengths, which distinguish the replies.
+LENGTH_COUNT = 11  # per span: the shortest version, and up to ten preceding registers
 
-EXCHANGE_COUNT = 50  # number that `doctor` times
-_TIMED_REPLY_TIMEOUT = 0.1  # s for a timed reply, even if `servos.reply_timeout` is shorter
-_CONNECT_READ_COUNT = 9  # reads at connect, of which the fastest gives the minimum reply time
-_REPLY_FRACTION_MAX = 0.8  # largest fraction of a tick for a reply
+EXCHANGE_COUNT = 50  # number of exchanges timed by `doctor`
+_TIMED_REPLY_TIMEOUT = 0.1  # s, minimum reply timeout for timed exchanges
+_CONNECT_READ_COUNT = 9  # reads at connect; the fastest one gives the minimum reply time
+_REPLY_FRACTION_MAX = 0.8  # maximum fraction of a tick for a reply
 _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2  # fraction of failed exchanges
 
 
 class TickReads:
-    """Hold the group reads of a tick, all of one kind, in all their span lengths."""
+    """The group reads of a tick, all of one type, in all span lengths."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class TickReads:
         self.errors = kind(port, handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
 
     def answered(self) -> bool:
-        """Return True if all servos answer each of these group reads."""
+        """Return True if all servos respond to each of these group reads."""
         return all(
             any(lengths[0].exchange() == COMM_SUCCESS for _ in range(TRY_COUNT))
             for lengths in self.spans.values()
@@ -68,11 +68,11 @@ class TickReads:
 def choose_reads(
     port: SerialPort, handler: PacketHandler, ids: Sequence[int], claims_fast: bool
 ) -> tuple[TickReads, list[Finding]]:
-    """Return the fastest group reads that all servos answer, and notices.
+    """Return the fastest group reads supported by all servos, and notices.
 
     ``claims_fast`` is True if the firmware should support fast sync reads. If these fail, the
-    normal sync read is used and a notice is returned. Raises ServoError if no group read is
-    answered.
+    normal sync read is used and a notice is returned. Raises ServoError if the servos do not
+    respond to any group read.
     """
     notices: list[Finding] = []
     if claims_fast:
@@ -93,7 +93,7 @@ def choose_reads(
 
 
 class ExchangeTimes(NamedTuple):
-    """Durations of exchanges [s] and the fraction that failed."""
+    """Exchange durations [s] and the fraction of failed exchanges."""
 
     least: float
     p50: float
@@ -107,10 +107,10 @@ def time_exchanges(
     write: Callable[[], None] | None = None,
     count: int = EXCHANGE_COUNT,
 ) -> ExchangeTimes:
-    """Time ``count`` exchanges, reading and writing as a tick does, without pauses.
+    """Time ``count`` exchanges without pauses, reading and writing as in a tick.
 
-    A read waits on the wire for the preceding write, so its duration includes both. With ``write``
-    None only reads are timed. Each reply may take up to 0.1 s.
+    A read waits on the wire for the preceding write, so its duration includes both. If ``write`` is
+    None, only reads are timed. Each reply may take up to 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0
@@ -138,10 +138,10 @@ def time_exchanges(
 def judge_exchanges(
     times: ExchangeTimes, settings: Settings, what: str, emulated: bool = False
 ) -> Finding:
-    """Compare the duration of exchanges with the tick and with ``servos.reply_timeout``.
+    """Compare exchange durations with the tick and with ``servos.reply_timeout``.
 
-    ``what`` names the timed exchanges in the report. An ``emulated`` hand shares the processors
-    with its clients, so the fastest exchange is compared instead of the 99th percentile.
+    ``what`` is the name of the timed exchanges in the report. An ``emulated`` hand shares the
+    processors with its clients, so the fastest exchange is used instead of the 99th percentile.
     """
     decisive = times.least if emulated else times.p99
     rate, allowed = settings.loop.rate, settings.servos.reply_timeout
@@ -164,7 +164,7 @@ def judge_exchanges(
 
 
 def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) -> list[Finding]:
-    """Return a notice if the fastest of a few reads takes most of a tick."""
+    """Return a notice if even the fastest of a few reads takes most of a tick."""
     least = time_exchanges(port, reads, count=_CONNECT_READ_COUNT).least
     rate = settings.loop.rate
     if least * rate <= _REPLY_FRACTION_MAX:
@@ -178,7 +178,7 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
 
 
 def _remedy(duration: float, settings: Settings) -> str:
-    """Return the settings that allow replies of this duration [s]."""
+    """Return settings that allow replies of this duration [s]."""
     rate = _REPLY_FRACTION_MAX / duration
     digit = 10.0 ** max(len(str(int(rate))) - 2, 0)
     parts = []

@@ -1,4 +1,4 @@
-"""Represent one joint and its servo: unit conversion, limits, last reading and packed goals."""
+"""Represent a joint and its servo: unit conversion, limits, last reading and packed goals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.types import FINGERS
 
-_GOAL_LIMIT = 1_048_575  # counts, largest goal that the multi-turn modes accept
+_GOAL_LIMIT = 1_048_575  # counts, maximum goal in multi-turn modes
 _CURRENT_AND_POSITION = struct.Struct("<hi")
 _CURRENT = struct.Struct("<h")
 _POSITION = struct.Struct("<i")
@@ -25,16 +25,16 @@ GOAL_SIZE: Final = {
 
 
 def servo_name(servo_id: int, finger: int) -> str:
-    """Return the name of a servo in reports, such as ``servo 1 (left)``."""
+    """Return a servo's name for reports, such as ``servo 1 (left)``."""
     return f"servo {servo_id} ({FINGERS[finger]})"
 
 
 def current_toward(
     servos: ServoSettings, goal_q: float, bound: float, q: float, dq: float
 ) -> float:
-    """Return the current [A], positive closing, of the position loop in current mode.
+    """Return the position-loop current [A] in current mode, positive when closing.
 
-    stiffness · (goal_q − q) − damping · dq, limited to ± ``bound``.
+    The current is stiffness · (goal_q − q) − damping · dq, limited to ± ``bound``.
     """
     bound = abs(bound)
     current = servos.stiffness * (goal_q - q) - servos.damping * dq
@@ -45,11 +45,11 @@ def current_toward(
 class JointScale:
     """Conversion of one joint's counts to rad, rad/s and A.
 
-    q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and likewise for velocity. Currents
-    remain motor currents; only their sign follows the joint, so that positive closes.
+    q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and similarly for velocity. Currents
+    remain motor currents; only their sign follows the joint, so that positive currents close it.
     """
 
-    direction: int  # +1 or -1: sign of the counts when the joint closes
+    direction: int  # +1 or -1, sign of the counts when closing
     zero: int  # counts at q = 0
     radian: float  # rad of the joint per position count, always > 0
     velocity: float  # rad/s of the joint per velocity count, always > 0
@@ -57,12 +57,12 @@ class JointScale:
 
     @classmethod
     def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
-        """Return the scale of joint 0 (left) or 1 (right) for these settings.
+        """Return the scale for joint 0 (left) or 1 (right) with these settings.
 
         Raises
         ------
         KeyError
-            The servo model in the settings is unknown.
+            If the servo model in the settings is unknown.
         """
         model = by_name(servos.model) if model is None else model
         return cls(
@@ -74,19 +74,19 @@ class JointScale:
         )
 
     def angle(self, counts: float) -> float:
-        """Convert a position in counts to a joint angle [rad]."""
+        """Convert a position [counts] to a joint angle [rad]."""
         return self.direction * (counts - self.zero) * self.radian
 
     def rate(self, counts: float) -> float:
-        """Convert a velocity in counts to a joint velocity [rad/s]."""
+        """Convert a velocity [counts] to a joint velocity [rad/s]."""
         return self.direction * counts * self.velocity
 
     def amperes(self, counts: float) -> float:
-        """Convert a signed current in counts to a motor current [A], positive closing."""
+        """Convert a signed current [counts] to a motor current [A], positive when closing."""
         return self.direction * counts * self.current_unit
 
     def position_counts(self, q: float) -> int:
-        """Convert a joint angle [rad] to the nearest count within the range of goals."""
+        """Convert a joint angle [rad] to the nearest count within the goal range."""
         counts = self.zero + self.direction * q / self.radian
         return round(min(max(counts, -_GOAL_LIMIT), _GOAL_LIMIT))
 
@@ -95,7 +95,7 @@ class JointScale:
         return round(self.direction * dq / self.velocity)
 
     def current_counts(self, current: float) -> int:
-        """Convert a motor current [A], positive closing, to the nearest signed count."""
+        """Convert a motor current [A], positive when closing, to the nearest signed count."""
         return round(self.direction * current / self.current_unit) if self.current_unit else 0
 
     def bound_counts(self, current: float) -> int:
@@ -105,26 +105,26 @@ class JointScale:
 
 @dataclass(slots=True)
 class Joint:
-    """State of a finger's joint on the bus."""
+    """Bus state of a finger's joint."""
 
     finger: int
     id: int
     scale: JointScale
-    bound: int = 0  # largest goal current in counts
+    bound: int = 0  # maximum goal current in counts
     ends: tuple[int, int] = (0, 0)  # position limits in counts
-    q: float = 0.0  # angle of the last good reading [rad]
+    q: float = 0.0  # angle in the last valid reading [rad]
     dq: float = 0.0  # [rad/s]
     sent: deque[bytes] = field(default_factory=deque)  # recent goals as register bytes
-    ticks: int = -1  # servo's own clock at the last check
+    ticks: int = -1  # servo clock at the last check
     ticked: float = math.inf  # time when that clock last advanced [s]
 
     @property
     def name(self) -> str:
-        """Name of the joint's servo in reports."""
+        """Servo name for reports."""
         return servo_name(self.id, self.finger)
 
     def goal(self, servos: ServoSettings, mode: int, q: float, current: float) -> bytes:
-        """Return the register bytes of a goal [rad, A] in this mode."""
+        """Return the register bytes for a goal [rad, A] in this mode."""
         scale, position = self.scale, self.scale.position_counts(q)
         counts = bound = min(scale.bound_counts(current), self.bound)
         if mode == reg.POSITION_MODE:
@@ -136,7 +136,7 @@ class Joint:
 
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:
-    """Return the register bytes of a goal in counts in this mode."""
+    """Return the register bytes for a goal [counts] in this mode."""
     if mode == reg.POSITION_MODE:
         return _POSITION.pack(position)
     if mode == reg.CURRENT_MODE:
@@ -145,7 +145,7 @@ def pack_goal(mode: int, current: int, position: int) -> bytes:
 
 
 def goal_in(mode: int, table: bytes, start: int) -> bytes:
-    """Extract the goal that a servo holds from its registers ``table``, starting at ``start``."""
+    """Extract a servo's goal from its registers ``table``, which begin at address ``start``."""
     current = table[reg.GOAL_CURRENT - start : reg.GOAL_CURRENT - start + _CURRENT.size]
     position = table[reg.GOAL_POSITION - start : reg.GOAL_POSITION - start + _POSITION.size]
     if mode == reg.POSITION_MODE:

@@ -1,6 +1,6 @@
-"""Open a serial port exclusively for the SDK, with a monotonic deadline for each exchange.
+"""Provide the SDK with an exclusive serial port and a monotonic deadline per exchange.
 
-:mod:`servos.protocol` lists the reasons for not using the SDK's own port.
+:mod:`servos.protocol` lists the reasons why the SDK's own port is not used.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ with contextlib.suppress(ModuleNotFoundError):  # Windows supports only simulate
     import termios
 
 BITS_PER_BYTE = 10
-# s for a reply outside the loop (setup, calibration). It covers a new servo with its factory return
-# delay behind a slow adapter on a busy machine.
+# s, reply timeout outside the loop (setup, calibration). It allows for a new servo with its factory
+# return delay, on a slow adapter and a busy machine.
 UNPACED_TIMEOUT = 0.5
 _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")
 
 
 def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
-    """Return the kernel's file of a USB adapter's latency timer [ms], or None without one."""
+    """Return the kernel file for a USB adapter's latency timer [ms], or None if there is none."""
     place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     return place if place.exists() else None
 
 
 class PortLost(ServoError):
-    """The open port disappeared: adapter unplugged or without power."""
+    """Raised if the open port disappears: adapter unplugged or without power."""
 
 
 class SerialPort(PortHandler):  # type: ignore[misc]
     """An exclusive serial port for one thread.
 
-    A reply may take ``reply_timeout`` seconds, or longer if the transmission of its bytes alone
-    takes longer. ``received`` holds received bytes that are not decoded yet. ``deadline`` is the
-    time.monotonic() at which the current exchange ends.
+    A reply may take ``reply_timeout`` seconds, or longer if the transmission of its bytes takes
+    longer. ``received`` holds bytes that have not been decoded yet. ``deadline`` is the
+    time.monotonic() value at which the current exchange ends.
     """
 
     def __init__(
         self, path: str, baud: int, reply_timeout: float, low_latency: bool = True
     ) -> None:
-        """``low_latency`` requests the adapter's low-latency mode when the port is opened."""
+        """Create a closed port; ``low_latency`` requests low-latency mode when it is opened."""
         super().__init__(path)
         self._low_latency = low_latency
         self.baudrate = baud
@@ -62,7 +62,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         self._sent = 0
 
     def openPort(self) -> bool:
-        """Open the port exclusively. Raises ServoError with the reason and its fix."""
+        """Open the port exclusively. Raises ServoError with the reason and a fix."""
         path = self.port_name
         try:
             self.ser = serial.Serial(path, self.baudrate, timeout=0, exclusive=True)
@@ -74,23 +74,23 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             if self._low_latency:
                 self.ser.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
-            pass  # pseudo-terminals and some adapters lack this mode; see latency_file()
+            pass  # Pseudo-terminals and some adapters lack this mode; see latency_file().
         self.received.clear()
         self.ser.reset_input_buffer()
         return True
 
     def closePort(self) -> None:
-        """Close the port. Does nothing if it is closed."""
+        """Close the port if it is open."""
         if self.ser is not None:
             self.ser.close()
         self.is_open = False
         self._descriptor = -1
 
     def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
-        """Send a packet; return True if it was sent completely.
+        """Send a packet; return True if it was completely sent.
 
-        If ``reply`` bytes are expected, older input is discarded first, so that it is not mistaken
-        for the reply, and the reply's deadline starts. The deadline is not later than ``until`` [s,
+        If ``reply`` bytes are expected, older input is first discarded so that it is not mistaken
+        for the reply. The reply deadline then starts and is limited to ``until`` [s,
         time.monotonic()].
         """
         remaining = packet
@@ -112,13 +112,13 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         return True
 
     def setPacketTimeout(self, packet_length: int) -> None:
-        """Start the deadline of a reply of ``packet_length`` bytes."""
+        """Start the deadline for a reply of ``packet_length`` bytes."""
         wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
         # At slow baud rates, allow twice the transmission time and the return delays.
         self.deadline = time.monotonic() + max(self.reply_timeout, 2.0 * wire + 0.001)
 
     def fill(self) -> bool:
-        """Wait for bytes and append them to ``received``; return False at the deadline."""
+        """Wait for bytes and append them to ``received``; return False if the deadline passes."""
         try:
             remaining = max(0.0, self.deadline - time.monotonic())
             if not select.select((self._descriptor,), (), (), remaining)[0]:

@@ -1,18 +1,19 @@
-"""Implement the client side of Protocol 2.0: packet handler, group exchanges, single servos.
+"""Implement the client side of Protocol 2.0: packet handler, group exchanges and single servos.
 
-This module and :mod:`servos.port` override the following behaviour of the SDK (3.7.31 to 4.1.0) and
-use the rest of it unchanged:
+This module and :mod:`servos.port` override the following behaviour of the SDK (3.7.31 to 4.1.0).
+The rest of the SDK is used unchanged.
 
-- ``txPacket`` drops the stuffed packet, so FF FF FD within goals is sent unstuffed and misread.
-- ``removeStuffing`` loses a byte of FF FF FD 12 FF FD FD; 3-8 % of group reads failed in tests.
-- ``rxPacket`` polls non-blocking reads, which keeps a processor busy during the transmission.
-- ``txPacket`` leaves ``is_using`` set if the port raises, so every later call returns −1000.
-- ``readTxRx`` accepts replies of a wrong length, so the CRC of a late reply is returned as data.
-- ``GroupSyncRead`` drops the servos' error bytes and returns 0 after a failure. An alert is lost,
+- ``txPacket`` discards the stuffed packet, so FF FF FD within goals is sent unstuffed and misread.
+- ``removeStuffing`` drops a byte of FF FF FD 12 FF FD FD; 3-8 % of group reads failed in tests.
+- ``rxPacket`` polls with non-blocking reads, which keeps a processor busy during transmission.
+- ``txPacket`` leaves ``is_using`` set if the port raises, so all later calls return −1000.
+- ``readTxRx`` accepts replies with a wrong length, so the CRC of a late reply is returned as data.
+- ``GroupSyncRead`` discards the servos' error bytes and returns 0 after a failure. Alerts are lost,
   and a joint appears to be at 0.
 - ``broadcastPing`` always waits for 253 servos, which takes 0.8 s at 1 Mbaud.
-- ``PortHandler`` measures deadlines on the wall clock and adds 34 ms. A missing servo costs 35 ms,
-  and setting the clock changes the deadline. It also opens a port that another process uses.
+- ``PortHandler`` measures deadlines on the wall clock and adds 34 ms. A missing servo therefore
+  costs 35 ms, and setting the clock changes the deadline. It also opens ports that are in use by
+  another process.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from dynamixel_sdk.robotis_def import (
 from softfinger.daemon.servos.control_table import crc16
 from softfinger.daemon.servos.port import UNPACED_TIMEOUT, SerialPort
 
-TRY_COUNT = 3  # tries of an exchange outside the tick
+TRY_COUNT = 3  # attempts per exchange outside the tick
 _HEADER = b"\xff\xff\xfd"
 _PREFIX = _HEADER + b"\x00"
 _STUFFED = _HEADER + b"\xfd"
@@ -52,9 +53,9 @@ _MAX_PACKET = 1024
 _STATUS_SIZE = 11  # bytes of a status packet without data
 _FAST_SYNC_READ = 0x8A  # not defined by dynamixel-sdk 3
 _OLD_HEADER = b"\xff\xff"  # Protocol 1.0: header, ID, length, instruction or error, checksum
-_OLD_STATUS = 6  # bytes of a reply to a ping in Protocol 1.0
-_OLD_TIMEOUT = 0.5  # s; an emulated servo on a busy machine takes longer than 0.1 s
-_ERROR_MASK = 0x7F  # error code in a servo's error byte; the highest bit is the alert
+_OLD_STATUS = 6  # bytes, ping reply in Protocol 1.0
+_OLD_TIMEOUT = 0.5  # s; an emulated servo on a busy machine may take longer than 0.1 s
+_ERROR_MASK = 0x7F  # error code in the error byte; the highest bit is the alert
 
 
 def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -71,7 +72,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
     def __init__(self) -> None:
         self.timeouts = 0  # missing replies
-        self.crc_errors = 0  # replies with a wrong CRC
+        self.crc_errors = 0  # replies with an invalid CRC
         self.torn = 0  # incomplete replies
         self.late = 0  # replies to an earlier request
         self.refused = 0  # reads answered with an error
@@ -79,11 +80,11 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
     @property
     def damaged(self) -> int:
-        """Sum of the counters of damaged, incomplete and unexpected input."""
+        """Total count of corrupted, incomplete and unexpected input."""
         return self.crc_errors + self.torn + self.skipped_bytes
 
     def txPacket(self, port: SerialPort, txpacket: list[int]) -> int:
-        """Add byte stuffing and CRC to the packet in ``txpacket``, and send it."""
+        """Add byte stuffing and CRC to the packet ``txpacket`` and send it."""
         packet = packed(txpacket[4], txpacket[7], bytes(txpacket[8:-2]))
         if len(packet) > _MAX_PACKET:
             return int(COMM_TX_ERROR)
@@ -92,10 +93,10 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     def readTxRx(
         self, port: SerialPort, dxl_id: int, address: int, length: int
     ) -> tuple[list[int], int, int]:
-        """Read a span; return (data, result code, error byte), with zeros as data after an error.
+        """Read a span; return (data, result code, error byte). After an error, data are zeros.
 
-        A reply of another length is a late reply, because the SDK does not wait for the reply to an
-        action, and is skipped.
+        Replies with another length are skipped. They are late replies to an action instruction, for
+        which the SDK does not wait.
         """
         if dxl_id >= BROADCAST_ID:
             return [], int(COMM_NOT_AVAILABLE), 0
@@ -114,10 +115,10 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 return [0] * length, result, packet[8]
 
     def rxPacket(self, port: SerialPort, fast_option: bool = False) -> tuple[Any, int]:
-        """Return the next status packet without byte stuffing, and the result code.
+        """Return the next status packet with byte stuffing removed, and the result code.
 
-        A fast reply has no byte stuffing and comes from the broadcast ID. A damaged packet ends the
-        wait at once, because it is not sent again.
+        A fast reply has no byte stuffing and comes from the broadcast ID. A corrupted packet ends
+        the wait immediately, because it is not sent again.
         """
         buffer = port.received
         while True:
@@ -131,7 +132,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 known = sender == BROADCAST_ID if fast_option else sender <= MAX_ID
                 if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != INST_STATUS:
                     self.skipped_bytes += 1
-                    del buffer[0]  # an echo of the request, or noise
+                    del buffer[0]  # echo of the request, or noise
                     continue
                 end = 7 + length
                 if len(buffer) >= end:
@@ -157,10 +158,10 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
 
 class GroupRead:
-    """A sync read of one span of several servos.
+    """Sync read of one span from several servos.
 
-    After a successful :meth:`exchange`, ``data[id]`` has the span's bytes and ``errors[id]`` the
-    servo's error byte. After a failure their contents are undefined.
+    After a successful :meth:`exchange`, ``data[id]`` contains the span's bytes and ``errors[id]``
+    the servo's error byte. After a failure, their contents are undefined.
     """
 
     instruction = INST_SYNC_READ
@@ -184,11 +185,11 @@ class GroupRead:
         self._reply = (_STATUS_SIZE + length) * len(ids)
 
     def exchange(self, until: float = math.inf) -> int:
-        """Request and wait at most ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Exchange by the time ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler = self._handler
-        for servo_id in self.data:  # each servo sends its own reply, in this order
+        for servo_id in self.data:  # Each servo sends its own reply in this order.
             while True:
                 packet, result = handler.rxPacket(self.port, False)
                 if result != COMM_SUCCESS:
@@ -206,12 +207,12 @@ class GroupRead:
 
 
 class FastGroupRead(GroupRead):
-    """A fast sync read: all servos share one reply, whose last CRC covers all of its bytes."""
+    """Fast sync read: all servos share one reply, whose last CRC covers all its bytes."""
 
     instruction = _FAST_SYNC_READ
 
     def exchange(self, until: float = math.inf) -> int:
-        """Request and wait at most ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Exchange by the time ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler, length = self._handler, self._length
@@ -236,7 +237,7 @@ class FastGroupRead(GroupRead):
 
 
 class GroupWrite:
-    """A sync write of one span of several servos."""
+    """Sync write of one span to several servos."""
 
     def __init__(self, port: SerialPort, address: int, length: int, ids: Sequence[int]) -> None:
         self._port = port
@@ -244,7 +245,7 @@ class GroupWrite:
         self.ids = [bytes((servo_id,)) for servo_id in ids]
 
     def send(self, values: Sequence[bytes]) -> None:
-        """Write each servo's bytes in the order of the IDs, without a reply."""
+        """Write one value per servo, in the order of the IDs, without a reply."""
         body = b"".join(name + value for name, value in zip(self.ids, values, strict=True))
         self._port.send(packed(BROADCAST_ID, INST_SYNC_WRITE, self._span + body))
 
@@ -253,14 +254,14 @@ class GroupWrite:
 
 
 class ServoLine:
-    """Exchanges with single servos on an open port, each with a few tries."""
+    """Exchanges with single servos on an open port, each attempted up to `TRY_COUNT` times."""
 
     def __init__(self, port: SerialPort, handler: PacketHandler | None = None) -> None:
         self.port = port
         self.handler = handler or PacketHandler()
 
     def ping(self, servo_id: int, tries: int = TRY_COUNT) -> int | None:
-        """Return the servo's model number, or None without a reply."""
+        """Return the servo's model number, or None if it does not reply."""
         for _ in range(tries):
             number, result, _ = self.handler.ping(self.port, servo_id)
             if result == COMM_SUCCESS:
@@ -268,13 +269,13 @@ class ServoLine:
         return None
 
     def ping_old(self, servo_id: int) -> bool:
-        """Return True if a servo answers one ping in Protocol 1.0."""
+        """Return True if a servo replies to one ping in Protocol 1.0."""
         port = self.port
         body = bytes((servo_id, 2, INST_PING))
         request = _OLD_HEADER + body + bytes((~sum(body) & 0xFF,))
         port.send(request, _OLD_STATUS, time.monotonic() + _OLD_TIMEOUT)
         while True:
-            came = bytes(port.received).replace(request, b"")  # an adapter may echo the request
+            came = bytes(port.received).replace(request, b"")  # some adapters echo it
             reply = came[max(came.find(_OLD_HEADER), 0) :][:_OLD_STATUS]
             if len(reply) == _OLD_STATUS:
                 sound = ~sum(reply[2:-1]) & 0xFF == reply[-1]
@@ -283,9 +284,10 @@ class ServoLine:
                 return False
 
     def ping_all(self, wait: float) -> dict[int, tuple[int, int]]:
-        """Return (model number, firmware) of each servo that answers a ping within ``wait`` [s].
+        """Return (model number, firmware) of each servo that replies to a ping within ``wait`` [s].
 
-        Servos answer one after the other in the order of their IDs; 253 servos need 0.8 s.
+        Servos reply one after the other in the order of their IDs, which takes 0.8 s for 253
+        servos.
         """
         found: dict[int, tuple[int, int]] = {}
         port = self.port
@@ -298,7 +300,7 @@ class ServoLine:
         return found
 
     def read(self, servo_id: int, address: int, length: int) -> bytes | None:
-        """Return a span of registers, or None without a valid reply."""
+        """Return a register span, or None if there is no valid reply."""
         for _ in range(TRY_COUNT):
             data, result, error = self.handler.readTxRx(self.port, servo_id, address, length)
             if result == COMM_SUCCESS:
@@ -306,15 +308,15 @@ class ServoLine:
         return None
 
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
-        """Write bytes of equal length to each servo, without a reply or verification.
+        """Write bytes of equal length to each servo without a reply or verification.
 
-        It uses a sync write, which works at every status return level.
+        This uses a sync write, which works at every status return level.
         """
         length = len(next(iter(values.values())))
         GroupWrite(self.port, address, length, list(values)).send(list(values.values()))
 
     def store(self, address: int, values: Mapping[int, bytes]) -> list[int]:
-        """Write each servo's bytes and read them back; return the IDs of servos that failed."""
+        """Write each servo's bytes and read them back; return the IDs of failed servos."""
         waiting = dict(values)
         for _ in range(TRY_COUNT):
             self.write(address, waiting)
@@ -328,7 +330,7 @@ class ServoLine:
 
 @contextlib.contextmanager
 def open_line(path: str, baud: int, low_latency: bool = True) -> Iterator[ServoLine]:
-    """Yield a line on its own port, closed at the end. Raises ServoError if it can't be opened."""
+    """Open a port, yield a line on it, and close it. Raises ServoError if it can't be opened."""
     port = SerialPort(path, baud, UNPACED_TIMEOUT, low_latency)
     port.openPort()
     try:

@@ -1,8 +1,8 @@
-"""Find servos on a port, and configure the hand's servos: ID, baud rate and registers.
+"""Find servos on a port and configure the hand's servos: ID, baud rate and registers.
 
-:func:`provision` is the only code that writes a servo's EEPROM. It runs only on request
-(`softfinger doctor --fix`) and with torque off. IDs and baud rates are written only to servos that
-are identified without ambiguity (:func:`plan`).
+Only :func:`provision` writes a servo's EEPROM. It runs only on request (`softfinger doctor --fix`)
+and with torque off. IDs and baud rates are written only to servos that are identified unambiguously
+(:func:`plan`).
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-SEARCH_TIME = 0.8  # s to listen at each rate, enough for 253 servos at 1 Mbaud
+SEARCH_TIME = 0.8  # s of listening per rate, enough for 253 servos at 1 Mbaud
 FACTORY_ID = 1
 ONE_SERVO_ONLY = (
     "connect one servo alone, then `softfinger doctor --fix`; then the next one beside it, and the "
     "same again"
 )
-_READ_COUNT = 8  # reads of the whole table
-_REBOOT_TIMEOUT = 2.0  # s until a servo must answer after a reboot
-_WRITE_TIME = 0.05  # s for a packet to leave the adapter and be stored in EEPROM
+_READ_COUNT = 8  # number of full-table reads
+_REBOOT_TIMEOUT = 2.0  # s, maximum time until a servo responds after a reboot
+_WRITE_TIME = 0.05  # s for sending a packet and storing it in EEPROM
 
 
 # --- finding servos ------------------------------------------------------------------------------
@@ -49,7 +49,7 @@ _WRITE_TIME = 0.05  # s for a packet to leave the adapter and be stored in EEPRO
 
 @dataclass(frozen=True, slots=True)
 class FoundServo:
-    """A servo that answered a search."""
+    """Servo that replied to a search."""
 
     id: int
     baud: int
@@ -60,14 +60,14 @@ class FoundServo:
         return self.describe(str(self.baud))
 
     def describe(self, rates: str) -> str:
-        """Return the report line of a servo that answers at these rates [baud]."""
+        """Return the report line for a servo that replies at these rates [baud]."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
 
 @dataclass(frozen=True, slots=True)
 class Garbled:
-    """An ID with damaged replies: several servos share it, or the line is bad."""
+    """ID with corrupted replies: several servos share it, or the line is faulty."""
 
     id: int
     baud: int
@@ -82,11 +82,11 @@ class Garbled:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Result of a search. A servo may be in ``servos`` and its ID also in ``garbled``."""
+    """Search result. The ID of a servo in ``servos`` may also be in ``garbled``."""
 
     servos: tuple[FoundServo, ...]
     garbled: tuple[Garbled, ...]
-    old: tuple[int, ...] = ()  # rates at which a servo answers in Protocol 1.0
+    old: tuple[int, ...] = ()  # rates at which a servo replies in Protocol 1.0
 
     def old_protocol(self) -> list[Finding]:
         """Return a finding for each rate at which a servo uses Protocol 1.0."""
@@ -100,15 +100,15 @@ def search(
     wait: float = SEARCH_TIME,
     ids: Iterable[int] = (FACTORY_ID,),
 ) -> Found:
-    """Search the port for servos at each rate for ``wait`` s, without changing registers.
+    """Search the port for servos for ``wait`` [s] at each rate, without changing registers.
 
-    Rates that the adapter lacks are skipped. If damaged bytes arrive, ``ids`` are probed
-    individually.
+    Rates that the adapter does not support are skipped. If corrupted bytes arrive, ``ids`` are
+    probed individually.
 
     Raises
     ------
     ServoError
-        The port can't be opened at any of the rates.
+        If the port can't be opened at any of the rates.
     """
     found: list[FoundServo] = []
     garbled: list[Garbled] = []
@@ -134,10 +134,10 @@ def search(
 
 
 def is_garbled(line: ServoLine, servo_id: int) -> bool:
-    """Return True if several servos reply to this ID and their registers differ.
+    """Return True if several servos with different register values reply to this ID.
 
-    Supply voltage, position and running time differ between servos, whereas ping replies may be
-    equal.
+    Supply voltage, position and running time differ between servos, whereas their ping replies may
+    be identical.
     """
     handler, damaged, silent = line.handler, 0, 0
     for _ in range(_READ_COUNT):
@@ -146,8 +146,8 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
         damaged += handler.damaged > before
         silent += result == COMM_RX_TIMEOUT
         if silent > 1 and not damaged:
-            break  # no servo has this ID
-    return damaged > 1  # a single one may be interference
+            break  # no servo uses this ID
+    return damaged > 1  # a single corrupted reply may be interference
 
 
 # --- identifying servos --------------------------------------------------------------------------
@@ -155,7 +155,7 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A servo that will receive the ID and baud rate of a finger's servo."""
+    """Assignment of a finger's ID and baud rate to a servo."""
 
     servo: FoundServo
     finger: int
@@ -164,7 +164,7 @@ class Change:
 
     @property
     def name(self) -> str:
-        """Name in reports after the change."""
+        """Name used in reports after the change."""
         return servo_name(self.id, self.finger)
 
     def __str__(self) -> str:
@@ -178,24 +178,24 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Unambiguous ``changes``, and the remaining differences from the settings."""
+    """Unambiguous ``changes`` and remaining differences from the settings."""
 
     changes: tuple[Change, ...]
-    missing: tuple[int, ...]  # fingers whose servo is not identified
-    strangers: tuple[FoundServo, ...]  # answering servos that belong to no finger
+    missing: tuple[int, ...]  # fingers with an unidentified servo
+    strangers: tuple[FoundServo, ...]  # replying servos not assigned to a finger
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
     """Assign the servos found at ``rates`` to the joints.
 
-    A servo of the right model with a missing servo's ID at another rate is that servo. Otherwise, a
-    single unassigned servo is assigned to a single missing one. Servos with damaged replies are not
-    changed.
+    If a servo of the right model replies at another rate with the ID of a missing servo, it is
+    taken to be that servo. Otherwise, a single unassigned servo is assigned to a single missing
+    one. Servos with corrupted replies are not changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
-    # An emulator without line timing answers at every rate.
+    # An emulator without line timing replies at every rate.
     anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
@@ -206,8 +206,8 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
         and not (each.id in anywhere and each.baud != servos.baud)
         and (each.id, each.baud) not in bad
     ]
-    # A servo with a configured ID and rate belongs to that finger even if the scene omits the
-    # finger.
+    # A servo with a configured ID and rate belongs to that finger even if the finger is not in the
+    # scene.
     others = {each for each in strangers if each.baud == servos.baud and each.id in servos.ids}
     fit = [each for each in strangers if each.number == model.number and each not in others]
     missing = [servo_id for servo_id in ids if servo_id not in home]
@@ -233,7 +233,7 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 
 
 def provision(settings: Settings) -> list[Finding]:
-    """Configure each servo of the scene: ID, baud rate, required registers and error state.
+    """Configure each servo in the scene: ID, baud rate, required registers and error state.
 
     Returns
     -------
@@ -242,7 +242,7 @@ def provision(settings: Settings) -> list[Finding]:
     Raises
     ------
     ServoError
-        The port can't be opened.
+        If the port can't be opened.
     """
     servos = settings.servos
     result: list[Finding] = []
@@ -324,14 +324,14 @@ def _set_up(
     model: ServoModel,
     result: list[Finding],
 ) -> None:
-    """Write all registers that `register_table` requires, and reboot the servo if needed."""
+    """Write all registers required by `register_table` and reboot the servo if needed."""
     servo_id = settings.servos.ids[finger]
     name = servo_name(servo_id, finger)
 
     def failed(problem: str) -> None:
         result.append(Finding("warn", name, problem))
 
-    # At level 0 reads are not answered, so the level is set before the first read.
+    # At level 0, servos do not reply to reads, so set the level before the first read.
     if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
         return failed("answers a ping but no read")
     table = line.read(servo_id, 0, CHECKED)
@@ -355,7 +355,7 @@ def _set_up(
     elif table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
         return None
     rows = required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION])
-    # Write the operating mode first, because it resets gains, profiles and goals.
+    # Write the operating mode first, because this resets gains, profiles and goals.
     for row in sorted(rows, key=lambda row: row.register.address != reg.OPERATING_MODE):
         raw = line.read(servo_id, row.register.address, row.register.size) or b""
         wrong = row.wrong_in(raw, row.register.address) if raw else None
@@ -381,7 +381,7 @@ def _reboot(line: ServoLine, servo_id: int) -> bool:
     line.handler.reboot(line.port, servo_id)
     end = time.monotonic() + _REBOOT_TIMEOUT
     while time.monotonic() < end:
-        # Each ping waits for its deadline, which paces this loop.
+        # A ping without a reply waits for its deadline, which paces this loop.
         if line.ping(servo_id, tries=1) is not None:
             return line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1) == b"\x00"
     return False

@@ -1,14 +1,14 @@
-"""List the servo registers that affect the hand, with their required values.
+"""List the servo registers that affect the hand and their required values.
 
-The table is :func:`required_registers`, in the order of the e-Manual's control table. A servo keeps
-its EEPROM permanently and its RAM until power is cut, so both may contain values of another
-program. EEPROM is checked at connect and written only by `softfinger doctor --fix`. RAM registers
-marked ``armed`` are written by `arm`, so they are also correct after a reboot.
+:func:`required_registers` returns the table in the order of the e-Manual's control table. A servo
+retains its EEPROM permanently and its RAM until power is cut, so both may contain values from
+another program. EEPROM is checked at connect and written only by `softfinger doctor --fix`. RAM
+registers marked ``armed`` are written by `arm`, so they are correct even after a reboot.
 
-Omitted registers do not affect goal tracking, limits or bus replies in the modes that the hand
-uses. ID and baud rate are found by a search. Moving threshold, LED and external ports only report.
-Velocity gains and goal velocity apply to velocity mode. `servos.torque` writes goal current, goal
-position, bus watchdog and indirect addresses at each `arm`.
+The omitted registers do not affect goal tracking, limits or bus replies in the modes used by the
+hand. ID and baud rate are found by a search. Moving threshold, LED and external ports are only
+indicators. Velocity gains and goal velocity apply only to velocity mode. `servos.torque` writes
+goal current, goal position, bus watchdog and indirect addresses on each `arm`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from softfinger.daemon.servos.base import Status
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 
-# The return delays of both servos add up in one read; above 50 µs each they exceed a 500 Hz tick.
+# The return delays of both servos add up in one read. With more than 50 µs each, a read would
+# exceed a 500 Hz tick.
 RETURN_DELAY_MAX: Final = 25
-# Drive mode bits: follow another servo; switch torque on when a goal is written.
+# Drive mode bits: follow another servo, and switch torque on when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
 _STARTUP_FIRMWARE = 45
@@ -33,7 +34,7 @@ _POSITION_MAX = reg.COUNTS_PER_TURN - 1
 
 
 class Register(NamedTuple):
-    """A writable register with the name that the e-Manual gives it."""
+    """Writable register with its name from the e-Manual."""
 
     name: str
     address: int
@@ -41,17 +42,17 @@ class Register(NamedTuple):
     signed: bool = False
 
     def value_in(self, table: bytes, start: int = 0) -> int:
-        """Return the register's value from ``table``, a span of registers starting at ``start``."""
+        """Return the register's value from ``table``, a register span beginning at ``start``."""
         at = self.address - start
         return int.from_bytes(table[at : at + self.size], "little", signed=self.signed)
 
     def packed(self, value: int) -> bytes:
-        """Return a value as the register's bytes."""
+        """Convert a value to the register's bytes."""
         return value.to_bytes(self.size, "little", signed=value < 0)
 
 
-# Registers that `doctor --save` stores for a later restore. ID, baud rate and protocol are
-# excluded, because a servo that changes them no longer answers at its address.
+# Registers stored by `doctor --save` for a later restore. ID, baud rate and protocol are excluded,
+# because a servo no longer replies at its address after they change.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),
@@ -87,18 +88,18 @@ _AT: Final = {register.address: register for register in REGISTERS}
 
 
 class Requirement(NamedTuple):
-    """Required value of a register. ``status`` is the finding's status if it does not hold."""
+    """Required value of a register. A wrong value causes a finding with this ``status``."""
 
     register: Register
     holds: Callable[[int], bool]
-    mended: Callable[[int], int]  # value to write instead of a wrong one
-    told: Callable[[int], str]  # description of a wrong value and of the expected one
+    mended: Callable[[int], int]  # replacement for a wrong value
+    told: Callable[[int], str]  # description of a wrong value and the expected value
     status: Status
     armed: bool = False  # RAM written by `arm`
     then: str = ""  # action required after the value is corrected
 
     def wrong_in(self, table: bytes, start: int = 0) -> int | None:
-        """Return the value from ``table``, which begins at ``start``, if it is wrong; else None."""
+        """Return the value in ``table`` (from address ``start``) if it is wrong, otherwise None."""
         value = self.register.value_in(table, start)
         return None if self.holds(value) else value
 
@@ -118,7 +119,7 @@ def _exactly(
 
 
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
-    """Return the row of a limit at which the servo stops itself; ``high`` is the factory value."""
+    """Return the row for a limit at which the servo stops itself; ``high`` is the factory value."""
     register = _AT[address]
     expected = f"{low}" if low == high else f"{low} … {high}"
     return Requirement(
@@ -237,7 +238,7 @@ def required_registers(
 
 
 def armed_registers(model: ServoModel) -> list[Requirement]:
-    """Return the rows of RAM that `arm` writes."""
+    """Return the rows for RAM registers written by `arm`."""
     why = "another program's; `arm` sets it"
     d, i, p = model.position_gains
     values = (
@@ -268,7 +269,7 @@ def _current_limit(model: ServoModel, current_max: float) -> Requirement:
 
 
 def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iterable[Requirement]:
-    """Return the rows of position mode, where a servo silently rejects goals beyond its limits."""
+    """Return the rows for position mode, where servos silently reject goals beyond their limits."""
     ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
     first, last = sorted(scale.position_counts(q) for q in ends)
     needed = f"the joint needs {first} … {last}"

@@ -1,4 +1,4 @@
-"""Simulate the hand's servos in this process, with the resolution of real ones."""
+"""Simulate the hand's servos in this process with realistic resolution."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.joint import JointScale, current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
-_HEALTH_INTERVAL = 0.25  # s between two readings of temperature and supply
-_OVERLOAD_TIME = 2.0  # s at the current limit until an overload error
+_HEALTH_INTERVAL = 0.25  # s between temperature and supply readings
+_OVERLOAD_TIME = 2.0  # s at the current limit before an overload error
 
 
 class MotorHeat(Protocol):
-    """Thermal model of one motor."""
+    """Thermal model of a motor."""
 
     sensed: float  # thermometer reading [°C]
 
     def step(self, current: float, seconds: float) -> None:
-        """Advance by ``seconds`` at this ``current`` [A]."""
+        """Advance by ``seconds`` at a constant ``current`` [A]."""
 
 
 class HandPlant(JointPlant, Protocol):
-    """Joints of the simulated hand, including the servos' watchdog and temperatures."""
+    """Joints of the simulated hand, including servo watchdog and temperatures."""
 
     @property
     def servo_heat(self) -> Sequence[MotorHeat]:
         """Thermal model of each joint's motor."""
 
     def hold_torque_until(self, t: float) -> None:
-        """Keep torque on until time t [s], when it ends by itself."""
+        """Keep torque on until time t [s], then switch it off."""
 
 
 class SimulatedServos:
-    """The joints of a simulated hand, in counts of the configured model.
+    """Servos of a simulated hand, with the resolution of the configured model.
 
-    Every exchange first advances the hand to the clock's time. With a watchdog set, torque ends by
-    itself that long after the last exchange, and only :meth:`torque_on` restores it.
+    Every exchange first advances the hand to the clock time. If a watchdog is set and no exchange
+    occurs for that time, torque is switched off, and only :meth:`torque_on` restores it.
     """
 
     def __init__(self, settings: Settings, hand: HandPlant, clock: Clock) -> None:
@@ -58,12 +58,12 @@ class SimulatedServos:
         self._watchdog = settings.servos.watchdog or math.inf
         self._connected = False
         self._torque = False
-        self._tripped = False  # the watchdog ended torque that was switched on here
+        self._tripped = False  # the watchdog has switched torque off
         self._trips = 0
         self._last = -math.inf  # time of the last exchange
         self._goal_q = [0.0, 0.0]
         self._goal_current = [0.0, 0.0]
-        self._q = [0.0, 0.0]  # last reading [rad, rad/s]
+        self._q = [0.0, 0.0]  # last angle and velocity readings [rad, rad/s]
         self._dq = [0.0, 0.0]
         self._seq = 0
         self._errors = [0, 0]  # hardware error bits
@@ -71,7 +71,7 @@ class SimulatedServos:
         self._health_read = -math.inf
 
     def connect(self) -> None:
-        """Connect the servos with torque off. Raises ServoError if the model lacks the mode."""
+        """Connect with torque off. Raises ServoError if the model does not support the mode."""
         unfit = check_model("servos.model", self._model, self._mode)
         if unfit is not None:
             raise ServoError(str(unfit))
@@ -80,7 +80,7 @@ class SimulatedServos:
         self._switch(False)
 
     def read(self, reading: Reading) -> None:
-        """Update ``reading`` with angle, velocity and current, rounded to the servo's counts."""
+        """Update ``reading`` with angle, velocity and current, rounded to servo counts."""
         if not self._connected:
             reading.valid = False
             return
@@ -125,7 +125,7 @@ class SimulatedServos:
             self._drive()
 
     def torque_on(self) -> None:
-        """Switch torque on with the goal at the present count and zero current."""
+        """Switch torque on with the goal at the present position and zero motor current."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -136,7 +136,7 @@ class SimulatedServos:
         self._switch(True)
 
     def torque_off(self, reading: Reading) -> bool:
-        """Switch torque off, which always succeeds here, and read."""
+        """Switch torque off and read. This always succeeds."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -160,7 +160,7 @@ class SimulatedServos:
             limit = self._settings.current_limit[joint]
             bound = scale.bound_counts(min(abs(goal.current[joint]), limit))
             current = bound * scale.current_unit
-            if self._mode == reg.CURRENT_MODE:  # the daemon's own position loop
+            if self._mode == reg.CURRENT_MODE:  # position loop of the daemon
                 q, dq = self._q[joint], self._dq[joint]
                 current = current_toward(self._settings, goal.q[joint], current, q, dq)
                 counts = min(max(scale.current_counts(current), -bound), bound)
@@ -169,7 +169,7 @@ class SimulatedServos:
         self._drive()
 
     def counters(self) -> dict[str, int]:
-        """Return ``timeouts`` and ``crc``, always 0, and the number of ``watchdog`` stops."""
+        """Return ``timeouts`` and ``crc``, which are always 0, and the ``watchdog`` stops."""
         return {"timeouts": 0, "crc": 0, "watchdog": self._trips}
 
     def close(self) -> None:
@@ -180,7 +180,7 @@ class SimulatedServos:
             self._connected = False
 
     def _exchange(self) -> float:
-        """Advance the hand to now, including a watchdog stop, and restart the watchdog."""
+        """Advance the hand to now, apply any watchdog stop, and restart the watchdog."""
         now = self._clock.now()
         if self._torque and now > self._last + self._watchdog:
             self._torque = False
@@ -201,5 +201,5 @@ class SimulatedServos:
     def _drive(self) -> None:
         for joint in self._joints:
             goal_q, goal_current = self._goal_q[joint], self._goal_current[joint]
-            torque = self._torque and not self._errors[joint]  # as a real servo after a shutdown
+            torque = self._torque and not self._errors[joint]  # like a real servo after a shutdown
             self._hand.drive(joint, self._mode, torque, goal_q, goal_current)

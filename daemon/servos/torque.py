@@ -1,7 +1,7 @@
-"""Switch torque on with each step verified, switch it off, and manage the servos' bus watchdog.
+"""Switch torque on with verification of each step, switch it off, and manage the bus watchdog.
 
-Torque is switched on at the present angle with zero current. Goal current and goal position are
-placed side by side through indirect addresses, which are in RAM and are therefore set each time.
+Torque is switched on at the current angle with zero motor current. Indirect addresses make goal
+current and goal position adjacent. They are in RAM and are therefore set each time.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _GOAL_BYTES = (
     *range(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 2),
     *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
-_PACKET_COUNT = 2  # copies of each torque-off packet, because it has no reply
-_ON_TIMEOUTS = 50  # reply timeouts allowed for torque on, which blocks the loop
-_MOTION_MAX = 8  # counts, allowed motion of a limp joint before torque on (0.7°)
+_PACKET_COUNT = 2  # copies of each torque-off packet, which has no reply
+_ON_TIMEOUTS = 50  # reply timeouts allowed for switching on, which blocks the loop
+_MOTION_MAX = 8  # counts (0.7°), allowed motion of a limp joint before torque on
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
-    """Return the address of the goals written in a tick: a register, or indirect data for two."""
+    """Return the address of the goals written on a tick: a register, or indirect data for two."""
     if mode == reg.CURRENT_MODE:
         return reg.GOAL_CURRENT
     if mode == reg.POSITION_MODE:
@@ -42,7 +42,7 @@ def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
 class Torque:
     """Torque of all joints on one line.
 
-    ``goals`` writes the goals while torque is on and is None otherwise. ``may_be_on`` is True from
+    ``goals`` writes the goals while torque is on; otherwise it is None. ``may_be_on`` is True from
     before torque is switched on until the servos have confirmed that it is off.
     """
 
@@ -63,7 +63,7 @@ class Torque:
         self._mode = reg.MODE_NUMBERS[servos.mode]
         ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
         self._ticks = min(ticks, reg.WATCHDOG_MAX)
-        self._not_after = math.inf  # time.monotonic() deadline for switching on
+        self._not_after = math.inf  # deadline for switching on [s, time.monotonic()]
         ids = list(self._joints)
         self._offs = [
             GroupWrite(line.port, reg.TORQUE_ENABLE, 1, each) for each in (ids, *([i] for i in ids))
@@ -73,24 +73,24 @@ class Torque:
     # --- on and off ------------------------------------------------------------------------------
 
     def on(self) -> None:
-        """Switch torque on at the present angle with zero current.
+        """Switch torque on at the current angle with zero motor current.
 
         Raises
         ------
         ServoError
-            Torque on failed or could not be verified. Torque may be on.
+            If switching on failed or could not be verified. Torque may be on.
         """
         self._not_after = time.monotonic() + _ON_TIMEOUTS * self._line.port.reply_timeout
         self._refuse_hardware_errors()
-        # Writing 0 ends a watchdog stop, during which goals are read-only.
+        # Writing 0 clears a watchdog stop, during which goals are read-only.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
         self._write_registers()
         goals = self._choose_goals()
         if self._mode != reg.POSITION_MODE:
             self._store_all(reg.GOAL_CURRENT, bytes(2), "goal current")
         self.may_be_on = True
-        # The watchdog must already run when torque is switched on, to stop servos whose state
-        # cannot be verified.
+        # The watchdog must already be running when torque is switched on, so that it stops servos
+        # whose state cannot be verified.
         if self._ticks:
             self._store_all(reg.BUS_WATCHDOG, bytes((self._ticks,)), "watchdog armed")
         positions = self._aim_here()
@@ -101,9 +101,9 @@ class Torque:
         self.goals = goals
 
     def ask_off(self) -> None:
-        """Request torque off from all servos in one packet and from each in a packet of its own.
+        """Request torque off with one packet for all servos and one packet for each servo.
 
-        There is no reply; the caller reads the registers.
+        There is no reply; the caller must read the registers.
         """
         self.goals = None
         for _ in range(_PACKET_COUNT):
@@ -117,7 +117,7 @@ class Torque:
         self.may_be_on = False
 
     def _aim_here(self) -> dict[int, int]:
-        """Set the goal positions to the present positions until the joints rest there [counts]."""
+        """Set the goals to the present positions until the joints stay there; return them."""
         while True:
             positions = self._positions()
             strayed = [
@@ -135,19 +135,19 @@ class Torque:
                 return positions
 
     def _choose_goals(self) -> GroupWrite:
-        """Return the sync write of a tick: goal current, goal position, or both side by side."""
+        """Return the sync write for a tick: goal current, goal position, or both adjacent."""
         address = goal_address(self._mode, self._model, self._firmware())
         if self._mode == reg.CURRENT_BASED_POSITION_MODE:
             self._map_goals()
         return GroupWrite(self._line.port, address, GOAL_SIZE[self._mode], list(self._joints))
 
     def _map_goals(self) -> None:
-        """Map goal current and goal position side by side into the indirect data."""
+        """Map goal current and goal position to adjacent indirect data."""
         pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
         self._store_all(reg.INDIRECT_ADDRESS, pointers, "indirect addresses")
 
     def _firmware(self) -> int:
-        """Return the servos' firmware; all must place indirect data at the same address."""
+        """Return the servos' firmware version; all must use the same indirect data address."""
         found = set()
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.FIRMWARE_VERSION, 1)
@@ -162,9 +162,9 @@ class Torque:
         return max(found)
 
     def _write_registers(self) -> None:
-        """Write RAM registers that another program may have changed.
+        """Restore RAM registers that another program may have changed.
 
-        A servo keeps gains, profiles and the PWM limit until power is cut or it reboots.
+        A servo retains gains, profiles and the PWM limit until a power cut or reboot.
         """
         for servo_id, joint in self._joints.items():
             held = self._line.read(servo_id, reg.RAM, reg.GOAL_POSITION - reg.RAM)
@@ -201,14 +201,14 @@ class Torque:
     # --- checks while torque is on ---------------------------------------------------------------
 
     def holds_goal(self, joint: Joint, table: bytes, start: int) -> bool:
-        """Return True if a servo holds a recent goal, or torque was not switched on here.
+        """Return True if a servo's goal is a recent one, or torque was not switched on here.
 
-        ``table`` contains its registers from ``start`` on.
+        ``table`` contains its registers, beginning at ``start``.
 
         Raises
         ------
         ServoError
-            Its bus watchdog has stopped it, or is no longer armed.
+            If its bus watchdog has stopped it or is no longer armed.
         """
         if self.goals is None:
             return True

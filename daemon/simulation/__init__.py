@@ -1,1 +1,1 @@
-"""Simulated hand: its physics, and emulated servos and tactile boards on ptys."""
+"""Simulated hand: physics, and emulated servos and tactile boards on ptys."""

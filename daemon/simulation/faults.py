@@ -1,7 +1,7 @@
-"""Faults of the emulated hand: text form, faults of the servo line, and measurement faults.
+"""Define faults of the emulated hand: text form, servo line faults and measurement faults.
 
-A fault is written as ``[PART:]KIND[=VALUE][@START[..END]]``. It begins suddenly or grows from START
-to END. Faults do not change the physics of the hand.
+A fault is written as ``[PART:]KIND[=VALUE][@START[..END]]``. It begins suddenly or increases from
+START to END. Faults do not change the physics of the hand.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ FloatArray = NDArray[np.float64]
 
 SERVOS = "servos"
 OBJECT = "object"
-LATE_REPLY_DELAY = 0.010  # s, delay of a late reply
+LATE_REPLY_DELAY = 0.010  # s
 
 
 @dataclass(slots=True)
 class LineFaults:
-    """Fault probabilities (0 to 1) of each instruction and reply, and the delay of every reply."""
+    """Fault probabilities (0 to 1) per instruction or reply, and the delay of all replies."""
 
     lose: float = 0.0  # an instruction is lost
-    lose_writes: float = 0.0  # an instruction other than a read is lost, in addition
+    lose_writes: float = 0.0  # additional loss of instructions other than reads
     drop: float = 0.0  # a reply is lost
-    late: float = 0.0  # a reply arrives LATE_REPLY_DELAY seconds later
+    late: float = 0.0  # a reply arrives LATE_REPLY_DELAY later
     truncate: float = 0.0  # the end of a reply is missing
     corrupt: float = 0.0  # one bit of a reply is flipped
     duplicate: float = 0.0  # a reply is sent twice
-    delay: float = 0.0  # s by which all replies are delayed, like a slow adapter
+    delay: float = 0.0  # s, delay of all replies, as with a slow adapter
 
 
 LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
 _SERVO_FAILURES = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
 SERVO_FAULTS = ("silent", "answer", "reboot", *_SERVO_FAILURES, "recover")
-BOARD_FAULTS = {  # kind → probability if none is given
+BOARD_FAULTS = {  # kind → default probability
     "torn": 0.1,
     "noisy": 0.1,
     "silent": 1.0,
@@ -56,7 +56,7 @@ _WITHOUT_VALUE = ("unplug", "plug", "well")
 
 
 class FaultSource:
-    """Apply :class:`LineFaults` at random, reproducibly for a given seed."""
+    """Random generator of :class:`LineFaults`, reproducible for a given seed."""
 
     def __init__(self, seed: int = 1) -> None:
         self.rates = LineFaults()
@@ -64,20 +64,20 @@ class FaultSource:
 
     @property
     def active(self) -> bool:
-        """True if replies may be lost, damaged or delayed."""
+        """True if replies may be lost, corrupted or delayed."""
         rates = self.rates
         damage = rates.drop or rates.late or rates.truncate or rates.corrupt or rates.duplicate
         return bool(damage or rates.delay)
 
     def loses(self, reads: bool) -> bool:
-        """Return True if the next instruction is lost; ``reads`` if it is a read instruction."""
+        """Return True if the next instruction is lost; ``reads`` is True for a read instruction."""
         rates = self.rates
         if rates.lose and self._random.random() < rates.lose:
             return True
         return bool(not reads and rates.lose_writes and self._random.random() < rates.lose_writes)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
-        """Return the copies of a damaged reply as (extra delay [s], bytes); empty if dropped."""
+        """Return the copies of a corrupted reply as (extra delay [s], bytes); empty if dropped."""
         rates, chance = self.rates, self._random.random
         if chance() < rates.drop:
             return []
@@ -97,7 +97,7 @@ REPLAY_TIME_MAX = 3.0  # s
 
 
 class MeasurementFault(NamedTuple):
-    """A kind of measurement fault: its value without a fault, and the limits of its value."""
+    """Type of measurement fault: its value without a fault and the limits of its value."""
 
     honest: float
     low: float
@@ -105,29 +105,29 @@ class MeasurementFault(NamedTuple):
 
 
 MEASUREMENT_FAULTS = {
-    "gain": MeasurementFault(1.0, 0.0, 100.0),  # factor of the pressure of all cells
-    "shift-x": MeasurementFault(0.0, -255.0, 255.0),  # cells, to higher columns, filled with zeros
-    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # cells, to higher rows
-    "mirror": MeasurementFault(0.0, 0.0, 1.0),  # 1: the order of the columns is reversed
-    "drift": MeasurementFault(0.0, -1.0, 1.0),  # offset of all cells, fraction of the largest count
-    "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # s of frames that are repeated
-    "current": MeasurementFault(1.0, -100.0, 100.0),  # factor of the measured current
+    "gain": MeasurementFault(1.0, 0.0, 100.0),  # factor for the pressure of all cells
+    "shift-x": MeasurementFault(0.0, -255.0, 255.0),  # cells towards higher columns, zero-filled
+    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # cells towards higher rows
+    "mirror": MeasurementFault(0.0, 0.0, 1.0),  # 1 reverses the column order
+    "drift": MeasurementFault(0.0, -1.0, 1.0),  # offset of all cells, fraction of the maximum count
+    "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # s of repeated frames
+    "current": MeasurementFault(1.0, -100.0, 100.0),  # factor for the measured current
 }
-SWITCHED_FAULTS = ("mirror", "replay")  # these are either on or off
+SWITCHED_FAULTS = ("mirror", "replay")  # either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
-    """The text of a fault is invalid. The message lists the expected forms."""
+    """Raised for an invalid fault text. The message lists the expected forms."""
 
 
 class FaultEvent(NamedTuple):
-    """Begin of a fault or load of one device or of the object."""
+    """Start of a device fault or object load."""
 
     after: float  # s
-    part: str  # ``servos``, ``object``, or a finger, for its board or measurements
+    part: str  # ``servos``, ``object``, or a finger (board or measurements)
     kind: str
-    value: float = 1.0  # probability, ID of a servo, load, or value of a measurement fault
-    over: float = 0.0  # s in which the fault grows
+    value: float = 1.0  # probability, servo ID, load, or measurement fault value
+    over: float = 0.0  # s over which the fault increases
 
     def __str__(self) -> str:
         value = "" if self.kind in _WITHOUT_VALUE else f"={self.value:g}"
@@ -135,11 +135,11 @@ class FaultEvent(NamedTuple):
 
 
 class _Form(NamedTuple):
-    """Kinds of faults with the same syntax."""
+    """Fault types with the same syntax."""
 
     kinds: Collection[str]
-    value: str  # syntax of the value: in brackets if optional, empty for no value
-    parts: tuple[str, ...]  # affected parts if the word names no finger
+    value: str  # syntax of the value: in brackets if optional, empty if none
+    parts: tuple[str, ...]  # affected parts if the word does not name a finger
     sided: bool = False  # the word may name a finger
 
     def fits(self, side: str | None, kind: str, valued: bool) -> bool:
@@ -152,21 +152,21 @@ class _Form(NamedTuple):
         )
 
     def bounds(self, kind: str) -> tuple[float, float]:
-        """Return the lowest and the highest value."""
+        """Return the minimum and maximum value."""
         if kind in MEASUREMENT_FAULTS:
             return MEASUREMENT_FAULTS[kind][1:]
         return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
 
 
-# The first matching form counts: `silent=2` and `frozen=2` are faults of a servo, `left:silent` and
-# `silent` are faults of boards.
+# The first matching form is used: `silent=2` and `frozen=2` are servo faults, whereas `left:silent`
+# and `silent` are board faults.
 _ID = "=ID"
 _FORMS = (
     _Form(SERVO_FAULTS, _ID, (SERVOS,)),
     _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True),
     _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
-    _Form(("push", "twist"), "=NUMBER", (OBJECT,)),  # N along its faces, away from the palm; N·m
+    _Form(("push", "twist"), "=NUMBER", (OBJECT,)),  # N along the faces, away from the palm; N·m
     _Form(_WITHOUT_VALUE[:2], "", (SERVOS,), sided=True),
     _Form(_WITHOUT_VALUE[2:], "", (SERVOS, *FINGERS), sided=True),
 )
@@ -174,32 +174,32 @@ _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?
 
 
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
-    """Parse fault words, and return the faults in order of time, then in the given order.
+    """Parse fault words; return the faults sorted by time, then in the given order.
 
-    - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated``, ``zero`` affect
-      both boards, or one with the prefix ``left:`` or ``right:``; see :class:`TactileBoard`.
-    - ``drop=0.01``, ``silent=2`` and others affect the servos; see :meth:`ServoBus.fault`.
-    - ``gain=0.5``, ``left:current=2`` and others affect the measurements of both fingers or one;
-      see MEASUREMENT_FAULTS.
-    - ``unplug`` and ``plug`` affect the port of the servos, ``left:unplug`` that of a board.
-    - ``push=15``, ``twist=0.3`` load the object from then on; 0 ends the load.
-    - ``well`` ends the faults of the servo line, boards and measurements, ``left:well`` those of
-      one finger.
+    - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated`` and ``zero`` affect
+      both boards, or one board if prefixed with ``left:`` or ``right:``; see :class:`TactileBoard`.
+    - ``drop=0.01``, ``silent=2`` etc. affect the servos; see :meth:`ServoBus.fault`.
+    - ``gain=0.5``, ``left:current=2`` etc. affect the measurements of one or both fingers; see
+      MEASUREMENT_FAULTS.
+    - ``unplug`` and ``plug`` affect the servo port, and ``left:unplug`` affects a board's port.
+    - ``push=15`` and ``twist=0.3`` apply a permanent load to the object; 0 removes it.
+    - ``well`` ends the faults of the servo line, boards and measurements; ``left:well`` ends the
+      faults of one finger.
 
-    The suffix ``@START`` gives the time of the begin [s]. With ``@START..END`` a measurement fault
-    grows linearly from START to END.
+    The suffix ``@START`` is the start time [s]. With ``@START..END``, a measurement fault increases
+    linearly from START to END.
 
     Parameters
     ----------
     words
-        The faults.
+        Fault words.
     ids
-        IDs of the servos.
+        Servo IDs.
 
     Raises
     ------
     FaultError
-        For an invalid word.
+        If a word is invalid.
     """
     return sorted((event for word in words for event in _parse(word.strip(), ids)), key=_after)
 
@@ -253,7 +253,7 @@ def _number(text: str) -> float:
 
 @dataclass(slots=True)
 class _Ramp:
-    """Value that changes linearly in time."""
+    """Value that changes linearly with time."""
 
     before: float
     after: float
@@ -269,30 +269,30 @@ class _Ramp:
 
 
 class MeasurementFaults:
-    """Measurement faults of one finger: of its tactile sensor and of its servo's current."""
+    """Measurement faults of one finger's tactile sensor and servo current."""
 
     def __init__(self) -> None:
         self._ramps: dict[str, _Ramp] = {}
 
     def begin(self, kind: str, value: float, t: float, over: float = 0.0) -> None:
-        """Change a kind of MEASUREMENT_FAULTS linearly to ``value`` within ``over`` [s] from ``t``.
+        """Change one of MEASUREMENT_FAULTS linearly to ``value``, within ``over`` [s] from ``t``.
 
-        The change starts from the value at ``t`` and replaces an unfinished one. Raises KeyError
-        for an unknown kind.
+        The change starts from the value at ``t`` and replaces an unfinished change. Raises KeyError
+        if ``kind`` is unknown.
         """
         self._ramps[kind] = _Ramp(self(kind, t), value, t, over)
 
     def clear(self) -> None:
-        """End all faults at once."""
+        """End all faults immediately."""
         self._ramps.clear()
 
     def __call__(self, kind: str, t: float) -> float:
-        """Return the value of a kind at time ``t`` [s]."""
+        """Return the value of a fault at time ``t`` [s]."""
         ramp = self._ramps.get(kind)
         return MEASUREMENT_FAULTS[kind].honest if ramp is None else ramp(t)
 
     def apply(self, signal: FloatArray, full_count: int, t: float) -> None:
-        """Apply the faults at ``t`` [s] to a sensor's counts ``signal`` [rows, cols] in place.
+        """Apply the faults at ``t`` [s] in place to a sensor's counts ``signal`` [rows, cols].
 
         Shifts by fractions of a cell are interpolated.
         """
@@ -308,7 +308,7 @@ class MeasurementFaults:
 
 
 def _shift(count: int, cells: float) -> FloatArray:
-    """Return the matrix [count, count] of a shift by ``cells``, with linear interpolation."""
+    """Return the matrix [count, count] for a linearly interpolated shift by ``cells``."""
     places = np.arange(count)
     weights: FloatArray = np.maximum(1.0 - np.abs(places[:, None] - places - cells), 0.0)
     return weights

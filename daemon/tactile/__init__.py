@@ -1,4 +1,4 @@
-"""Tactile backends: their common interface, boards on serial ports, and recordings.
+"""Tactile backends: common interface, boards on serial ports, and recordings.
 
-`daemon.backends` maps the names in the settings to them.
+`daemon.backends` maps the backend names in the settings to these classes.
 """

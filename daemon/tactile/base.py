@@ -1,4 +1,4 @@
-"""Define the interface of tactile backends, and create the selected backend."""
+"""Define the interface of tactile backends; create the selected backend."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ __all__ = ["TactileSensor"]
 
 
 class TactileSensor(Protocol):
-    """The pressure grid under one fingertip. It is read outside the tick."""
+    """Pressure grid under one fingertip, which is read outside the tick."""
 
     def open(self) -> None:
-        """Open the sensor and wait for a first valid frame. Raises TactileError if none arrives."""
+        """Open the sensor and wait for a valid frame. Raises TactileError if none arrives."""
 
     def latest(self) -> Frame | None:
-        """Return the newest complete frame, or None before the first.
+        """Return the newest complete frame, or None before the first frame.
 
         The same object is returned until a newer frame arrives.
         """
 
     def counters(self) -> dict[str, int]:
-        """Return counts since open: ``frames``, ``resyncs``, ``skipped_bytes``, …"""
+        """Return the counts since opening: ``frames``, ``resyncs``, ``skipped_bytes``, …"""
 
     def close(self) -> None:
         """Stop reading and close. Never raises."""
@@ -34,10 +34,10 @@ class TactileSensor(Protocol):
 def make_sensor(
     settings: Settings, clock: Clock, hand: object, finger: int
 ) -> TactileSensor | None:
-    """Create the tactile backend of one finger, not yet open; None in a scene without sensors.
+    """Create a finger's tactile backend without opening it; None in a scene without sensors.
 
-    ``hand`` is the simulated hand, for backends that need it. Raises the errors of the backend's
-    constructor.
+    ``hand`` is the simulated hand, for backends that use it. Raises the same errors as the
+    backend's constructor.
     """
     found = backend("tactile", settings.tactile.backend)
     if settings.tactile.backend == "none":

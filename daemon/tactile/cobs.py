@@ -1,19 +1,19 @@
-"""Read boards with the COBS framing, intended for custom boards and 44 × 44 sensors.
+"""Read boards with COBS framing, which is intended for custom boards and 44 × 44 sensors.
 
-The firmware sends each scan without a request, at any baud rate (USB boards may ignore it):
+The firmware sends each scan without a request at any baud rate (USB boards may ignore the rate):
 
-1. Build the message, all numbers little-endian:
+1. Build the message with all numbers in little-endian order:
 
    ======  ====== =====================================================================
    offset  type   content
    ======  ====== =====================================================================
    0       uint8  bytes per count: 1 (uint8 counts) or 2 (uint16 counts)
    1       uint8  0, reserved
-   2       uint16 sequence number: incremented by every scan, sent or not; 0 after 65535
-   4       uint32 the board's clock at the middle of the scan [µs]; wraps at 2³²
+   2       uint16 sequence number, incremented by every scan (sent or not), 0 after 65535
+   4       uint32 board clock at mid-scan [µs], wraps at 2³²
    8       uint16 rows
    10      uint16 cols
-   12      …      rows × cols counts, row after row
+   12      …      rows × cols counts, row by row
    ======  ====== =====================================================================
 
 2. Append the CRC-16 of the message, low byte first: polynomial 0x1021, initial value 0xFFFF,
@@ -24,17 +24,18 @@ The firmware sends each scan without a request, at any baud rate (USB boards may
        for each byte:  crc ^= byte << 8
                        eight times:  crc = (crc << 1) ^ (crc & 0x8000 ? 0x1021 : 0)   in 16 bits
 
-3. Encode it with COBS, which removes all zero bytes: split the message at its zero bytes and drop
-   them; write each piece as one byte, its length + 1, followed by the piece. Split a piece of 254
-   bytes or more into blocks of 254, each preceded by the byte 255; the remainder, which may be
-   empty, follows as its own piece. (An empty piece at the end of the message may be omitted.)
+3. Encode the message with COBS, which removes all zero bytes. Split the message at its zero bytes
+   and drop them. Write each piece as one byte with the value length + 1, followed by the piece.
+   Split pieces of 254 bytes or more into blocks of 254, each preceded by the byte 255. The
+   remainder, which may be empty, follows as a separate piece. (An empty piece at the end of the
+   message may be omitted.)
 
 4. Send a zero byte. An additional zero byte before the first frame is allowed.
 
 A 44 × 44 frame of uint16 takes at most 3903 bytes on the wire. `encode` is the reference
 implementation. A reader that starts within a frame synchronises at the next zero byte. Incomplete
-and damaged frames are dropped: the CRC detects every error of up to 16 adjacent bits, and all but
-1 in 65536 of the others. Gaps in the sequence numbers give the number of missed frames.
+and corrupted frames are dropped: the CRC detects every error of up to 16 adjacent bits, and all but
+1 in 65536 of other errors. Gaps in the sequence numbers indicate the number of missed frames.
 """
 
 from __future__ import annotations
@@ -52,14 +53,14 @@ from softfinger.kinematics.compiled.kernel import kernel
 _HEADER = struct.Struct("<BBHIHH")
 _CRC = struct.Struct("<H")
 _CRC_START = 0xFFFF
-_TICK = 1e-6  # s per tick of the board's clock
-_BLOCK = 254  # longest block of a COBS code, in bytes
+_TICK = 1e-6  # s per tick of the board clock
+_BLOCK = 254  # bytes, maximum block of a COBS code
 
 
 def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
-    """Encode a frame for the wire: counts [rows, cols], sequence number, board time ``t`` [s].
+    """Encode a frame: counts [rows, cols], sequence number and board time ``t`` [s].
 
-    This is the reference for firmware. Raises ValueError for other types of counts.
+    This is the reference for firmware. Raises ValueError if the counts have another type.
     """
     if counts.dtype not in (np.uint8, np.uint16) or counts.ndim != 2:
         raise ValueError(f"counts must be uint8 or uint16 [rows, cols], got {counts.dtype}")
@@ -77,21 +78,20 @@ def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -
 
 
 def longest_frame(rows: int, cols: int) -> int:
-    """Return the largest size of a uint16 frame on the wire in bytes, including the delimiter."""
+    """Return the maximum size of a uint16 frame on the wire in bytes, including the delimiter."""
     message = _HEADER.size + 2 * rows * cols + _CRC.size
     return message + 1 + message // _BLOCK + 1
 
 
 @kernel
 def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
-    """Decode COBS: write the message of ``packet``, which contains no zero byte, into ``out``.
+    """Decode COBS: write the message in ``packet``, which contains no zero byte, to ``out``.
 
-    ``out`` must be as long as the packet. Returns the length of the message, or -1 if the packet
-    ends within a block. The code has no branches that depend on the bytes, because they would be
-    unpredictable.
+    ``out`` must be as long as the packet. Returns the message length, or -1 if the packet ends
+    within a block. The code has no data-dependent branches, because these would be unpredictable.
     """
     code = np.int64(_BLOCK + 1)  # code of the current block
-    left = np.int64(0)  # remaining bytes of that block
+    left = np.int64(0)  # remaining bytes of the block
     size = 0
     for byte in packet:
         value = np.int64(byte)
@@ -104,20 +104,20 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
 
 
 class CobsDecoder(DelimitedDecoder):
-    """Decoder of the COBS framing, with the board's sequence number and time."""
+    """Decoder for COBS framing, with the board's sequence number and time."""
 
     def __init__(self, rows: int, cols: int) -> None:
         super().__init__(rows, cols, b"\0", longest_frame(rows, cols))
-        # Compile the kernel here and not at the first frame.
+        # Compile the kernel now instead of at the first frame.
         unstuff(np.frombuffer(bytearray(b"\1"), np.uint8), np.zeros(1, np.uint8))
         self._bad_crc = 0
         self._missed = 0
         self._seq: int | None = None
         self._ticks = 0
-        self._wraps = 0  # overflows of the board's clock
+        self._wraps = 0  # overflows of the board clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """Parse as :meth:`DelimitedDecoder.parse` does, with the board's own number and time."""
+        """Parse like :meth:`DelimitedDecoder.parse`, with the board's sequence number and time."""
         if len(packet) >= self.longest:
             self._reason = f"packets of {len(packet)} bytes"
             return None
@@ -141,26 +141,26 @@ class CobsDecoder(DelimitedDecoder):
             self._reason = f"frames of {rows} × {cols} cells in {size} bytes"
             return None
         steps = 1 if self._seq is None else (seq - self._seq - 1) % 65536 + 1
-        if steps > 32768:  # the number decreased, so the board restarted
+        if steps > 32768:  # The number has decreased, so the board has restarted.
             steps = 1
         self._missed += steps - 1
         self._seq = seq
-        # The clock wrapped, or the board restarted, which SensorClock detects.
+        # The clock has wrapped, or the board has restarted, which SensorClock detects.
         self._wraps += ticks < self._ticks
         self._ticks = ticks
-        # Counts of two bytes are not copied, because the buffer belongs to this frame alone.
+        # Two-byte counts are not copied, because the buffer belongs to this frame alone.
         cells = message[_HEADER.size : size].view(f"<u{kind}")
         counts = cells.astype(np.uint16, copy=False)
         t_sensor = (self._wraps * 2.0**32 + ticks) * _TICK
         return Decoded(counts.reshape(rows, cols), t, steps, t_sensor)
 
     def counters(self) -> dict[str, int]:
-        """Return the common counters, ``bad_crc``, and ``missed``, the number of missing frames."""
+        """Return the common counters, ``bad_crc``, and ``missed`` (number of missing frames)."""
         return {**super().counters(), "bad_crc": self._bad_crc, "missed": self._missed}
 
 
 class Cobs(SerialReader):
-    """A board with the COBS framing under one fingertip."""
+    """Board with COBS framing under one fingertip."""
 
     def make_decoder(self) -> CobsDecoder:
         return CobsDecoder(self.settings.rows, self.settings.cols)

@@ -1,6 +1,6 @@
-"""Decode bytes of serial boards to frames: interface of the framings and common code.
+"""Decode bytes from serial boards to frames: interface of the framings and common code.
 
-A decoder works incrementally and uses no port, clock or thread.
+A decoder works incrementally, without a port, clock or thread.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 
 __all__ = ["Decoded", "DelimitedDecoder"]
 
-_LOST_AFTER = 10  # frame lengths without a frame, after which the stream counts as lost
+_LOST_AFTER = 10  # frame lengths without a frame after which the stream counts as lost
 
 
 @dataclass(slots=True)
 class Decoded:
-    """A decoded frame: newly allocated counts [rows, cols] and the time of its last byte [s]."""
+    """Decoded frame: newly allocated counts [rows, cols] and the time of its last byte [s]."""
 
     data: NDArray[np.uint16]
     t: float
-    steps: int = 1  # increase of the board's sequence number since the last frame
-    t_sensor: float | None = None  # the board's clock at the middle of the scan [s]
-    behind: int = 0  # bytes after the frame's last byte in the same read
+    steps: int = 1  # increase in the board's sequence number since the previous frame
+    t_sensor: float | None = None  # board clock at mid-scan [s]
+    behind: int = 0  # bytes after the frame in the same read
 
 
 class Decoder(ABC):
-    """Convert bytes to frames [rows, cols].
+    """Converter from bytes to frames [rows, cols].
 
-    Every byte is part of a frame, counted in ``skipped_bytes``, or still in the buffer.
+    Every byte is either part of a frame, counted in ``skipped_bytes``, or still in the buffer.
     ``frame_bytes`` is the length of a frame on the wire, or of the last frame if lengths vary.
     """
 
@@ -38,7 +38,7 @@ class Decoder(ABC):
         self.rows = rows
         self.cols = cols
         self.frame_bytes = frame_bytes
-        self.locked = False  # the buffer starts at the start of a frame
+        self.locked = False  # the buffer begins at the start of a frame
         self._buffer = bytearray()
         self._frames = 0
         self._resyncs = 0
@@ -47,35 +47,35 @@ class Decoder(ABC):
 
     @abstractmethod
     def feed(self, data: bytes, t: float) -> Decoded | None:
-        """Add bytes read at time ``t`` [s]; return the newest frame they complete, or None."""
+        """Add bytes read at time ``t`` [s]; return the newest frame completed by them, or None."""
 
     @abstractmethod
     def diagnosis(self) -> str:
-        """Explain in one line why a stream gives no frames."""
+        """Explain in one line why the stream yields no frames."""
 
     @property
     def pending(self) -> bool:
-        """True if ``settle`` may return a frame that is complete but not yet confirmed."""
+        """True if ``settle`` may return a complete but unconfirmed frame."""
         return False
 
     def settle(self) -> Decoded | None:
-        """Return the pending frame, called when the line has been quiet since the last byte."""
+        """Return the pending frame. Called when the line has been quiet since the last byte."""
         return None
 
     @property
     def missing(self) -> int:
-        """Number of bytes that complete the frame in the buffer; 0 if unknown."""
+        """Number of bytes missing from the frame in the buffer; 0 if unknown."""
         held = len(self._buffer)
         return max(self.frame_bytes - held, 0) if self.locked and held else 0
 
     @property
     def lost(self) -> bool:
-        """True if the bytes of the last ten frames contained no frame."""
+        """True if no frame was found in the bytes of the last ten frame lengths."""
         behind = self._skipped - self._skipped_at_frame + len(self._buffer)
         return behind > _LOST_AFTER * self.frame_bytes
 
     def counters(self) -> dict[str, int]:
-        """Return ``frames``, ``resyncs`` (synchronisation losses), ``skipped_bytes`` and others."""
+        """Return ``frames``, ``resyncs`` (synchronisation losses), ``skipped_bytes``, etc."""
         return {
             "frames": self._frames,
             "resyncs": self._resyncs,
@@ -87,25 +87,28 @@ class Decoder(ABC):
 
 
 class DelimitedDecoder(Decoder):
-    """Decode packets that end with a byte that occurs nowhere else.
+    """Decoder for packets that end with a byte that does not occur elsewhere.
 
-    A packet is complete at its delimiter. After any damage the decoder is synchronised at the next
-    packet. The buffer is at most as long as the longest packet.
+    A packet is complete at its delimiter. After any corruption, the decoder resynchronises at the
+    next packet. The buffer is at most as long as the longest packet.
     """
 
     def __init__(self, rows: int, cols: int, delimiter: bytes, longest: int) -> None:
-        """``longest`` is the largest size of a frame on the wire in bytes, with its delimiter."""
+        """Create a decoder.
+
+        ``longest`` is the maximum frame size on the wire in bytes, including the delimiter.
+        """
         super().__init__(rows, cols, longest)
         self.longest = longest
         self._delimiter = delimiter
-        self._scanned = 0  # bytes of the buffer already searched for a delimiter
-        self._reason = ""  # why the last packet was rejected, in a few words
+        self._scanned = 0  # number of buffer bytes already searched for a delimiter
+        self._reason = ""  # short reason for the last rejected packet
 
     @abstractmethod
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """Return the frame of a packet without its delimiter, or None after setting ``_reason``.
+        """Return the frame in a packet (without delimiter), or None after setting ``_reason``.
 
-        ``t`` [s] is the time when its last byte was read.
+        ``t`` [s] is the read time of its last byte.
         """
 
     def feed(self, data: bytes, t: float) -> Decoded | None:

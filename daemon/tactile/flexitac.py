@@ -1,7 +1,8 @@
 """Read FlexiTac boards over a serial port.
 
-The stream, at 2,000,000 baud, repeats ``AA 55`` followed by rows × cols bytes in row-major order,
-one count each. It has no length, number or checksum, and ``AA 55`` may also occur among the counts.
+The stream (2,000,000 baud) repeats ``AA 55`` followed by rows × cols bytes in row-major order, one
+per count. It contains no length, sequence number or checksum, and ``AA 55`` may also occur among
+the counts.
 """
 
 from __future__ import annotations
@@ -17,42 +18,43 @@ from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
-_SEARCH_FRAME_COUNT = 12  # frames that a search compares before it drops the oldest
-_MARKER_COUNT_MAX = 96  # to recognise a grid of another size
-_GAP_TIME = 1e-3  # s, a longer pause is a gap between frames
-_CELL_COUNT_MIN = 16  # cells, closer markers are a pattern in the image
+_SEARCH_FRAME_COUNT = 12  # frames compared by a search before it drops the oldest
+_MARKER_COUNT_MAX = 96  # markers stored to recognise another grid size
+_GAP_TIME = 1e-3  # s, minimum gap between frames
+_CELL_COUNT_MIN = 16  # cells; closer markers are image content
 
 
 class FlexiTacDecoder(Decoder):
-    """Decode a FlexiTac stream to frames.
+    """Decoder for FlexiTac streams.
 
-    *Lock.* A marker differs from two counts ``AA 55`` only by its position. The search requires two
-    markers one frame apart. If other ``AA 55`` between them recur at the same distance, it waits
-    for more frames until a single position remains. A constant image that contains ``AA 55`` cannot
-    be locked and is counted as ``ambiguous``.
+    *Lock.* A marker differs from two counts ``AA 55`` only in its position. The search requires two
+    markers one frame apart. If other ``AA 55`` pairs between them recur at the same distance, it
+    waits for more frames until only one position remains. The decoder cannot lock to a constant
+    image that contains ``AA 55``; this is counted as ``ambiguous``.
 
     *Hold.* After locking, a frame is returned when the next marker is found at its expected
-    position, which proves that no byte of the frame was lost. On a line with gaps between frames
-    this would delay every frame by one period. There a complete frame is returned at once if it
-    cannot combine parts of two frames: its counts contain no ``AA 55``, and its bytes arrived in
-    their transmission time. Otherwise it waits for the next marker, or for ``settle``.
+    position, which proves that no byte of the frame was lost. On a line with gaps between frames,
+    this would delay every frame by one period. In this case, a complete frame is returned
+    immediately if it cannot be spliced from two frames: its counts contain no ``AA 55``, and its
+    bytes arrived within their transmission time. Otherwise, the decoder waits for the next marker
+    or for ``settle``.
 
-    *Loss.* If a marker is not at its expected position, the preceding frame is dropped and the
+    *Loss.* If a marker is not at its expected position, the preceding frame is dropped, and the
     search restarts.
     """
 
     def __init__(self, rows: int, cols: int, byte_time: float = 5e-6) -> None:
-        """``byte_time`` is the transmission time of a byte [s]."""
+        """Create a decoder; ``byte_time`` is the transmission time of one byte [s]."""
         super().__init__(rows, cols, len(MARKER) + rows * cols)
-        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # s, for one frame
-        self._t_whole = -math.inf  # time when the last returned frame was complete
-        self._start = 0  # position of the buffer's first byte in the stream
-        # End position in the stream and read time of each piece in the buffer.
+        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # s, maximum per frame
+        self._t_whole = -math.inf  # completion time of the last returned frame
+        self._start = 0  # stream position of the buffer's first byte
+        # End position (in the stream) and read time of each piece in the buffer.
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
         self._markers: deque[int] = deque(
             maxlen=_MARKER_COUNT_MAX
-        )  # in the stream, while not locked
+        )  # stream positions while not locked
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
         self._buffer += data
@@ -70,7 +72,7 @@ class FlexiTacDecoder(Decoder):
         return newest
 
     def settle(self) -> Decoded | None:
-        """Settle as :meth:`Decoder.settle` does; None if the counts could contain a marker."""
+        """Settle like :meth:`Decoder.settle`; return None if the counts may contain a marker."""
         return self._take() if self.pending and not self._may_be_spliced() else None
 
     @property
@@ -79,14 +81,14 @@ class FlexiTacDecoder(Decoder):
 
     @property
     def found_cells(self) -> int:
-        """Cells per frame from the most common marker distance while not locked, otherwise 0."""
+        """Cells per frame according to the most common marker distance; 0 while locked."""
         apart = Counter(b - a for a, b in combinations(self._markers, 2))
         spacings = [each for each in apart if each >= _CELL_COUNT_MIN + len(MARKER)]
         spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)
         return spacing - len(MARKER) if apart[spacing] > 2 and spacing != self.frame_bytes else 0
 
     def counters(self) -> dict[str, int]:
-        """Return the common counters and ``ambiguous``, the number of searches without a result."""
+        """Return the common counters and ``ambiguous`` (number of searches without a result)."""
         return {**super().counters(), "ambiguous": self._ambiguous}
 
     def diagnosis(self) -> str:
@@ -103,7 +105,7 @@ class FlexiTacDecoder(Decoder):
         return f"no marker AA 55 among them; frames of {expected} expected: another board or baud?"
 
     def _search(self) -> bool:
-        """Move the buffer's start to a confirmed marker; return False if more bytes are needed."""
+        """Move the buffer start to a confirmed marker; return False if more bytes are needed."""
         buffer, stride = self._buffer, self.frame_bytes
         while True:
             marker = buffer.find(MARKER)
@@ -128,10 +130,10 @@ class FlexiTacDecoder(Decoder):
             self._skip(stride)
 
     def _only_place(self) -> Literal["yes", "no", "undecided", "ambiguous"]:
-        """Decide if the marker at the buffer's start is the only consistent one.
+        """Decide whether the marker at the buffer start is the only consistent marker.
 
-        Each level adds one frame, so the result depends only on the stream and not on how it was
-        split into pieces.
+        Each level adds one frame, so the result depends only on the stream, not on how it was split
+        into pieces.
         """
         buffer, stride = self._buffer, self.frame_bytes
         rivals = self._between()
@@ -149,7 +151,7 @@ class FlexiTacDecoder(Decoder):
         return "ambiguous"
 
     def _between(self) -> list[int]:
-        """Return positions of ``AA 55`` between the first marker in the buffer and the next one."""
+        """Return the positions of ``AA 55`` between the first marker in the buffer and the next."""
         markers = []
         marker = self._buffer.find(MARKER, len(MARKER), self.frame_bytes)
         while marker >= 0:
@@ -158,11 +160,11 @@ class FlexiTacDecoder(Decoder):
         return markers
 
     def _misplaced(self, marker: int) -> bool:
-        """Return True if the bytes received so far at ``marker`` are not a marker."""
+        """Return True if the bytes received so far at position ``marker`` are not a marker."""
         return not MARKER.startswith(self._buffer[marker : marker + len(MARKER)])
 
     def _may_be_spliced(self) -> bool:
-        """Return True if the frame at the buffer's start may contain the marker of another one."""
+        """Return True if the frame at the buffer start may contain another frame's marker."""
         first, end = len(MARKER), self.frame_bytes
         # The last count and the byte after it may also form a marker.
         return self._buffer.find(MARKER, first) >= 0 or self._buffer.endswith(
@@ -170,7 +172,7 @@ class FlexiTacDecoder(Decoder):
         )
 
     def _in_one_go(self) -> bool:
-        """Return True if the frame at the buffer's start arrived after a gap and without one."""
+        """Return True if the frame at the buffer start arrived after a gap and without gaps."""
         first, whole = self._pieces[0][1], self._pieces[-1][1]
         return first - self._t_whole > _GAP_TIME and whole - first < self._longest
 
@@ -187,7 +189,7 @@ class FlexiTacDecoder(Decoder):
     def _lose(self) -> None:
         self.locked = False
         self._resyncs += 1
-        if self._buffer.startswith(MARKER):  # marker of an incomplete frame
+        if self._buffer.startswith(MARKER):  # This is the marker of an incomplete frame.
             self._note(0)
             self._skip(len(MARKER))
 
@@ -209,7 +211,7 @@ class FlexiTacDecoder(Decoder):
 
 
 class FlexiTac(SerialReader):
-    """The FlexiTac board under one fingertip."""
+    """FlexiTac board under one fingertip."""
 
     def make_decoder(self) -> FlexiTacDecoder:
         settings = self.settings

@@ -4,14 +4,15 @@ Supported files:
 
 - ``.npz`` with ``frames`` [n, rows, cols], or with a single three-dimensional array of another
   name. Optional arrays are ``t`` [n], ``live`` [rows, cols] bool, and the true contact of each
-  frame if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
-- ``.npy`` with one frame [rows, cols] or several [n, rows, cols], or a folder of such files, sorted
-  by name with numbers in numerical order, which may contain ``t.npy`` [n].
-- Any other file is read as a Tekscan-style ASCII export.
+  frame, if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
+- ``.npy`` with one frame [rows, cols] or several frames [n, rows, cols], or a folder of such files.
+  The files are sorted by name, with numbers in numerical order. The folder may contain ``t.npy``
+  [n].
+- Other files are read as Tekscan-style ASCII exports.
 
-Frames of integers are counts. Other frames are in Pa and are converted with ``pascal_per_count``. A
-cell that is NaN in all frames is dead. Negative readings are set to 0 if noise around a tared zero
-explains them. Times are in s unless their step or date indicates another unit.
+Integer frames contain counts. Other frames are in Pa and are converted with ``pascal_per_count``. A
+cell that is NaN in all frames is dead. Negative readings are set to 0 if they can be explained by
+noise around a tared zero. Times are in s unless their step or date indicates another unit.
 """
 
 from __future__ import annotations
@@ -36,31 +37,31 @@ TRUTHS = ("d", "theta", "force")
 _TIMES = ("t", "time", "times", "timestamp", "timestamps")
 _COUNT_MAX = 65535
 _RANGE_ERROR = f"frames: found readings outside 0 to {_COUNT_MAX} counts"
-_LISTED_COUNT_MAX = 8  # arrays listed in a message
-_SAMPLE_COUNT_MAX = 200  # largest number of frames used to estimate zero and noise
-_NOISE_SIGMA_MAX = 6.0  # standard deviations, largest negative noise
-_CLIPPED_COUNT_MIN = 3  # cells that must share the largest reading
-_UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # units of times that are not in s
+_LISTED_COUNT_MAX = 8  # maximum number of arrays listed in a message
+_SAMPLE_COUNT_MAX = 200  # maximum number of frames for estimating zero and noise
+_NOISE_SIGMA_MAX = 6.0  # standard deviations, maximum negative noise
+_CLIPPED_COUNT_MIN = 3  # minimum number of cells that share the maximum reading
+_UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # time units other than s
 _DATE_RANGE = (1e9, 4e9)  # Unix time [s], from 2001 to 2096
-_INTERVAL_RATIO_MAX = 100.0  # times the expected interval, up to which times are in s
-_INTERVAL_RATIO_NOTED = 10.0  # times the expected interval, from which a note is given
+_INTERVAL_RATIO_MAX = 100.0  # maximum ratio to the expected interval for times in s
+_INTERVAL_RATIO_NOTED = 10.0  # ratio to the expected interval that triggers a note
 
 
 @dataclass(frozen=True)
 class FrameRecording:
-    """Counts uint16 [n, rows, cols] at times t float64 [n], increasing from 0 [s].
+    """Counts uint16 [n, rows, cols] at times t float64 [n], which increase from 0 [s].
 
     ``live`` [rows, cols] is False where the sensor has no cell. ``truths`` contains the true
-    contact. ``largest`` is the largest reading in the file's unit: counts if ``whole``, otherwise
-    Pa. ``notes`` list corrections and suspicious values, one per line.
+    contact. ``largest`` is the maximum reading in the file's unit: counts if ``whole``, otherwise
+    Pa. ``notes`` lists corrections and suspicious values, one per line.
     """
 
     counts: NDArray[np.uint16]
     t: FloatArray
     live: NDArray[np.bool_]
     truths: dict[str, FloatArray] = field(default_factory=dict)
-    pitch: tuple[float, float] | None = None  # x and y [m], None if the file has none
-    full_count: int | None = None  # reading of saturated cells, None if the file has none
+    pitch: tuple[float, float] | None = None  # x and y [m], None if not in the file
+    full_count: int | None = None  # reading of saturated cells, None if not in the file
     largest: float = 0.0
     whole: bool = True
     notes: tuple[str, ...] = ()
@@ -86,7 +87,7 @@ def load_recording(
     Raises
     ------
     RecordingError
-        The recording cannot be read. The message names the file and the problem.
+        If the recording cannot be read. The message names the file and the problem.
     """
     try:
         found = _loaded(path, pascal_per_count, rate, noise)
@@ -131,7 +132,7 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _frames(path: Path) -> NDArray[Any]:
-    """Return the frames of one .npy file, [n, rows, cols]."""
+    """Return the frames in one .npy file [n, rows, cols]."""
     array = _array(path)
     if array.ndim not in (2, 3):
         raise ValueError(f"{path.name}: found shape {array.shape}, expected [n, rows, cols]")
@@ -139,7 +140,7 @@ def _frames(path: Path) -> NDArray[Any]:
 
 
 def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
-    """Return the known arrays of an .npz file."""
+    """Return the known arrays in an .npz file."""
     held: dict[str, NDArray[Any]] = {}
     with open_regular(path) as file, zipfile.ZipFile(file) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
@@ -159,7 +160,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
 
 
 def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) -> str:
-    """Return the name of the array with the frames. Raises ValueError if it is ambiguous."""
+    """Return the name of the frames array. Raises ValueError if it is ambiguous."""
     if "frames" in names:
         return "frames"
     shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
@@ -177,14 +178,14 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
 
 def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     part = archive.getinfo(f"{name}.npy")
-    # NumPy uses only these; other methods may unpack to more than the stated size.
+    # NumPy uses only these methods; other methods may unpack to more than the stated size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name}: found another compression than deflate")
     return part
 
 
 def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], str]:
-    """Return the shape and kind of an array without reading it."""
+    """Return the shape and dtype kind of an array without reading it."""
     with archive.open(_part(archive, name)) as unpacked:
         shape, _, kind = _read_header(unpacked)
     return shape, kind.kind
@@ -205,7 +206,7 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
 
 
 def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
-    """Read the array of a .npy file of ``size`` bytes. Raises ValueError if it claims more."""
+    """Read the array in a .npy file. Raises ValueError if it claims more than ``size`` bytes."""
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
         raise ValueError(f"claims to hold {shape} of {kind}, more than the file has")
@@ -262,7 +263,7 @@ def _checked(
 def _without_dead(
     frames: NDArray[Any], live: NDArray[np.bool_], most: float
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Mark cells that are NaN in all frames as dead; clear out-of-range readings of dead cells."""
+    """Mark cells as dead if they are NaN in all frames; clear dead cells' out-of-range readings."""
     if frames.dtype.kind == "f":
         unknown = np.isnan(frames)
         live = live & ~unknown.all(axis=0)
@@ -281,7 +282,7 @@ def _without_dead(
 def _check_below(
     frames: NDArray[Any], live: NDArray[np.bool_], noise: float, notes: list[str]
 ) -> None:
-    """Note negative readings that noise explains. Raises ValueError for other negative readings."""
+    """Note negative readings due to noise. Raises ValueError for other negative readings."""
     lowest = float(frames.min())
     if lowest >= 0.0:
         return
@@ -322,7 +323,7 @@ def _row(arrays: dict[str, NDArray[Any]], name: str, count: int) -> NDArray[Any]
 
 
 def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
-    """Convert times to s since the first one. Raises ValueError if they do not increase."""
+    """Convert times to s since the first frame. Raises ValueError if they do not increase."""
     first = t[0].item()
     since: FloatArray = (t - t[0]).astype(np.float64)
     steps = np.diff(since)
@@ -333,7 +334,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
         return since
     step = float(np.median(steps))
     for factor in (1.0, *_UNITS):
-        if _DATE_RANGE[0] <= first * factor < _DATE_RANGE[1]:  # the times are dates
+        if _DATE_RANGE[0] <= first * factor < _DATE_RANGE[1]:  # The times are dates.
             break
     else:
         factor = _factor(t, step, rate)
@@ -351,7 +352,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
 
 
 def _factor(t: NDArray[Any], step: float, rate: float) -> float:
-    """Return the unit [s] of times without a date, from their step. Raises ValueError."""
+    """Return the unit [s] of undated times based on their step. Raises ValueError."""
     whole = t.dtype.kind in "ui"
     if whole and (np.diff(t) == 1).all() and len(t) > 2:
         raise ValueError("t: whole numbers that rise by 1, expected times in s, or no t")
@@ -361,14 +362,14 @@ def _factor(t: NDArray[Any], step: float, rate: float) -> float:
 
 
 def _clipped(found: FrameRecording, scale: float, full: int) -> str:
-    """Return a warning if several cells share the largest reading, which indicates saturation."""
+    """Return a warning if several cells share the maximum reading, which indicates saturation."""
     counts = np.where(found.live, found.counts, 0)
     top = int(counts.max())
     at_top = counts == top
     cells = np.count_nonzero(at_top.any(axis=0))
     if top == 0 or top >= full or cells < _CLIPPED_COUNT_MIN:
         return ""
-    # If readings are round numbers, the next smaller one is just as frequent.
+    # If readings are round numbers, the next lower reading is just as frequent.
     below = int(counts[~at_top].max(initial=0))
     if below and np.count_nonzero(at_top) <= 2 * np.count_nonzero(counts == below):
         return ""

@@ -1,12 +1,12 @@
-"""Read the 32 × 32 glove-style board, which is polled over a serial port.
+"""Read a 32 × 32 glove-style board, which is polled over a serial port.
 
-The board runs at 1,000,000 baud. The host writes ``a`` and the board replies with one frame of 2 +
+The board runs at 1,000,000 baud. The host writes ``a``, and the board replies with one frame of 2 +
 2 · rows · cols bytes: index + 11, then for each cell in row-major order the high 5 bits + 11 and
-the low 5 bits + 11, then a newline (10). Only the last byte can be a newline, so the decoder
-resynchronises at the next one. There is no checksum, so a byte corrupted to another value of 11 …
-42 is not detected.
+the low 5 bits + 11, and finally a newline (10). Only the last byte can be a newline, so the decoder
+resynchronises at the next newline. There is no checksum, so a byte that is corrupted to another
+value in 11 … 42 is not detected.
 
-Boards with a 12-bit converter use the same framing with 6 bits in each half. They are selected by
+Boards with a 12-bit converter use the same framing with 6 bits per half. They are selected by a
 ``tactile.full_count`` from 1024 to 4095.
 """
 
@@ -18,15 +18,15 @@ from softfinger.daemon.tactile.decoder import Decoded, DelimitedDecoder
 from softfinger.daemon.tactile.serial_reader import SerialReader
 
 _OFFSET = 11
-_BITS = 5  # bits in each half of a count
+_BITS = 5  # bits per half of a count
 
 
 class GloveDecoder(DelimitedDecoder):
-    """Decoder of a glove-style board, whose counts have twice ``bits`` bits."""
+    """Decoder for a glove-style board, whose counts have 2 × ``bits`` bits."""
 
     def __init__(self, rows: int = 32, cols: int = 32, bits: int = _BITS) -> None:
         super().__init__(rows, cols, b"\n", 2 + 2 * rows * cols)
-        self._values = 1 << bits  # number of values of each half
+        self._values = 1 << bits  # number of possible values per half
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
         if len(packet) != self.longest - 1:
@@ -45,12 +45,12 @@ class GloveDecoder(DelimitedDecoder):
 
 
 def bits_of(full_count: int) -> int:
-    """Return the bits in each half of a count, given the board's largest count."""
+    """Return the number of bits per half of a count, given the board's maximum count."""
     return _BITS + 1 if 1 << 2 * _BITS <= full_count < 1 << 2 * (_BITS + 1) else _BITS
 
 
 class Glove(SerialReader):
-    """The glove-style board under one fingertip; a new frame is requested after each one."""
+    """Glove-style board under one fingertip. Each frame triggers a request for the next."""
 
     request = b"a"
 

@@ -1,4 +1,4 @@
-"""Provide recorded frames in place of a sensor, at recorded times or set by the caller."""
+"""Provide recorded frames instead of a sensor, at recorded times or set by the caller."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
-_PITCH_TOLERANCE = 0.01  # relative tolerance between the pitch in a file and in the settings
+_PITCH_TOLERANCE = 0.01  # relative tolerance between pitch in file and settings
 
 
 def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:
-    """Describe how a file's cell sizes differ from ``pitch`` (x, y) [m]; y = 0 means y = x.
+    """Describe how a file's cell size differs from ``pitch`` (x, y) [m]; y = 0 means y = x.
 
-    The text is empty if they agree or the file states none.
+    The text is empty if they agree or the file does not state a size.
     """
     if recording.pitch is None:
         return ""
@@ -38,10 +38,10 @@ def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> s
 
 
 class GivenFrames:
-    """A sensor whose newest frame the caller sets in ``frame``.
+    """Sensor whose newest ``frame`` is set by the caller.
 
     ``live`` [rows, cols] is False where the sensor has no cell; None means that all cells exist.
-    ``full_count`` is the reading of saturated cells; None means the settings' value.
+    ``full_count`` is the reading of saturated cells; None means the value in the settings.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class GivenFrames:
         """Do nothing: there is no port."""
 
     def latest(self) -> Frame | None:
-        """Return the frame that was set last."""
+        """Return the frame set last."""
         return self.frame
 
     def counters(self) -> dict[str, int]:
-        """Return an empty dict, as there are no errors to count."""
+        """Return an empty dict, because there are no errors to count."""
         return {}
 
     def close(self) -> None:
@@ -67,12 +67,12 @@ class GivenFrames:
 
 
 class ReplayTactile:
-    """Frames of a recording at its own times, counted from ``open``.
+    """Backend that replays a recording at its recorded times, starting at ``open``.
 
-    One mean interval after its last frame the recording restarts. If ``tactile.replay_again`` is
-    false, the last frame is repeated once with ``valid`` False instead. ``live`` [rows, cols] is
-    False where the recording has no cell. ``full_count`` is the reading of saturated cells, None if
-    the recording does not state it. ``notes`` describe suspicious properties of the recording.
+    The recording restarts one mean interval after its last frame. If ``tactile.replay_again`` is
+    false, the last frame is instead repeated once with ``valid`` False. ``live`` [rows, cols] is
+    False where the recording has no cell. ``full_count`` is the reading of saturated cells, or None
+    if the recording does not state it. ``notes`` describes suspicious properties of the recording.
     """
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
@@ -114,14 +114,14 @@ class ReplayTactile:
         self._frame: Frame | None = None
 
     def open(self) -> None:
-        """Start with the recording's first frame now."""
+        """Start playing at the recording's first frame."""
         self._start = self._due = self._clock.now()
         self._frame = None
         self.latest()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame that is due, or None if the sensor is not open."""
-        now = self._clock.now() + 1e-9  # include a frame that is due now
+        """Return the newest due frame, or None if the sensor is not open."""
+        now = self._clock.now() + 1e-9  # includes a frame due now
         if now < self._due:
             return self._frame
         turn = math.floor((now - self._start) / self._period)
@@ -138,12 +138,12 @@ class ReplayTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return the number of ``frames`` since open; ``resyncs`` and ``skipped_bytes`` stay 0."""
+        """Return the ``frames`` since opening; ``resyncs`` and ``skipped_bytes`` are always 0."""
         frames = 0 if self._frame is None else self._frame.seq
         return {"frames": frames, "resyncs": 0, "skipped_bytes": 0}
 
     def close(self) -> None:
-        """Deliver no more frames."""
+        """Stop delivering frames."""
         self._due = math.inf
 
     def _end(self) -> Frame | None:

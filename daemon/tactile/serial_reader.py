@@ -1,7 +1,7 @@
-"""Read a tactile board's serial port in a thread, and provide its newest complete frame.
+"""Read a tactile board's serial port in a thread and provide its newest complete frame.
 
-All framings over serial ports share this module. It handles the port, the thread and the times,
-which a :class:`Decoder` does not need.
+All framings for serial ports share this module. It handles the port, the thread and the timing, so
+that a :class:`Decoder` handles only bytes.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ __all__ = ["SerialReader"]
 
 _READ_SIZE = 65536  # bytes per read, the capacity of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-_GAP_TIME = 5e-4  # s without a byte, counts as a gap between frames
-_REQUEST_TIMEOUT = 0.1  # s beyond the transmission time of a frame until the request is repeated
-_WAIT_MIN = 3e-4  # s, shorter timed waits cost more than the wake-ups they save
-_WAIT_MAX = 2e-3  # s, limits the delay if the number of missing bytes is wrong
+_GAP_TIME = 5e-4  # s without a byte that count as a gap between frames
+_REQUEST_TIMEOUT = 0.1  # s beyond a frame's transmission time until the request is repeated
+_WAIT_MIN = 3e-4  # s; shorter timed waits cost more than the wake-ups they save
+_WAIT_MAX = 2e-3  # s, maximum delay if the number of missing bytes is wrong
 
 
 class SensorClock:
-    """Convert a board's clock to the local clock, using the smallest recent delay as offset.
+    """Converter from a board's clock to the local clock, using the minimum recent delay as offset.
 
-    Frames arrive with varying delays but never early, so the smallest delay removes the port's
-    jitter from t_sample. The offset may rise by 200 ppm, which exceeds the difference of two
-    quartzes. A jump of more than a second is treated as a restart of the board.
+    Frames arrive with varying delays but never early, so using the minimum delay removes port
+    jitter from t_sample. The offset may increase by 200 ppm, which exceeds the difference between
+    two quartz clocks. A jump of more than one second is treated as a board restart.
     """
 
     _DRIFT = 2e-4
@@ -48,9 +48,10 @@ class SensorClock:
         self._t = -math.inf
 
     def arrival(self, t_sensor: float, t: float) -> float:
-        """Return the undelayed arrival time [s] of a frame.
+        """Return a frame's arrival time [s] without jitter.
 
-        ``t_sensor`` [s] is the frame's board time and ``t`` [s] the local time when it was read.
+        ``t_sensor`` [s] is the frame's board time, and ``t`` [s] is the local time at which it was
+        read.
         """
         offset = t - t_sensor
         risen = self._offset + self._DRIFT * (t - self._t)
@@ -60,26 +61,26 @@ class SensorClock:
 
 
 class SerialReader:
-    """Backend of a board on a serial port, except for the framing, which a subclass provides.
+    """Backend for a board on a serial port; subclasses provide the framing.
 
-    A frame's ``t_arrival`` is the time when its last byte was read. ``t_sample`` estimates the
-    middle of the board's scan: ``t_arrival`` minus the transmission time of the frame's bytes and
-    of later bytes in the same read, minus ``latency`` [s] from the middle of the scan to the
-    frame's first byte. It is never earlier than that of the last frame. If frames carry the board's
-    time, :class:`SensorClock` removes the port's jitter.
+    A frame's ``t_arrival`` is the time at which its last byte was read. ``t_sample`` estimates the
+    mid-scan time: ``t_arrival`` minus the transmission time of the frame's bytes and of later bytes
+    in the same read, minus ``latency`` [s] from mid-scan to the frame's first byte. It never
+    decreases from frame to frame. If frames contain the board time, :class:`SensorClock` removes
+    port jitter.
 
     A polled board receives ``request`` at the start, after each frame, and again if no frame
-    arrives within 0.1 s more than its transmission time.
+    arrives within its transmission time plus 0.1 s.
 
-    ``latest`` may be called from any thread. Each frame has its own array, which is not modified
-    later. If the port is lost or the stream becomes unreadable, one last frame with the old data
-    and ``valid`` False is provided.
+    ``latest`` may be called from any thread. Each frame has its own array, which is never modified.
+    If the port is lost or the stream becomes unreadable, a final frame with the old data and
+    ``valid`` False is provided.
     """
 
     request = b""
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
-        """``finger`` selects the port; 0 is the left finger."""
+        """Create a closed reader; ``finger`` selects the port (0 is the left finger)."""
         self.settings = settings
         self._path = settings.port[finger]
         self._decoder = self.make_decoder()
@@ -91,17 +92,17 @@ class SerialReader:
         self._bytes = 0
         self._error = ""
         self._port_lost = False
-        self._event = threading.Event()  # set by the first frame or by loss of the port
+        self._event = threading.Event()  # set by the first frame or when the port is lost
         self._thread: threading.Thread | None = None
         self._port: serial.Serial | None = None
         self._stop: tuple[int, int] | None = None
 
     def make_decoder(self) -> Decoder:
-        """Return a new decoder of the board's framing, called each time the port is opened."""
+        """Create a decoder for the board's framing. Called each time the port is opened."""
         raise NotImplementedError
 
     def open(self) -> None:
-        """Open the port, start reading and wait for a valid frame. Raises TactileError."""
+        """Open the port, start reading, and wait for a valid frame. Raises TactileError."""
         if self._port is not None:
             raise TactileError(f"{self._path}: is open already")
         self._decoder = self.make_decoder()
@@ -126,14 +127,14 @@ class SerialReader:
             raise TactileError(f"{self._path}: {trouble}")
 
     def latest(self) -> Frame | None:
-        """Return the newest complete frame, or None before the first.
+        """Return the newest complete frame, or None before the first frame.
 
         The same object is returned until a newer frame arrives.
         """
         return self._latest
 
     def counters(self) -> dict[str, int]:
-        """Return ``bytes`` read, the decoder's counters, and ``port_lost``, 1 until reopened."""
+        """Return ``bytes`` read, the decoder's counters, and ``port_lost`` (1 until reopened)."""
         return {
             "bytes": self._bytes,
             "port_lost": int(self._port_lost),
@@ -142,11 +143,11 @@ class SerialReader:
 
     @property
     def error(self) -> str:
-        """Reason for missing frames (port lost, stream unreadable); empty while frames arrive."""
+        """Reason for missing frames (port lost or stream unreadable); empty while frames arrive."""
         return self._error
 
     def close(self) -> None:
-        """Stop the thread and close the port. Never raises, and may be called repeatedly."""
+        """Stop the thread and close the port. Never raises; may be called repeatedly."""
         stop, thread, port = self._stop, self._thread, self._port
         self._stop = self._thread = self._port = None
         if stop is not None:
@@ -174,7 +175,7 @@ class SerialReader:
         return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
 
     def _run(self, port: int, stop: int) -> None:
-        """Read in the thread, which blocks in the kernel and wakes once or twice per frame."""
+        """Read in the thread, which blocks in the kernel and wakes up once or twice per frame."""
         decoder = self._decoder
         timeout = self._ask(port)
         while True:
@@ -204,21 +205,22 @@ class SerialReader:
             else:
                 timeout = self._request_timeout if decoded is None else self._ask(port)
             wait = decoder.missing * self._byte_time
-            # The remaining bytes are being sent: wait for the frame's end instead of its next byte.
+            # The remaining bytes are being sent, so wait for the end of the frame instead of its
+            # next byte.
             if wait > _WAIT_MIN and select.select((stop,), (), (), min(wait, _WAIT_MAX))[0]:
                 return None
 
     @property
     def _request_timeout(self) -> float | None:
-        """Longest time to wait for a requested frame [s]; None for boards that are not polled."""
+        """Maximum waiting time for a requested frame [s]; None for boards that are not polled."""
         if not self.request:
             return None
         return self._decoder.frame_bytes * self._byte_time + _REQUEST_TIMEOUT
 
     def _ask(self, port: int) -> float | None:
-        """Request a frame from a polled board; return the longest time to wait for it [s]."""
+        """Request a frame from a polled board; return the maximum waiting time [s]."""
         if self.request:
-            with contextlib.suppress(OSError):  # the next read reports a lost port
+            with contextlib.suppress(OSError):  # The next read reports a lost port.
                 os.write(port, self.request)
         return self._request_timeout
 
@@ -250,7 +252,7 @@ class SerialReader:
 
 
 def open_port(path: str, baud: int) -> serial.Serial:
-    """Open ``path`` exclusively: raw, eight data bits, no parity. Raises TactileError."""
+    """Open ``path`` exclusively: raw mode, eight data bits, no parity. Raises TactileError."""
     try:
         return serial.Serial(path, baud, timeout=0, exclusive=True)
     except serial.SerialException as error:

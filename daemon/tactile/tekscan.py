@@ -1,13 +1,14 @@
 """Parse Tekscan-style ASCII exports of pressure frames.
 
-Such a file starts with lines ``KEY value``, up to the line ``ASCII_DATA @@``. Each frame is a line
-``Frame n``, which may have more text, followed by the rows, with ``B`` where the sensor has no
-cell. A line ``@@`` may end the file. The export of a single frame has no ``Frame`` line.
+An export starts with lines of the form ``KEY value``, up to the line ``ASCII_DATA @@``. Each frame
+consists of a line ``Frame n``, which may contain more text, and the rows, with ``B`` where the
+sensor has no cell. A line ``@@`` may end the file. An export with a single frame has no ``Frame``
+line.
 
 Encoding, decimal sign and separator depend on the locale of the exporting machine and are detected
-from the file. Lengths are in mm, cm, m or in, abbreviated or spelt out. Readings are raw, in a unit
-of pressure, or in a unit of force per cell. Free text follows ``COMMENTS:``, where only words in
-capitals are keys. A spreadsheet may add separators at the ends of lines and quotation marks.
+from the file. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings are raw,
+pressures, or forces per cell. Free text follows ``COMMENTS:``; within it, only words in capitals
+are keys. Spreadsheets may add quotation marks, and separators at line ends.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SoftfingerError
 
-_SIZE_MAX = 1024  # largest number of rows or cols
-_HEADER_LINES_MAX = 1000  # largest number of header lines
-_READING_MAX = 1e12  # largest reading, in its unit
-_RAW_SATURATION = 255  # the manufacturer's electronics has 8 bits
-_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, which is also rounded
-_EDGE_CHARACTERS = ' \t,;"'  # characters that a spreadsheet adds at the ends of lines
+_SIZE_MAX = 1024  # maximum number of rows or cols
+_HEADER_LINES_MAX = 1000
+_READING_MAX = 1e12  # maximum reading in its unit
+_RAW_SATURATION = 255  # the manufacturer's electronics have 8 bits
+_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, to allow for rounding
+_EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
     **dict.fromkeys(("cm", "centimeters", "centimetres", "centimeter", "centimetre"), 1e-2),
@@ -52,22 +53,22 @@ _FORCES = {
     **dict.fromkeys(("oz", "ozf"), 0.27801385095),
 }
 _AREAS = {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6, "in2": 0.0254**2, "ft2": 0.3048**2}
-# Squares as encoded by Latin-1, UTF-8 and DOS code pages.
+# Square symbols as encoded by Latin-1, UTF-8 and DOS code pages.
 _SQUARES = str.maketrans({"²": "2", "ý": "2", "^": "", ".": "", "*": ""})
 
 
 class TekscanError(SoftfingerError, ValueError):
-    """Text that is not such an export. The message names the line."""
+    """Raised for text that is not a valid export. The message names the line."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """A parsed export.
+    """Parsed export.
 
-    ``values`` float64 [frames, rows, cols] are in Pa, or counts if ``raw``, and 0 where ``live``
-    [rows, cols] is False. ``t`` float64 [frames] is the time since the first frame [s]. ``pitch``
-    (x, y) [m] is NaN if the header lacks it. ``full`` is the reading at which a cell is saturated,
-    inf if unknown.
+    ``values`` float64 [frames, rows, cols] are in Pa, or counts if ``raw``. They are 0 where
+    ``live`` [rows, cols] is False. ``t`` float64 [frames] is the time since the first frame [s].
+    ``pitch`` (x, y) [m] is NaN if the header does not contain it. ``full`` is the reading of a
+    saturated cell, inf if unknown.
     """
 
     values: NDArray[np.float64]
@@ -79,7 +80,7 @@ class Export:
 
 
 def decode(data: bytes) -> str:
-    """Decode a file as UTF-8, UTF-16 or a single-byte code, with or without a byte order mark."""
+    """Decode UTF-8, UTF-16 or a single-byte encoding, with or without a byte order mark."""
     for mark, code in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
         if data.startswith(mark):
             return data.decode(code, "replace")
@@ -95,7 +96,7 @@ def decode(data: bytes) -> str:
 def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     """Parse an export. Raises TekscanError.
 
-    ``seconds_per_frame`` [s] is used if the header states none.
+    ``seconds_per_frame`` [s] is used if the header does not contain it.
     """
     lines = text.splitlines()
     header, first = _header(lines)
@@ -128,9 +129,9 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
 def _live_cells(
     values: NDArray[np.float64], places: list[list[int]]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the values, with 0 in missing and never numeric cells, and a mask of the other cells.
+    """Set missing and never-numeric cells to 0; return the values and a mask of the other cells.
 
-    Raises TekscanError for a cell that is not a number in some frames.
+    Raises TekscanError if a cell is a number only in some frames.
     """
     unknown = np.isnan(values)
     live: NDArray[np.bool_] = ~np.any([np.isneginf(values).any(0), unknown.all(0)], axis=0)
@@ -144,7 +145,7 @@ def _live_cells(
 
 
 def _digits(values: NDArray[np.float64]) -> int:
-    """Return the number of decimals of the readings."""
+    """Return the number of decimals in the readings."""
     for digits in range(9):
         if np.allclose(values, np.round(values, digits), rtol=1e-12, atol=0.0):
             return digits
@@ -174,7 +175,7 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
 def _frames(
     lines: list[str], first: int, rows: int, cols: int
 ) -> tuple[list[int], list[list[NDArray[np.float64]]], list[list[int]]]:
-    """Return the frames' numbers, their rows and the rows' line numbers, from line ``first`` on."""
+    """Parse lines from ``first`` on; return frame numbers, rows and the rows' line numbers."""
     numbers: list[int] = []
     frames: list[list[NDArray[np.float64]]] = []
     places: list[list[int]] = []
@@ -185,7 +186,7 @@ def _frames(
             continue
         if line.lstrip(_EDGE_CHARACTERS).startswith("@@"):
             break
-        if re.match(r'"?[^\W\d]{2}', line):  # a row starts with a number or a single B
+        if re.match(r'"?[^\W\d]{2}', line):  # A row starts with a number or a single B.
             match = re.match(r'"?[^\W\d]+[\s:#,;]*(\d{1,9})\b', line)
             if match is None:
                 if re.match(r'"?(nan|inf)', line, re.IGNORECASE) is None:
@@ -200,7 +201,7 @@ def _frames(
                 frames.append([])
                 places.append([])
                 continue
-        if not frames:  # export of a single frame
+        if not frames:  # single-frame export
             numbers.append(1)
             frames.append([])
             places.append([])
@@ -219,7 +220,7 @@ def _frames(
 
 
 def _separator(line: str, cols: int) -> str:
-    """Detect the separator of the cells from their number in a row."""
+    """Detect the cell separator from the number of cells in a row."""
     for separator in ("\t", ";", ", ", ",", " "):
         if separator in line and len(_cells(line, separator, cols)) == cols:
             return separator
@@ -239,11 +240,11 @@ def _cells(line: str, separator: str, cols: int) -> list[str]:
 
 
 def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float64]:
-    """Parse the readings of a row; −inf where the sensor has no cell."""
+    """Parse a row's readings, with −inf where the sensor has no cell."""
     cells = [cell.strip(' "').upper() for cell in _cells(line, separator, cols)]
     missing = cells.count("B")
     if separator == "," and len(cells) != cols:
-        # The commas are decimal signs only if every number has one.
+        # Commas are decimal signs only if every number has one.
         if len(cells) == 2 * cols - missing:
             parts = iter(cells)
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
@@ -266,7 +267,7 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
 def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
-    If both occur, the last one is the decimal sign and the other groups digits.
+    If both occur, the last one is the decimal sign, and the other one groups digits.
     """
     if "," in text:
         text = text.replace("," if text.rfind(",") < text.rfind(".") else ".", "")
@@ -284,7 +285,7 @@ def _count(header: dict[str, str], key: str) -> int:
 
 
 def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> float:
-    """Parse a number with its unit and convert it to SI."""
+    """Parse a number with a unit and convert it to SI."""
     match = re.fullmatch(r"([-+0-9.,eE]+)[\s,;]*(.*)", header[key])
     try:
         value = _number(match[1].rstrip(",")) if match else math.nan
@@ -298,7 +299,7 @@ def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> floa
 
 
 def _pitch(header: dict[str, str]) -> tuple[float, float]:
-    """Return (x, y) from the spacings in the header [m]."""
+    """Return the pitch (x, y) from the spacings in the header [m]."""
     found = []
     for key in ("COL_SPACING", "ROW_SPACING"):
         value = _quantity(header, key, _LENGTHS) if key in header else math.nan
@@ -309,14 +310,14 @@ def _pitch(header: dict[str, str]) -> tuple[float, float]:
 
 
 def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
-    """Return the unit of the readings [Pa], 0 for raw ones."""
+    """Return the unit of the readings [Pa], or 0 if they are raw."""
     text = header.get("UNITS", "")
     unit = _plain_unit(text)
     if unit in _RAW:
         return 0.0
     if unit in _PRESSURES or unit in _per_area():
         return (_PRESSURES | _per_area())[unit]
-    if unit in _FORCES:  # force on one cell
+    if unit in _FORCES:  # force per cell
         area = _quantity(header, "SENSEL_AREA", _AREAS) if "SENSEL_AREA" in header else math.nan
         area = pitch[0] * pitch[1] if math.isnan(area) else area
         if area > 0.0:
@@ -334,6 +335,6 @@ def _per_area() -> dict[str, float]:
 
 
 def _plain_unit(unit: str) -> str:
-    """Normalise a unit, including the notations of a square."""
+    """Normalise a unit, including different notations for squares."""
     plain = re.sub(r"[\s\[\]()]", "", unit.translate(_SQUARES)).lower()
     return re.sub(r"(sq|square)([a-z]+)", r"\g<2>2", plain)

@@ -1,5 +1,5 @@
-"""`softfinger emulate`: the simulated hand as servos and tactile boards on ptys.
+"""`softfinger emulate`: the simulated hand with servos and tactile boards on ptys.
 
-The package handles ports, transmission times, framings and injected faults. The servos themselves
-are in `servo_model`.
+This package handles ports, transmission times, framing and injected faults. The servos are in
+`servo_model`.
 """

@@ -1,11 +1,11 @@
-"""Emulated hand: simulated physics behind servos and tactile boards on ptys, in real time.
+"""Emulate a hand in real time: simulated physics with servos and tactile boards on ptys.
 
-On a busy machine the emulator and the daemon wait for each other, unless the daemon's
+On a busy machine, the emulator and the daemon wait for each other unless the daemon's
 ``loop.clock`` is ``real``; see `EmulatorClock`.
 
-There is one thread with one event loop. It waits for bytes on the servo pty or for the next event.
-It answers the servos first, then does at most one slower task (a step of the physics, a frame)
-before it checks for bytes again.
+One thread runs one event loop, which waits for bytes on the servo pty or for the next event. It
+serves the servos first, then does at most one slower task (a physics step or a frame) before it
+checks for bytes again.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTacti
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
-_STEP = 0.002  # s, largest delay of the physics
-_REQUESTS = ("report", "forget", "place")  # words to the control socket that are not faults
-# rad; the joint stops are closer than 6 rad.
+_STEP = 0.002  # s, maximum physics delay
+_REQUESTS = ("report", "forget", "place")  # control socket words other than faults
+# rad; 6 rad is beyond the joint stops.
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
-_TURN_CURRENT = 0.3  # A of motor current that corresponds to the force of a person's hand
+_TURN_CURRENT = 0.3  # A, motor current equivalent to turning by hand
 _TURN_TIME = 1.0  # s
-_STALL_TIME = 0.05  # s; the part of a pause beyond this does not count as the hand's time
-# s by which the hand's time may be ahead of the daemon, which waits for replies.
+_STALL_TIME = 0.05  # s, maximum pause counted by the hand's clock
+# s by which the hand's clock may be ahead of the daemon, which waits for replies.
 _AHEAD_TIME = 0.002
-_POLL_INTERVAL = 0.0005  # s between two checks for a new deadline
-# Board for profiles without one: the same as in config/hil.toml.
+_POLL_INTERVAL = 0.0005  # s between checks for a new deadline
+# Default board, as in config/hil.toml.
 DEFAULT_BOARD = {
     "backend": "flexitac",
     "rows": 32,
@@ -66,30 +66,30 @@ DEFAULT_BOARD = {
 
 
 class EmulatorError(SoftfingerError):
-    """The emulated hand can't be set up. The message gives the reason and the remedy."""
+    """Raised if the emulated hand can't be set up. The message gives the reason and a fix."""
 
 
 class EmulatorClock:
-    """Time of the emulated hand: real time from 0, without interruptions of its process.
+    """Clock of the emulated hand: real time from 0, excluding interruptions of its process.
 
-    Otherwise a process that was stopped for a minute would have to simulate that minute, and could
-    not answer meanwhile. A daemon whose own time waits for a busy machine sets deadlines. While
-    that daemon uses the ``servos`` and their torque is on, the emulator's time advances from one
-    deadline to the next by the same amount as the daemon's, within `_AHEAD_TIME`.
+    Otherwise, a process that was stopped for a minute would have to simulate that minute and could
+    not reply in the meantime. A daemon whose own clock waits for a busy machine sets deadlines.
+    While this daemon uses the ``servos`` and their torque is on, the emulator clock advances from
+    one deadline to the next by the same amount as the daemon clock, to within `_AHEAD_TIME`.
     """
 
     pauses_when_late = False
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
-        self.held = False  # the last returned time was limited
+        self.held = False  # the last returned time was limited by the deadline
         self._deadline = deadline
         self._seen = 0.0
-        self._bound = math.inf  # time at which to wait for the next deadline
+        self._bound = math.inf  # time after which the clock waits for the next deadline
         self._origin = self._last = time.monotonic()
 
     def now(self) -> float:
-        """Return the hand's time [s]; the time since the last call counts up to `_STALL_TIME`."""
+        """Return the hand's time [s]; at most `_STALL_TIME` per call is counted."""
         now = time.monotonic()
         self._origin += max(now - self._last - _STALL_TIME, 0.0)
         self._last = now
@@ -101,7 +101,7 @@ class EmulatorClock:
         self.held = False
         if t > self._bound and self.servos is not None:
             if not self.servos.driven():
-                self._bound = math.inf  # torque is off, or the daemon has ended
+                self._bound = math.inf  # Torque is off, or the daemon has ended.
             elif t > (bound := max(self._bound, self.servos.answering_until)):
                 self.held = True
                 self._origin += t - bound
@@ -113,7 +113,7 @@ class EmulatorClock:
         return time.time()
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until the hand's time ``t``, and return the delay of the wake-up [s]."""
+        """Sleep until ``t`` on the hand's clock; return the wake-up delay [s]."""
         while (delay := t - self.now()) > 0.0:
             time.sleep(min(delay, 0.5 * _STALL_TIME))
         return -delay
@@ -121,18 +121,18 @@ class EmulatorClock:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedServos:
-    """Options of the emulated servos in addition to the settings."""
+    """Emulated servo options that are not part of the settings."""
 
-    baud: int = 0  # 0: they answer at once and at any rate
-    factory: bool = False  # factory settings, except IDs and baud rate
-    ids: tuple[int, ...] | None = None  # instead of those of the settings; may be equal
+    baud: int = 0  # 0: reply immediately at any rate
+    factory: bool = False  # factory defaults except for IDs and baud rate
+    ids: tuple[int, ...] | None = None  # replace the IDs in the settings; may be equal
 
 
 class Emulator:
-    """Emulated hand on ptys, with links in ``folder``; :meth:`run` serves it.
+    """Emulated hand on ptys with links in ``folder``; :meth:`run` serves it.
 
-    A finger that is absent in the scene of ``settings`` has no board. Servos or tactile sensors
-    with the backend ``none`` have no port.
+    A finger that is not in the scene has no board. Servos or tactile sensors with the backend
+    ``none`` have no port.
     """
 
     def __init__(
@@ -144,18 +144,18 @@ class Emulator:
         faults: Iterable[str] = (),
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Create the hand; it does not answer before :meth:`run`.
+        """Create the hand, which does not respond until :meth:`run` is called.
 
-        Signal handlers must not raise during this call, since files would be left behind.
+        Signal handlers must not raise during this call, because files would be left behind.
 
         Parameters
         ----------
         settings, folder, servos
-            Settings of the hand, folder for the links, and options of the servos.
+            Settings of the hand, folder for the links, and servo options.
         faults
             Faults; see :func:`parse_faults`.
         tell
-            Function for log lines about faults that begin and plates that come to rest.
+            Called with log lines when a fault begins or a plate reaches its position.
 
         Raises
         ------
@@ -168,14 +168,14 @@ class Emulator:
         self._wake = os.pipe()
         self._closers.append(self._close_wake)
         self._stopping = False
-        # poll and epoll only have a resolution of milliseconds.
+        # poll and epoll have only millisecond resolution.
         self._selector = selectors.SelectSelector()
         self._selector.register(self._wake[0], selectors.EVENT_READ)
         self._servos: PtyServoBus | None = None
         self._boards: dict[str, TactileBoard] = {}
         self._sources: dict[str, SimulatedTactile] = {}
         self._plates: dict[str, Plate] = {}
-        self._turned = 0.0  # end time of the last turn of a joint by hand
+        self._turned = 0.0  # end time of the last joint rotation by hand
         self._tell = tell
         self._advance_due = 0.0
         try:
@@ -236,7 +236,7 @@ class Emulator:
         self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Serve the ports until :meth:`end`. ``on_ready`` is called once all parts answer."""
+        """Serve the ports until :meth:`end`; call ``on_ready`` once all parts respond."""
         ready = False
         while not self._stopping:
             self._turn()
@@ -263,13 +263,13 @@ class Emulator:
     # --- the event loop --------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Wait for bytes or the next event; serve the servos, then at most one slower task."""
+        """Wait for bytes or the next event; serve the servos, then do at most one slower task."""
         servos, boards = self._servos, self._boards.values()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
         start = self.clock.now()
         if servos is not None:
             due = min(due, servos.next_event())
-        # While the hand's time is held, no event becomes due, so avoid a busy loop.
+        # No event becomes due while the hand's clock is held, so avoid a busy loop.
         wait = max(due - start, _POLL_INTERVAL if self.clock.held else 0.0)
         ready = [key for key, _ in self._selector.select(wait)]
         t = self.clock.now()
@@ -303,17 +303,18 @@ class Emulator:
     # --- requests and faults ---------------------------------------------------------------------
 
     def request(self, text: str) -> str:
-        """Handle words from the control socket; return ``ok``, or ``error: `` with the reason.
+        """Handle words from the control socket; return ``ok`` or ``error: `` with the reason.
 
-        Words are faults, with times relative to now, and these requests:
+        Words are faults, with times relative to now, or these requests:
 
         - ``report``: the reply is :meth:`report` as JSON.
-        - ``forget``: the record of the bus begins again.
-        - ``place``: put the object back to its start, at rest and without load; remove plates.
-        - ``press …``, as the first word: see :meth:`press`.
-        - ``turn …``, as the first word: see :meth:`turn`.
+        - ``forget``: clear the bus record.
+        - ``place``: move the object back to its start pose with no velocity or load, and remove
+          plates.
+        - ``press …`` (first word): see :meth:`press`.
+        - ``turn …`` (first word): see :meth:`turn`.
 
-        After an error, none of the words takes effect.
+        If any word is invalid, all words are ignored.
         """
         words = text.split()
         if words[:1] == ["turn"]:
@@ -335,14 +336,14 @@ class Emulator:
                 self._take_away(finger)
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
-        self._advance_due = now  # so that faults without a time begin at once
+        self._advance_due = now  # faults without a time begin immediately
         return reply
 
     def press(self, text: str) -> str:
-        """Start the presses of ``text``; return their state as JSON, or ``error: `` with a reason.
+        """Start the presses in ``text``; return their state as JSON or ``error: `` with a reason.
 
-        The JSON object has ``wait``, the remaining time until the last press is reached [s]. With
-        an empty text no press is started.
+        The JSON object contains ``wait``, the remaining time until the last press is reached [s].
+        An empty text only queries this state.
         """
         now = self.clock.now()
         if text.strip():
@@ -360,15 +361,16 @@ class Emulator:
         return json.dumps({"wait": max(0.0, *ends) if ends else 0.0})
 
     def _take_away(self, finger: str) -> None:
-        """Remove the plate of a tip, so that its sensor measures the object again."""
+        """Remove a tip's plate, so that its sensor measures the object again."""
         del self._plates[finger]
         self._sources[finger].stage = None
 
     def turn(self, words: Sequence[str]) -> str:
-        """Turn joints as if by hand: ``left=closed`` to its stop, ``open``, or ``zero``.
+        """Turn joints as if by hand: ``left=closed`` (to its stop), ``open`` or ``zero``.
 
         The joints are held until the servos are written to. The reply is ``error: `` with a reason,
-        or JSON with the remaining time, as from :meth:`press`. Without words no turn is started.
+        or JSON with the remaining time as from :meth:`press`. Without words, only this reply is
+        returned.
         """
         now = self.clock.now()
         turns = [word.partition("=") for word in words]
@@ -386,16 +388,16 @@ class Emulator:
         return json.dumps({"wait": max(0.0, self._turned - now)})
 
     def _answer(self, text: str) -> str:
-        """Handle a :meth:`request`, and apply faults that begin now before the reply is sent."""
+        """Handle a :meth:`request`; apply faults that begin now before the reply is sent."""
         reply = self.request(text)
         self._advance(self.clock.now())
         return reply
 
     def report(self, t: float) -> dict[str, Any]:
-        """Return the traffic on the servo bus and the true state of the hand.
+        """Return the servo bus traffic and the true state of the hand.
 
-        Times are in the hand's time [s]. ``monotonic`` is time.monotonic() at ``t``, for comparison
-        with other processes.
+        Times are on the hand's clock [s]. ``monotonic`` is time.monotonic() at ``t``, for
+        comparison with other processes.
         """
         servos = self._servos.bus.report(t) if self._servos is not None else []
         held = {"pose": self.hand.object_pose.tolist()}
@@ -440,7 +442,7 @@ class Emulator:
 
 
 def with_board(settings: Settings) -> Settings:
-    """Return ``settings``, with the default board if the tactile backend has no framing."""
+    """Return ``settings`` with the default board if the tactile backend has no framing."""
     if settings.tactile.backend in (*ENCODERS, "none"):
         return settings
     tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})

@@ -1,7 +1,7 @@
-"""Folder of an emulator, with links to its ports and a control socket.
+"""Manage an emulator's folder with links to its ports and a control socket.
 
-Only one emulator may use a folder at a time. The socket answers each text message with one line.
-The emulator's event loop serves it, and `send_words` is its client.
+Only one emulator may use a folder at a time. The socket replies to each text message with one line.
+The emulator's event loop serves the socket; `send_words` is the client.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from softfinger.kinematics.compiled.own_folder import require_own
 LINKS = ("servos", "tactile-left", "tactile-right")
 _LOCK = ".emulator.lock"
 _CONTROL = "control"
-_MESSAGE_SIZE_MAX = 4096  # bytes of a message
+_MESSAGE_SIZE_MAX = 4096  # bytes per message
 _REPLY_SIZE_MAX = 1 << 17
-_CLIENT_COUNT_MAX = 8  # at a time
-_CLIENT_TIMEOUT = 10.0  # s, timeout of a client, also on a busy machine
+_CLIENT_COUNT_MAX = 8  # simultaneous clients
+_CLIENT_TIMEOUT = 10.0  # s, client timeout, long enough for a busy machine
 
 
 class FolderError(SoftfingerError):
-    """The folder can't be used. The message gives the reason and the remedy."""
+    """Raised if the folder can't be used. The message gives the reason and a fix."""
 
 
 class LinkFolder:
-    """Folder with the links to the ptys, locked by one emulator.
+    """Folder with links to the ptys, locked by one emulator.
 
-    The user must own the folder, and other users must not be able to write to it. Links left behind
-    by a killed emulator are replaced, but other files are not.
+    The user must own the folder, and other users must not have write access. Links left behind by a
+    killed emulator are replaced, but other files are not.
     """
 
     def __init__(self, path: Path) -> None:
@@ -68,7 +68,7 @@ class LinkFolder:
                     f"{self.path}: in use by another emulator (process {holder or 'unknown'}); "
                     "end that one or choose another --dir"
                 ) from None
-            # The previous holder may have removed the file between our open and our lock.
+            # The previous holder may have removed the file between the open and the lock.
             with contextlib.suppress(FileNotFoundError):
                 if path.stat().st_ino == os.fstat(lock).st_ino:
                     os.ftruncate(lock, 0)
@@ -93,7 +93,7 @@ class LinkFolder:
                 (self.path / name).unlink()
 
     def close(self) -> None:
-        """Remove the links, unless their targets have changed, and the lock."""
+        """Remove the lock and the links whose targets have not changed."""
         for link in list(self._links):
             self.unlink(link.name)
         with contextlib.suppress(OSError):
@@ -103,19 +103,19 @@ class LinkFolder:
 
 
 class NoEmulator(SoftfingerError):
-    """No emulator runs in that folder, or it does not answer."""
+    """Raised if no emulator is running in the folder or it does not respond."""
 
 
 class ControlPort:
     """Control socket ``folder``/control; ``handle`` returns the reply to each message.
 
-    The owner of ``selector`` must call the data of each readable key.
+    The owner of ``selector`` must call the ``data`` of each readable key.
     """
 
     def __init__(
         self, folder: Path, handle: Callable[[str], str], selector: selectors.BaseSelector
     ) -> None:
-        """Bind the socket. Raises FolderError if another kind of file has its name."""
+        """Bind the socket. Raises FolderError if a file of another type has its name."""
         self._handle = handle
         self._selector = selector
         self._folder = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -123,7 +123,7 @@ class ControlPort:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with contextlib.suppress(FileNotFoundError):
-                # It was left by a killed emulator, since we hold the lock of the folder.
+                # This process holds the folder lock, so the socket was left by a killed emulator.
                 if not stat.S_ISSOCK(os.stat(_CONTROL, dir_fd=self._folder).st_mode):
                     raise FolderError(f"{folder / _CONTROL}: is in the way; move it elsewhere")
                 os.unlink(_CONTROL, dir_fd=self._folder)
@@ -177,7 +177,7 @@ def send_words(folder: Path, text: str) -> str:
     Raises
     ------
     NoEmulator
-        If no emulator runs there, or it does not answer.
+        If no emulator is running there or it does not respond.
     """
     try:
         with _directory(folder) as descriptor:
@@ -204,5 +204,5 @@ def _directory(folder: Path) -> Iterator[int]:
 
 
 def _address(folder: int) -> str:
-    """Return the address via the folder's descriptor, since a path is limited to 107 bytes."""
+    """Return the address via the folder's descriptor, because paths are limited to 107 bytes."""
     return f"/proc/self/fd/{folder}/{_CONTROL}"

@@ -1,8 +1,8 @@
-"""Plate on a stage that presses a tip of the emulated hand with given depth, tilt and speed.
+"""Simulate a plate on a stage that presses a tip with given depth, tilt and speed.
 
-With it, calibration can be tried without hardware: the sensor measures the plate instead of the
-object, and the true contact is known. The plate has no friction, and it does not load the joint of
-the finger, as if the finger were clamped.
+The plate allows calibration to be tried without hardware: the sensor measures the plate instead of
+the object, and the true contact is known. The plate is frictionless and does not load the finger
+joint, as if the finger were clamped.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
 
-_CLEARANCE = 1e-3  # m above the tip, where the plate tilts and waits
+_CLEARANCE = 1e-3  # m above the tip where the plate tilts and waits
 _LIFT_SPEED = 0.02  # m/s
-_FILL_TIME = 0.1  # s to inflate a bladder
-_PAUSE = 1.0  # s without contact between two presses
+_FILL_TIME = 0.1  # s, inflation time of a bladder
+_PAUSE = 1.0  # s without contact between presses
 
 _UNITS = {
     "depth": {"mm": 1e-3, "m": 1.0},
@@ -38,15 +38,15 @@ _NUMBER = re.compile(r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)(.*)")
 
 
 class PlateError(SoftfingerError, ValueError):
-    """The presses are invalid or impossible. The message states the expected form or range."""
+    """Raised for invalid or impossible presses. The message states the expected form or range."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlatePress:
-    """Press to ``d`` [m] at ``theta`` [rad], or a uniform ``pressure`` [Pa] on all cells.
+    """Press to ``d`` [m] at ``theta`` [rad], or with uniform ``pressure`` [Pa] on all cells.
 
-    ``force`` [N] is the resulting force on the base of the tip. The press is held for ``hold`` [s];
-    inf means until the next command.
+    ``force`` [N] is the resulting force on the tip base. The press is held for ``hold`` [s], or
+    until the next command if this is inf.
     """
 
     d: float
@@ -58,7 +58,7 @@ class PlatePress:
 
     @property
     def is_clear(self) -> bool:
-        """True if the plate is lifted off and stays there."""
+        """True if the plate lifts off and stays there."""
         return self.d <= 0.0 and self.pressure == 0.0 and self.hold == math.inf
 
     def __str__(self) -> str:
@@ -70,12 +70,12 @@ class PlatePress:
 
 
 def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, list[PlatePress]]:
-    """Parse presses, ``[tip=left] depth=4mm [tilt=10deg] …, …``, and return them by finger.
+    """Parse ``[tip=left] depth=4mm [tilt=10deg] …, …`` and return the presses by finger.
 
-    Each press has either depth (0 lifts off), force or pressure (uniform, like a bladder), and may
-    have tilt, speed, hold, and tip (left, right or both, the default). Without ``hold`` the last
-    press stays, and the others last one second. Forces are ``scale`` times those of ``table``.
-    Raises PlateError.
+    Each press has either a depth (0 lifts off), a force or a pressure (uniform, like a bladder).
+    Optional words are tilt, speed, hold, and tip (left, right or both; default both). If ``hold``
+    is not given, the last press stays and the others last one second. Forces are ``scale`` times
+    the ``table`` forces. Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
     each = [part.split() for part in text.split(",")]
@@ -116,7 +116,7 @@ def _value(name: str, text: str) -> float:
 
 def _press(values: dict[str, float], table: ContactTable, scale: float) -> PlatePress:
     d, theta, pressure = values.get("depth", 0.0), values["tilt"], values.get("pressure", 0.0)
-    # Limit the depth to the valid range of the contact law at that tilt.
+    # Limit the depth to the valid range of the contact law at this tilt.
     d_max = 0.75 * table.tip.radius * (1.0 - abs(math.sin(theta)))
     known = [(float(x), lookup(table.data, x, theta)) for x in np.linspace(0.0, d_max, 1001)]
     depths = [x for x, (*_, inside) in known if inside]
@@ -133,19 +133,19 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
 
 
 class Plate:
-    """Plate over one tip. Its path is piecewise linear in the hand's time [s]."""
+    """Plate above one tip. Its path is piecewise linear in the hand's time [s]."""
 
     def __init__(self) -> None:
         self._t = [0.0]
         self._d = [-_CLEARANCE]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
-        ]  # from each knot on: the press, and True if the plate is at rest
+        ]  # starting at each knot: the press, and True if the plate is stationary
         self._reported = -1
-        self.arrives = 0.0  # time at which the last press of the sequence is reached
+        self.arrives = 0.0  # arrival time of the sequence's last press
 
     def go(self, presses: Sequence[PlatePress], t: float) -> None:
-        """Lift off and perform ``presses`` from ``t`` on."""
+        """Lift off and perform ``presses``, starting at ``t``."""
         d, (press, _) = max(self(t).d, -_CLEARANCE), self._doing[self._leg(t)]
         self._t, self._d, self._doing, self._reported = [t], [d], [], -1
         self._add((d + _CLEARANCE) / _LIFT_SPEED, -_CLEARANCE, press)
@@ -169,7 +169,7 @@ class Plate:
         self._doing.append((press, rests))
 
     def __call__(self, t: float) -> StageTouch:
-        """Return the contact of the tip at ``t``."""
+        """Return the tip's contact at ``t``."""
         press, rests = self._doing[self._leg(t)]
         d = float(np.interp(t, self._t, self._d))
         if press is None:
@@ -177,7 +177,7 @@ class Plate:
         return StageTouch(d, press.theta, press.pressure if rests else 0.0)
 
     def reached(self, t: float) -> PlatePress | None:
-        """Return the press that has come to rest since the last call, or None."""
+        """Return the press that has been reached since the last call, or None."""
         leg = self._leg(t)
         press, rests = self._doing[leg]
         fresh = rests and leg != self._reported

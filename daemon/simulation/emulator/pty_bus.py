@@ -1,8 +1,8 @@
-"""Servo bus on a pseudo-terminal, served by an event loop of the caller.
+"""Provide a servo bus on a pseudo-terminal, served by the caller's event loop.
 
-It manages the terminal and the transmission times. A paced reply is sent at the time at which its
-last byte would arrive at the client's baud rate, including the return delay. Unpaced replies are
-sent at once. Transmission times are absolute, so interruptions of this process do not add to them.
+This module manages the terminal and the transmission times. A paced reply is sent when its last
+byte would arrive at the client's baud rate, including the return delay. Unpaced replies are sent
+immediately. Transmission times are absolute, so interruptions of this process do not accumulate.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control char
 _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _READ_SIZE = 4096
-_READS_PER_TURN = 4  # reads in one turn, so that a busy client leaves time for other tasks
-# s of silence that end a packet; more than 1.5 ms, since this process may be delayed.
+_READS_PER_TURN = 4  # maximum reads per turn, to leave time for other tasks
+# s of silence that end a packet. It is longer than 1.5 ms because this process may be delayed.
 _GAP_TIME = 0.02
-# s: typical latency of a pseudo-terminal from a write to the wake-up of the reader. A paced bus
-# subtracts it in both directions, since the simulated wire has its own transmission time.
+# s, typical pseudo-terminal latency from a write to the reader's wake-up. A paced bus subtracts it
+# in both directions, because the simulated wire has its own transmission time.
 PASSAGE_TIME = 15e-6
-# s by which a reading may be older than its reply. Servos also measure at intervals of their own.
-# This allows the physics to be computed outside the exchange.
+# s by which a reading may be older than its reply, because servos also measure at their own
+# intervals. This allows the physics to be computed outside the exchange.
 _LAG_TIME = 0.0005
 
 
 def open_pty() -> tuple[int, int, str]:
-    """Open a pty; return its non-blocking master, its raw slave for clients, and the slave's path.
+    """Open a pty; return its non-blocking master, the raw slave for clients, and the slave path.
 
-    The slave stays open here, so that clients may come and go without an error.
+    The slave stays open here, so that clients can connect and disconnect without an error.
     """
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -48,20 +48,20 @@ def open_pty() -> tuple[int, int, str]:
 class PtyServoBus:
     """Servo bus on a new pseudo-terminal at ``path``.
 
-    The caller's event loop waits until :meth:`fileno` is readable or the time of :meth:`next_event`
-    is reached, and then calls :meth:`service`.
+    The caller's event loop waits until :meth:`fileno` is readable or the :meth:`next_event` time is
+    reached, and then calls :meth:`service`.
 
     Parameters
     ----------
     bus
         Emulated servos.
     baud
-        With 0, servos answer at any rate and at once. Otherwise a servo ignores a client whose port
-        is set to a different rate than its own, and replies take transmission time.
+        If 0, servos reply immediately at any rate. Otherwise, a servo ignores clients whose port is
+        set to another rate, and replies take transmission time.
     spin
-        Duration [s] of busy waiting before a paced reply is due, since sleeps end late.
+        Duration [s] of busy waiting before a paced reply is due, because sleeps end late.
     clock
-        Clock of all times.
+        Clock for all times.
     """
 
     def __init__(
@@ -78,14 +78,14 @@ class PtyServoBus:
         self._baud = baud
         self._spin = spin
         self._clock = clock
-        self._free_at = -math.inf  # the wire is busy until then
+        self._free_at = -math.inf  # the wire is busy until this time
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
         self._arrives = -math.inf  # arrival time of the last reply
         self.plug()
 
     def fileno(self) -> int:
-        """Return the file descriptor to wait for; -1 while unplugged."""
+        """Return the file descriptor to wait for, or -1 while unplugged."""
         return self._master
 
     @property
@@ -94,11 +94,11 @@ class PtyServoBus:
         return self._master >= 0
 
     def plug(self) -> None:
-        """Create the terminal (again), at a new ``path``."""
+        """Create or recreate the terminal at a new ``path``."""
         self._master, self._slave, self.path = open_pty()
 
     def unplug(self) -> None:
-        """Remove the terminal, like an unplugged adapter; the servos continue."""
+        """Remove the terminal, as if an adapter were unplugged; the servos continue."""
         self._due.clear()
         self.bus.parser.reset()
         if self.plugged:
@@ -113,17 +113,17 @@ class PtyServoBus:
         return int(_TERMIOS2.unpack(raw)[-1])
 
     def next_event(self) -> float:
-        """Return the time [s] at which :meth:`service` is needed next without new bytes."""
+        """Return the time [s] of the next :meth:`service` call if no bytes arrive first."""
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 
     @property
     def answering_until(self) -> float:
-        """Arrival time [s] of the last reply, except replies delayed by a fault."""
+        """Arrival time [s] of the last reply, excluding replies delayed by a fault."""
         return self._arrives
 
     def driven(self) -> bool:
-        """Return True if torque is on and a process, like the daemon, has locked the port."""
+        """Return True if torque is on and a process such as the daemon has locked the port."""
         if not (self.plugged and any(servo.torque_on for servo in self.bus.servos)):
             return False
         try:
@@ -134,7 +134,7 @@ class PtyServoBus:
         return False
 
     def service(self, t: float) -> None:
-        """Read bytes at time t [s], advance the servos, and send the replies that are due."""
+        """Read bytes at time t [s], advance the servos, and send due replies."""
         if self.plugged:
             for _ in range(_READS_PER_TURN):
                 try:
@@ -142,7 +142,7 @@ class PtyServoBus:
                 except OSError:  # no data
                     break
                 if self._receive(data, t):
-                    break  # the client needs some time to read the reply
+                    break  # The client needs time to read the reply.
                 # The next request often arrives while a write is being processed.
                 t = max(t, self._clock())
         self.bus.advance(t)
@@ -185,12 +185,12 @@ class PtyServoBus:
                 return
             while now < due:
                 before, now = now, self._clock()
-                if now == before:  # the hand's time is held
+                if now == before:  # The hand's clock is held.
                     return
             self._write(heapq.heappop(self._due)[2])
 
     def _write(self, data: bytes) -> None:
-        # A client that never reads fills the terminal. A real wire would lose these bytes too.
+        # A client that never reads fills the terminal. A real wire would also lose these bytes.
         try:
             os.write(self._master, data)
         except BlockingIOError:

@@ -1,7 +1,7 @@
-"""Emulated tactile board: sends the frames of the simulated sensor on a pty.
+"""Emulate a tactile board that sends the frames of the simulated sensor on a pty.
 
-The encoders (`ENCODERS`) are pure functions from counts to the bytes of a board's framing. Faults
-of the board are applied here too.
+The encoders (`ENCODERS`) are pure functions that convert counts to a board's framing. Board faults
+are also applied here.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from softfinger.daemon.simulation.emulator.pty_bus import open_pty
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
-_TTY_SIZE_MAX = 2048  # unread bytes; a tty reports at most 4095, so the limit must be below
+_TTY_SIZE_MAX = 2048  # unread bytes; must be less than 4095, the maximum that a tty reports
 _DRAIN = 4096
-_RETRY_TIME = 5e-4  # s until the source is asked again for a late frame
-_NOISE_LENGTH = 64  # bytes, longest burst of noise between frames
+_RETRY_TIME = 5e-4  # s until the source is polled again for a late frame
+_NOISE_LENGTH = 64  # bytes, longest noise burst between frames
 
 
 class FrameSource(Protocol):
-    """Source of a board's frames: the simulated sensor."""
+    """Source of frames for a board, such as the simulated sensor."""
 
     def latest(self) -> Frame | None:
-        """Return the newest frame that is due, or None before the first."""
+        """Return the newest frame that is due, or None before the first frame."""
 
 
 class FrameWriter:
-    """Board's end of a pty. Frames are sent completely or not at all.
+    """The board's end of a pty. Frames are sent completely or not at all.
 
-    A pty buffers tens of kilobytes. Without a reader, frames are dropped early, so that the next
-    client does not receive old ones. A board with a closed port behaves the same way.
+    A pty buffers tens of kilobytes. If there is no reader, frames are dropped early so that the
+    next client does not receive old frames. A board with a closed port behaves the same way.
     """
 
     def __init__(self) -> None:
@@ -51,11 +51,11 @@ class FrameWriter:
         self._unread = array.array("i", [0])
 
     def fileno(self) -> int:
-        """Return a file descriptor that is readable when the client has written; see `drain`."""
+        """Return a file descriptor that is readable when the client has sent bytes; see `drain`."""
         return self._master
 
     def send(self, frame: bytes) -> bool:
-        """Write one frame, or drop it if the client has not read the earlier ones."""
+        """Write one frame, or drop it if the client has not read earlier frames."""
         if not self.flush() or self._unread_bytes() > min(len(frame), _TTY_SIZE_MAX):
             self.dropped += 1
             return False
@@ -71,14 +71,14 @@ class FrameWriter:
         return not self._remaining
 
     def drain(self) -> bytes:
-        """Return the bytes that the client has written."""
+        """Return the bytes sent by the client."""
         try:
             return os.read(self._master, _DRAIN)
         except BlockingIOError:
             return b""
 
     def close(self) -> None:
-        """Close both ends; a client then reads an error."""
+        """Close both ends; a client then gets a read error."""
         for end in (self._master, self._slave):
             with contextlib.suppress(OSError):
                 os.close(end)
@@ -89,19 +89,19 @@ class FrameWriter:
 
 
 class TactileBoard:
-    """Emulated board that sends each new frame of ``source`` on a pty, with optional faults.
+    """Emulated board that sends each new frame from ``source`` on a pty, with optional faults.
 
-    A board that waits for requests sends the first frame after a request. ``faults`` has the
-    probabilities of active faults by kind:
+    A board that waits for requests sends one frame per request. ``faults`` maps each active fault
+    to its probability:
 
-    - ``torn``: a sequence of bytes is missing in a frame.
-    - ``noisy``: random bytes precede a frame, and one byte of it is wrong.
+    - ``torn``: a sequence of bytes is missing from a frame.
+    - ``noisy``: random bytes precede a frame, and one of its bytes is wrong.
     - ``silent``: the board sends no frames.
     - ``frozen``: the board repeats its last frame.
-    - ``wrong-size``: the grid has half the rows and half the columns.
-    - ``saturated``, ``zero``: all cells read the largest count, or 0.
+    - ``wrong-size``: the grid has half as many rows and columns.
+    - ``saturated``, ``zero``: all cells read the maximum count, or 0.
 
-    The probabilities of the last five are ignored: they are always active.
+    The last five faults are always active, regardless of their probability.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class TactileBoard:
         delay: float,
         seed: int = 1,
     ) -> None:
-        """Create a board; frame k is due at k/rate + delay [Hz, s], ``seed`` is for faults."""
+        """Create a board; frame k is due at k/rate + delay [Hz, s], and ``seed`` is for faults."""
         self._source = source
         self._encoder = encoder
         self._requested = not encoder.request
@@ -122,25 +122,25 @@ class TactileBoard:
         self._random = np.random.default_rng(seed)
         self.plug()
         self._seq = -1
-        self._frozen: NDArray[np.uint16] | None = None  # image that a frozen board repeats
+        self._frozen: NDArray[np.uint16] | None = None  # image repeated by a frozen board
         self._due = -math.inf
         self.sent = 0  # frames
 
     def plug(self) -> None:
-        """Create the port (again), at a new ``path``."""
+        """Create or recreate the port at a new ``path``."""
         self._writer = FrameWriter()
         self.path = self._writer.path
         self.plugged = True
 
     def unplug(self) -> None:
-        """Remove the port, so that a client reads an error; the board continues."""
+        """Remove the port, so that a client gets a read error; the board continues."""
         if self.plugged:
             self._writer.close()
         self.plugged = False
 
     @property
     def dropped(self) -> int:
-        """Number of frames that were not read in time."""
+        """Number of frames not read in time."""
         return self._writer.dropped
 
     def fileno(self) -> int:
@@ -148,7 +148,7 @@ class TactileBoard:
         return self._writer.fileno()
 
     def hear(self) -> None:
-        """Read the bytes of the client, which may be a request for a frame."""
+        """Read the client's bytes, which may contain a frame request."""
         written = self._writer.drain() if self.plugged else b""
         if self._encoder.request and self._encoder.request in written:
             self._requested = True
@@ -161,7 +161,7 @@ class TactileBoard:
         """Send the newest frame if a new one is due at time t [s]."""
         if self.plugged:
             self._writer.flush()
-        # The time of a due frame may be rounded up or down.
+        # The due time may be rounded up or down.
         self._due = (math.floor((t - self._delay) * self._rate + 1e-6) + 1) / self._rate
         self._due += self._delay
         frame = self._source.latest()
@@ -205,29 +205,29 @@ class TactileBoard:
         return data
 
 
-# counts [rows, cols], number of the scan, time of the board [s] → bytes
+# counts [rows, cols], scan number, board time [s] → bytes
 Encode = Callable[[NDArray[np.uint16], int, float], bytes]
 
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """Framing of a board, and the byte that requests a frame; empty if it sends continuously."""
+    """Framing of a board and the byte that requests a frame (empty if it sends continuously)."""
 
     encode: Encode
     request: bytes = b""
 
 
 def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.0) -> bytes:
-    """Encode ``AA 55``, then one byte per cell, row-major; counts above 255 saturate."""
+    """Encode ``AA 55`` and one byte per cell, row-major; counts above 255 saturate."""
     return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
 
 
 def encode_glove(
     counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0, values: int = 32
 ) -> bytes:
-    """Encode number + 11, the high and low half of each count + 11, newline; counts saturate.
+    """Encode number + 11, high and low half of each count + 11, and newline; counts saturate.
 
-    A half has ``values`` values: 32, or 64 with a 12-bit converter.
+    Each half has ``values`` possible values: 32, or 64 with a 12-bit converter.
     """
     counts = np.minimum(counts, values * values - 1)
     halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)
@@ -235,7 +235,7 @@ def encode_glove(
 
 
 def encoder_for(backend: str, full_count: int) -> Encoder:
-    """Return the framing of a backend's board with the largest count ``full_count``."""
+    """Return the framing of a backend's board with the maximum count ``full_count``."""
     if backend == "glove" and 1023 < full_count <= 4095:
         return Encoder(partial(encode_glove, values=64), b"a")
     return ENCODERS[backend]

@@ -1,5 +1,5 @@
-"""Mechanics of the simulated hand: `simulated_hand` is the interface, `plant` the integrator.
+"""Mechanics of the simulated hand: `simulated_hand` is the interface; `plant` is the integrator.
 
-The other modules are kernels on the records of `plant_state`: contacts, forces, equations of motion
-and energy guard.
+The other modules contain kernels on the `plant_state` records: contacts, forces, equations of
+motion and energy guard.
 """

@@ -1,11 +1,11 @@
-"""Energy of the plant, and a guard that prevents integration steps from creating energy.
+"""Compute the plant energy, and prevent integration steps from creating energy.
 
-With smooth forces the integration error is small and decreases with the step. With non-smooth
-forces, for example when a light object hits the stiff rim of the backing plate, or with a far too
+With smooth forces, the integration error is small and decreases with the step size. With non-smooth
+forces (for example, when a light object hits the stiff rim of the backing plate) or an excessively
 long step, the energy could increase by more than the work of the motors and loads. The guard then
-removes the excess from the kinetic energy. If the kinetic energy is too small for that, the motion
-ends at rest at an earlier point of the step. Without losses the energy should be constant; there,
-the small drift of the method is allowed in smooth steps.
+removes the excess from the kinetic energy. If the kinetic energy is too small for this, the motion
+stops at an earlier point of the step. Without damping, the energy should be constant; in this case,
+the method's small drift is allowed in smooth steps.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Plant
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth steps without losses
-_ROUNDING = 3e-13  # relative rounding error of the energy; d is a difference of larger lengths
-HALVINGS = 12  # limit for a step that must be shortened
+LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth undamped steps
+_ROUNDING = 3e-13  # relative rounding error of energy; d is a small difference of lengths
+HALVINGS = 12  # maximum number of halvings of a step
 
 
 @inner_kernel
@@ -32,7 +32,7 @@ def kinetic_energy(plant: Plant) -> float:
 
 @inner_kernel
 def weight_energy(plant: Plant) -> float:
-    """Return the potential energy of the object's weight [J]."""
+    """Return the gravitational potential energy of the object [J]."""
     p, at = plant.parameters, plant.state.position
     energy: float = -p.mass * (p.gravity[0] * at[2] + p.gravity[1] * at[3])
     return energy
@@ -40,7 +40,7 @@ def weight_energy(plant: Plant) -> float:
 
 @inner_kernel
 def elastic_energy(plant: Plant) -> float:
-    """Return the elastic energy [J] of end stops, bristles and the contacts of the first stage."""
+    """Return the elastic energy [J] of end stops, bristles and first-stage contacts."""
     p, stage = plant.parameters, plant.stages[0]
     energy: float = plant.palm_energy
     for finger in range(2):
@@ -68,7 +68,7 @@ def is_on_rim(plant: Plant) -> bool:
 
 @inner_kernel
 def open_guard(plant: Plant) -> None:
-    """Allow the present energy, if it was changed since the last step."""
+    """Accept the current energy if it was changed since the last step."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy
@@ -77,7 +77,7 @@ def open_guard(plant: Plant) -> None:
 
 @inner_kernel
 def work_done(plant: Plant) -> float:
-    """Return an upper bound of the work of motors and loads since the earlier state [J]."""
+    """Return an upper bound for the work of motors and loads since the previous state [J]."""
     before, now = plant.last_state, plant.state
     work = 0.0
     for j in range(5):
@@ -92,16 +92,16 @@ def work_done(plant: Plant) -> float:
 
 @inner_kernel
 def guard_step(plant: Plant, was_on_rim: bool) -> int:
-    """Remove the excess energy of a step from its velocities.
+    """Remove a step's excess energy from its velocities.
 
-    After a change the caller must evaluate the state again and call :func:`allow_changed_energy`.
+    After a change, the caller must evaluate the state again and call :func:`allow_changed_energy`.
 
     Returns
     -------
     int
-        0 if nothing was changed, and 1 if the motion was slowed. 2 if the kinetic energy was too
-        small and the motion was stopped; the step must then be shortened with :func:`shorten` until
-        :func:`is_within_limit`.
+        0 if the step is unchanged, 1 if the motion was slowed, 2 if the kinetic energy was too
+        small and the motion was stopped. In the last case, the caller must shorten the step with
+        :func:`shorten` until :func:`is_within_limit` is true.
     """
     moving = kinetic_energy(plant)
     weight = weight_energy(plant)
@@ -126,7 +126,7 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
 
 @inner_kernel
 def shorten(plant: Plant, scale: float) -> None:
-    """Scale the changes of positions, shears and bristles in this step by ``scale``."""
+    """Scale this step's changes in positions, shears and bristles by ``scale``."""
     before, now = plant.last_state, plant.state
     for j in range(5):
         now.position[j] = before.position[j] + scale * (now.position[j] - before.position[j])
@@ -136,7 +136,7 @@ def shorten(plant: Plant, scale: float) -> None:
         now.bristles[j] = before.bristles[j] + scale * bent
         layers, earlier = plant.layers[j], plant.last_layers[j]
         mean = square = 0.0
-        for k in range(LAYERS):  # array expressions would load Numba's ufuncs at each start
+        for k in range(LAYERS):  # array expressions would load Numba's ufuncs on each startup
             layers[k] = earlier[k] + scale * (layers[k] - earlier[k])
             mean += layers[k] / LAYERS
         for k in range(LAYERS):
@@ -149,7 +149,7 @@ def shorten(plant: Plant, scale: float) -> None:
 
 @inner_kernel
 def is_within_limit(plant: Plant) -> bool:
-    """Return True if the energy of a state at rest is within the allowed energy."""
+    """Return True if the energy of a state at rest is within the limit."""
     energy = elastic_energy(plant) + weight_energy(plant)
     return bool(energy <= plant.energy_limit + work_done(plant))
 
@@ -164,7 +164,7 @@ def allow_changed_energy(plant: Plant) -> None:
 
 @inner_kernel
 def allow_relaxed_energy(plant: Plant) -> None:
-    """Update the energies after relaxation of the tips, which changes the allowed energy too."""
+    """Update the energies after tip relaxation, which also changes the allowed energy."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.energy_limit += energy - plant.energy
     plant.energy = energy

@@ -1,18 +1,19 @@
-"""Contacts that occur only in some scenes: the object on the palm, and both tips on each other.
+"""Evaluate contacts that occur only in some scenes: object on palm, and tip on tip.
 
-Their rows are added to the matrix of the step (`solver`).
+Their rows are added to the step matrix (`solver`).
 
 The palm is a plane along x. Each corner of the object, or the lowest point of a disc, has two
-springs. A corner below the palm is pushed up, with a viscous loss that never pulls. A second spring
-along the palm models Coulomb friction: it sticks, and slips when its force would exceed the
-friction coefficient times the normal force. So a resting object does not creep.
+springs. The first pushes a corner below the palm up, with viscous damping that never pulls. The
+second acts along the palm and models Coulomb friction: it sticks until its force would exceed the
+friction coefficient times the normal force, and then slips. A resting object therefore does not
+creep.
 
-Two equal hemispheres meet on the plane midway between their centres. Each is pressed as by a rigid
-plane, d = a − D/2 with the distance D of the centres. The energy is the sum for both tips,
-U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With different tilts the
-real interface would bulge towards the softer tip, so this energy is slightly too high (of second
-order in the difference of cos² θ). The plane sticks equally to both tips: each shears by half of
-the relative sliding of their surfaces, minus its tan θ ḋ.
+Two equal hemispheres meet on the plane midway between their centres. Each is compressed as if by a
+rigid plane, with d = a − D/2, where D is the distance between the centres. The energy is the sum
+for both tips, U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With
+different tilts, the real interface would bulge towards the softer tip, so this energy is slightly
+too high (second order in the difference of cos² θ). The plane sticks equally to both tips: each
+shears by half the relative sliding of their surfaces, minus its tan θ ḋ.
 """
 
 from __future__ import annotations
@@ -43,15 +44,15 @@ from softfinger.daemon.simulation.physics.tip import (
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
 
-STIFFNESS = 1e5  # N/m, of each corner, normal to the palm and along it
+STIFFNESS = 1e5  # N/m per corner, normal to the palm and along it
 LOSS = 1e-3  # s, damping over stiffness
-# Radii, half the distance of the tips beyond which their contact is not evaluated.
+# Tip radii; the tip-to-tip contact is evaluated if half the centre distance is below this.
 _DISTANCE_MAX = 1.5
 
 
 @inner_kernel
 def palm_is_far(plant: Plant, now: Motion) -> bool:
-    """Return True if no point of the object can reach the palm within a step."""
+    """Return True if the object cannot reach the palm within a step."""
     p = plant.parameters
     height = now.position[3] - p.palm - p.extent
     rate = now.velocity[3]
@@ -63,9 +64,9 @@ def palm_is_far(plant: Plant, now: Motion) -> bool:
 def touch_palm(
     plant: Plant, now: Motion, stage: Stage, nx: float, ny: float, is_first: bool
 ) -> None:
-    """Add the forces of the palm on the object; (nx, ny) is the object's n.
+    """Add the palm's forces on the object; (nx, ny) is the object's n.
 
-    The first stage also limits the shears by friction and sets the rows of the full matrix.
+    The first stage also limits the shears by friction and sets the rows in the full matrix.
     """
     if palm_is_far(plant, now):
         for corner in range(CORNERS):
@@ -131,7 +132,7 @@ def touch_palm(
 
 @inner_kernel
 def tips_are_far(plant: Plant) -> bool:
-    """Return True if the tips are so far apart that their contact is not evaluated."""
+    """Return True if the tips are too far apart for their contact to be evaluated."""
     left, right = plant.fingers[0], plant.fingers[1]
     apart_x = right.x - left.x
     apart_y = right.y - left.y
@@ -141,7 +142,7 @@ def tips_are_far(plant: Plant) -> bool:
 
 @inner_kernel
 def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
-    """Evaluate the contact of both tips and add its torques; return True if they may touch."""
+    """Evaluate the tip-to-tip contact and add its torques; return True if they may touch."""
     p = plant.parameters
     left, right = plant.fingers[0], plant.fingers[1]
     apart_x = right.x - left.x
@@ -151,7 +152,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
     d = p.radius - half
     ex = apart_x / apart
     ey = apart_y / apart
-    # v·e and v along e turned by a right angle.
+    # Components of v along e and along e rotated by 90°.
     m1 = left.x_q * ex + left.y_q * ey
     m2 = right.x_q * ex + right.y_q * ey
     t1 = left.y_q * ex - left.x_q * ey
@@ -166,7 +167,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
     for finger in range(2):
         tip = stage.on_tip[finger]
         side = 1.0 - 2.0 * finger
-        ux = plant.fingers[finger].cosine  # axis and e are mirrored for the right tip
+        ux = plant.fingers[finger].cosine  # The axis and e are mirrored for the right tip.
         uy = -side * plant.fingers[finger].sine
         tip.sine = ux * ey - uy * ex
         tip.cosine = ux * ex + uy * ey
@@ -211,9 +212,9 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
 
 @inner_kernel
 def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
-    """Add the torques of the tips on each other, if they are near or there is no object.
+    """Add the tip-to-tip torques if the tips are close or there is no object.
 
-    The first stage also sets their rows of the full matrix.
+    The first stage also sets their rows in the full matrix.
     """
     near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
     touching = near and tip_on_tip(plant, table, now, stage)

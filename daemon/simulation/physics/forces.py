@@ -1,6 +1,6 @@
-"""Forces of a state: motors, weight, loads, friction and end stops.
+"""Compute the forces for a state: motors, weight, loads, friction and end stops.
 
-The contacts are evaluated from here, but their forces are computed in `tip` and `extra_contacts`.
+The contacts are evaluated from here; their forces are computed in `tip` and `extra_contacts`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from softfinger.kinematics.contact.table_record import Table
 
 @inner_kernel
 def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
-    """Return the current [A] that a servo commands to its motor, within all limits.
+    """Return a servo's motor current command [A], within all limits.
 
     The limit due to the supply voltage, scaled by the PWM limit, decreases linearly from the stall
-    current at rest to 0 at no-load speed.
+    current at standstill to 0 at no-load speed.
     """
     p, goals = plant.parameters, plant.goals
     if goals.torque_on[joint] == 0:
@@ -52,10 +52,10 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 
 @inner_kernel
 def set_motor_slopes(plant: Plant, g: float) -> None:
-    """Set the slopes of the motor torques by angle and by velocity, divided by (τ + g).
+    """Set the motor torque derivatives (angle and velocity), divided by (τ + g).
 
-    They are 0 unless a step of ``g`` makes the motors stiff. They are upper bounds, since the
-    current may enter or leave its limits within the step.
+    The derivatives are 0 unless the motors are stiff for a step ``g``. They are upper bounds, since
+    the current may enter or leave its limits within the step.
     """
     p, goals = plant.parameters, plant.goals
     constant = p.torque_constant
@@ -76,7 +76,7 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def joint_stiffness(plant: Plant, joint: int) -> float:
-    """Return the stiffness of a joint's bristles and of an end stop within reach [N·m/rad]."""
+    """Return the stiffness of a joint's bristles and of any end stop within reach [N·m/rad]."""
     p = plant.parameters
     stiffness: float = plant.gears[joint].stiffness
     q = plant.state.position[joint]
@@ -88,7 +88,7 @@ def joint_stiffness(plant: Plant, joint: int) -> float:
 
 @inner_kernel
 def free_object(plant: Plant, now: Motion) -> None:
-    """Set the object's forces to weight, loads and table friction."""
+    """Set the object's forces: weight, loads and table friction."""
     p, load = plant.parameters, plant.goals.load
     vx = now.velocity[2]
     vy = now.velocity[3]
@@ -105,10 +105,10 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 @inner_kernel
 def friction_level(plant: Plant, finger: int, rate: float, current: float) -> float:
-    """Return the friction torque [N·m] at which a joint slips, for motor ``current`` and load.
+    """Return the friction torque [N·m] at which a joint slips for a motor ``current`` and load.
 
-    Base, Stribeck and load terms follow the model M4 of Rhoban, identified for such servos
-    (arXiv 2410.08650). The gear torque is |external − motor|.
+    The base, Stribeck and load terms follow Rhoban's model M4, which was identified for servos of
+    this type (arXiv 2410.08650). The gear torque is |external − motor|.
     """
     p = plant.parameters
     still = math.exp(-abs(rate) / p.stribeck_speed)
@@ -120,19 +120,20 @@ def friction_level(plant: Plant, finger: int, rate: float, current: float) -> fl
 
 @inner_kernel
 def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
-    """Return the torque [N·m] of a joint's bristles, and set their damping as the joint's drag.
+    """Return a joint's bristle torque [N·m] and set the bristle damping as the joint's drag.
 
-    Elastic bristles with the deflection z connect the gears and slip at the friction level f. This
-    is the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE Trans. Automatic
-    Control 47(5), 2002) with one deflection z_p = ``presliding`` for break-away and steady slip:
+    Elastic bristles with deflection z connect the gears and slip at the friction level f. This is
+    the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE Trans. Automatic
+    Control 47(5), 2002), with the same deflection z_p = ``presliding`` for break-away and steady
+    slip:
 
         torque = f z/z_p    ż = q̇ while |z| ≤ z_p
 
-    Below f the bristles are elastic, so a load below f, constant or oscillating, causes no drift.
-    The number of bristles is proportional to f. New bristles are not deflected; on average they are
-    added at half of the step. Removed bristles take their energy with them. So a change of f adds
-    no energy. The damping of a stuck joint is half of the critical one, and the sum of bristle
-    torque and damping is limited to f.
+    Below f, the bristles are elastic, so a constant or oscillating load below f does not cause
+    drift. The number of bristles is proportional to f. New bristles are undeflected and are added
+    halfway through the step on average. Removed bristles take their energy with them. A change in f
+    therefore never adds energy. The damping of a stuck joint is half the critical damping, and the
+    sum of bristle torque and damping is limited to f.
     """
     p, gears = plant.parameters, plant.gears[finger]
     rate = now.velocity[finger]
@@ -158,7 +159,7 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
 
 @inner_kernel
 def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
-    """Return the torque [N·m] of a joint's friction and end stops, and set its drag."""
+    """Return the torque [N·m] due to a joint's friction and end stops, and set its drag."""
     p = plant.parameters
     q = now.position[finger]
     torque = -bend_bristles(plant, finger, now, is_first)
@@ -172,11 +173,11 @@ def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
 
 @inner_kernel
 def place_finger(plant: Plant, finger: int, q: float) -> None:
-    """Set the position of a finger for the joint angle ``q``."""
+    """Set a finger's position for the joint angle ``q``."""
     p, its = plant.parameters, plant.fingers[finger]
     cosine = math.cos(q)
     sine = math.sin(q)
-    # Centre of the tip relative to its pivot: inwards and away from the palm (hand.geometry).
+    # Tip centre relative to its pivot, inwards and away from the palm (hand.geometry).
     inward = p.length * sine + p.offset * cosine
     ahead = p.length * cosine - p.offset * sine
     side = 1.0 - 2.0 * finger
@@ -190,9 +191,9 @@ def place_finger(plant: Plant, finger: int, q: float) -> None:
 
 @inner_kernel
 def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
-    """Evaluate the contacts of ``now`` into ``stage``, and all forces except those of the motors.
+    """Evaluate the contacts of ``now`` into ``stage`` and all forces except the motor forces.
 
-    The drag is viscous friction divided by velocity; the forces already include this friction.
+    The drag is viscous friction divided by velocity. The forces already include this friction.
     """
     p, forces = plant.parameters, plant.forces
     nx = math.cos(now.position[4])
@@ -225,13 +226,13 @@ def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_firs
 
 @inner_kernel
 def evaluate_state(plant: Plant, table: Table) -> None:
-    """Evaluate all contacts and forces of the present state."""
+    """Evaluate all contacts and forces for the current state."""
     evaluate_hand(plant, table, plant.state, plant.stages[0], True)
 
 
 @inner_kernel
 def script_x(plant: Plant, t: float) -> float:
-    """Return x [m] of a scripted object at ``t``: to the left, back, and to the right."""
+    """Return x [m] of a scripted object at ``t``; it moves left, back, and then right."""
     p = plant.parameters
     x: float = p.script_x
     left = p.script_travel[0]

@@ -1,6 +1,6 @@
-"""Contact geometry of the object's outline: nearest point, and rim of a tip's backing plate.
+"""Compute contact geometry of the object outline: nearest point, and backing plate rim.
 
-The object is rigid and convex: a polygon or a disc.
+The object is a rigid convex polygon or a disc.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import DISC, Parameters, TipContact
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-FACE = -1.0  # code of a plane face, in place of a radius of curvature
+FACE = -1.0  # code for a plane face instead of a radius of curvature
 _DISTANCE_MIN = 1e-12  # m
 
 
 @inner_kernel
 def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
-    """Return direction, distance and curvature of the outline nearest to a point (u, v).
+    """Return direction, distance and radius of curvature of the outline nearest to (u, v).
 
-    (u, v) is in the object's frame. From a point outside, the direction leads to the nearest point
-    of the outline. For a point inside, the distance to the nearest face is negative, and the
-    direction is the inward normal of that face. The last result is the radius of curvature there: 0
-    at a corner, ``FACE`` on a face, or the radius of a disc.
+    (u, v) is in the object's frame. For an outside point, the direction points to the nearest point
+    of the outline. For an inside point, the distance is the negative distance to the nearest face,
+    and the direction is the inward normal of that face. The last result is the local radius of
+    curvature: 0 at a corner, ``FACE`` on a face, or the radius of a disc.
     """
     if p.shape == DISC:
         away = max(math.sqrt(u * u + v * v), _DISTANCE_MIN)
@@ -36,7 +36,7 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
             best = out
             face = k
         if out > 0.0:
-            # Edges run counter-clockwise, so their direction is the normal turned by 90°.
+            # Edges run counter-clockwise, so their direction is the normal rotated by 90°.
             along = (v - edge.y) * edge.normal_x
             along -= (u - edge.x) * edge.normal_y
             if 0.0 <= along <= edge.length:
@@ -62,10 +62,10 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
 
 @inner_kernel
 def rim_on_plane(p: Parameters, tip: TipContact) -> float:
-    """Evaluate both ends of the rim on a plane; return the larger depth [m], negative for a gap.
+    """Evaluate both rim ends on a plane; return the larger depth [m], negative for a gap.
 
     The depths are d − a(1 ∓ sin θ). Each end has its own spring, so that energy and forces are
-    smooth even if the plate lies flat on the face. With contact, the rim's energy and its
+    smooth even if the plate lies flat on the face. If there is contact, the rim energy and its
     derivatives are set.
     """
     d = tip.d
@@ -84,10 +84,10 @@ def rim_on_plane(p: Parameters, tip: TipContact) -> float:
 
 @inner_kernel
 def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
-    """Evaluate the rim on a disc like :func:`rim_on_plane`, with one spring for the plate's chord.
+    """Evaluate the rim on a disc like :func:`rim_on_plane`, with one spring for the plate chord.
 
-    ``away`` is the distance between the centres of disc and tip. The depth is the disc's radius
-    minus the distance of its centre from the chord, which is smooth.
+    ``away`` is the distance between the disc and tip centres. The depth is the disc radius minus
+    the distance of the disc centre from the chord, which is smooth.
     """
     across = away * tip.sine
     up = away * tip.cosine

@@ -1,16 +1,16 @@
-"""Integration kernel of the simulated hand: two joints, two soft tips, one rigid object.
+"""Integrate the simulated hand: two joints, two soft tips and one rigid object.
 
-Coordinates (q1, q2, x, y, φ) with their velocities, the shear of each contact and the current of
-each motor are advanced by fixed sub-steps of a two-stage Rosenbrock method (ROS2, γ = 1 − 1/√2):
+Fixed sub-steps of a two-stage Rosenbrock method (ROS2, γ = 1 − 1/√2) advance the coordinates (q1,
+q2, x, y, φ) and their velocities, the shear of each contact and the current of each motor:
 
     (1 − γhA) k1 = f(y)    (1 − γhA) k2 = f(y + h k1) − 2 k1    y ← y + h (3 k1 + k2)/2
 
-The method is of second order for any matrix A, and L-stable if A is the Jacobian. Here A contains
-the stiff parts: normal, rotational and shear stiffness of the contacts with their losses, end
-stops, bristles of the gears, table friction by its secant, motor lag and servo loops. Only the five
-accelerations are coupled, so a step costs two evaluations of the tips and one 5 × 5 factorisation.
-Coulomb slip is implemented by limiting shears and bristles at the start of each step. Finally the
-energy guard checks the step.
+The method is of second order for any matrix A, and L-stable if A is the Jacobian. Here, A contains
+the stiff parts: normal, rotational and shear stiffness of the contacts with their damping, end
+stops, gear bristles, the secant of table friction, motor lag and servo loops. Only the five
+accelerations are coupled, so a step costs two tip evaluations and one 5 × 5 factorisation. Coulomb
+slip is implemented by limiting shears and bristles at the start of each step. Finally, the energy
+guard checks the step.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ _GAMMA = 1.0 - math.sqrt(0.5)
 
 @inner_kernel
 def bounded(value: float, limit: float) -> float:
-    """Return ``value`` clipped to ± ``limit``."""
+    """Clip ``value`` to ± ``limit``."""
     return min(max(value, -limit), limit)
 
 
 @inner_kernel
 def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
-    """Add the motors to the load, and set the currents of ``k`` except the effect of the solution.
+    """Add the motors to the load; set the currents of ``k``, excluding the effect of the solution.
 
-    A current follows its reference with a lag: i' = (r(q, ω) − i)/τ. Its k decreases by
-    (r_q g + r_ω) g/(τ + g) per unit of acceleration; the matrix contains this term.
+    A current lags behind its reference: i' = (r(q, ω) − i)/τ. Its k decreases by (r_q g + r_ω) g/(τ
+    + g) per unit of acceleration; the matrix contains this term.
     """
     p = plant.parameters
     lag = p.electric_time
@@ -89,7 +89,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
 
 @inner_kernel
 def finish_stage(plant: Plant, k: Motion, g: float) -> None:
-    """Solve for the velocities of ``k`` and add their effect to its other rates."""
+    """Solve for the velocities in ``k`` and add their effect to its other rates."""
     solve(plant, k)
     if plant.has_extra_rows:
         add_extra_shears(plant, k, g)
@@ -125,7 +125,7 @@ def first_stage(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def begin_second_stage(plant: Plant, h: float) -> None:
-    """Move to the second stage: y + h k1."""
+    """Set the state of the second stage, y + h k1."""
     state, k, later = plant.state, plant.first, plant.stage_state
     for j in range(5):
         later.position[j] = state.position[j] + h * k.position[j]
@@ -140,7 +140,7 @@ def begin_second_stage(plant: Plant, h: float) -> None:
 
 @inner_kernel
 def second_stage(plant: Plant, g: float) -> None:
-    """Compute k2 of the step from the forces of the second stage."""
+    """Compute k2 of the step from the second-stage forces."""
     p, stage, first, k = plant.parameters, plant.stages[1], plant.first, plant.second
     for j in range(5):
         inertia = p.joint_inertia if j < 2 else p.mass if j < 4 else p.inertia
@@ -161,7 +161,7 @@ def second_stage(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def advance_state(plant: Plant, h: float) -> None:
-    """Advance the state by y + h (3 k1 + k2)/2, except held parts."""
+    """Advance the state to y + h (3 k1 + k2)/2, except for held parts."""
     p, state, first, second = plant.parameters, plant.state, plant.first, plant.second
     for j in range(2):
         state.shear[j] += h * (1.5 * first.shear[j] + 0.5 * second.shear[j])
@@ -174,8 +174,8 @@ def advance_state(plant: Plant, h: float) -> None:
             continue
         displacement = h * (1.5 * first.position[j] + 0.5 * second.position[j])
         change = h * (1.5 * first.velocity[j] + 0.5 * second.velocity[j])
-        # A step that would move a tip by more than a quarter of its radius is far too long. Limit
-        # the displacement, which only loses energy.
+        # A step that would move a tip by more than a quarter of its radius is too long. Limiting
+        # the displacement can only remove energy.
         limit = 0.25 * p.radius
         if j < 2:
             limit /= p.length + abs(p.offset)
@@ -190,7 +190,7 @@ def advance_state(plant: Plant, h: float) -> None:
 
 @inner_kernel
 def limit_energy(plant: Plant, table: Table) -> None:
-    """Shorten a step until its energy is allowed, or undo it after HALVINGS attempts."""
+    """Shorten a step until its energy is within the limit, or undo it after HALVINGS attempts."""
     for _ in range(HALVINGS):
         shorten(plant, 0.5)
         evaluate_state(plant, table)
@@ -202,7 +202,7 @@ def limit_energy(plant: Plant, table: Table) -> None:
 
 @inner_kernel
 def store_bristles(plant: Plant) -> None:
-    """Limit the bristle deflections, and store the friction level for the next step."""
+    """Limit the bristle deflections and store the friction level for the next step."""
     for joint in range(2):
         gears = plant.gears[joint]
         gears.level = gears.friction
@@ -215,7 +215,7 @@ def store_bristles(plant: Plant) -> None:
 
 @inner_kernel
 def senses_other_tip(plant: Plant, finger: int) -> bool:
-    """Return True if a tip's sensed contact is the other tip, since it presses more."""
+    """Return True if a tip senses the other tip because that contact is stronger."""
     if not plant.tips_may_touch:
         return False
     stage = plant.stages[0]
@@ -225,7 +225,7 @@ def senses_other_tip(plant: Plant, finger: int) -> bool:
 
 @inner_kernel
 def sensed_contact_of(plant: Plant, finger: int) -> TipContact:
-    """Return the sensed contact of a tip."""
+    """Return a tip's sensed contact."""
     if senses_other_tip(plant, finger):
         return plant.stages[0].on_tip[finger]
     return plant.stages[0].on_object[finger]
@@ -233,7 +233,7 @@ def sensed_contact_of(plant: Plant, finger: int) -> TipContact:
 
 @inner_kernel
 def take_sample(plant: Plant, ring: Records[Sample]) -> None:
-    """Write the due sample into ``ring``, interpolated between the last contact and the present."""
+    """Write the due sample to ``ring``, interpolated between the last and the current contact."""
     p = plant.parameters
     due = plant.sample_count * p.sample_period
     back = min((plant.step_count * p.step - due) / p.step, 1.0)
@@ -258,7 +258,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
 
 @inner_kernel
 def settle(plant: Plant, ring: Records[Sample]) -> None:
-    """Take the samples that are due, then store the present contacts of the tips."""
+    """Take all due samples, then store the current tip contacts."""
     p, stage = plant.parameters, plant.stages[0]
     while plant.sample_count * p.sample_period <= plant.step_count * p.step:
         take_sample(plant, ring)
@@ -275,13 +275,13 @@ def settle(plant: Plant, ring: Records[Sample]) -> None:
 
 @kernel
 def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], count: int) -> None:
-    """Advance the plant by ``count`` sub-steps and update the contacts of the tips.
+    """Advance the plant by ``count`` sub-steps and update the tip contacts.
 
-    ``tables`` is the data of the contact table. Due samples are written to ``ring``.
+    ``tables`` contains the contact table data. Due samples are written to ``ring``.
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
-    # Pass a record from here on, since array arguments cost a reference count at each call.
+    # Use a record from here on, because array arguments cost a reference count per call.
     data = tables[0]
     h = p.step
     g = _GAMMA * h
@@ -309,7 +309,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             state.position[2] = script_x(plant, plant.step_count * h)
         if relaxing:
             relax_shears(plant)
-        # Slip: this limits the shears, and `settle` stores them.
+        # Slip: this limits the shears, which `settle` then stores.
         evaluate_state(plant, data)
         if scripted:
             open_guard(plant)
@@ -318,7 +318,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             if changed == 2:
                 limit_energy(plant, data)
             elif changed == 1:
-                # New bristles of the slowed gears are not deflected either.
+                # New bristles of the slowed gears are also undeflected.
                 store_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:
@@ -326,8 +326,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
         store_bristles(plant)
         settle(plant, ring)
         if p.tips_relax:
-            # The relaxation factor is constant within a step; the energy change between steps
-            # comes from the tip itself, so the guard allows it.
+            # The relaxation factor is constant within a step. The energy change between steps comes
+            # from the tip itself, so the guard accepts it.
             relax_tips(plant)
             evaluate_state(plant, data)
             allow_relaxed_energy(plant)

@@ -1,6 +1,6 @@
-"""Record of the plant: state, parameters, goals and work data, shared by all kernels.
+"""Define the plant record shared by all kernels: state, parameters, goals and work data.
 
-Pairs are (left, right). Coordinates are the joint angles q1, q2 and the object's x, y, φ.
+Pairs are (left, right). Coordinates are the joint angles q1, q2 and the object pose x, y, φ.
 """
 
 from __future__ import annotations
@@ -16,46 +16,46 @@ FloatArray = NDArray[np.float64]
 
 FloatTriple = Annotated[FloatArray, 3]
 FloatFive = Annotated[FloatArray, 5]
-Flags = Annotated[NDArray[np.int64], 2]  # 0 or 1 for each finger
+Flags = Annotated[NDArray[np.int64], 2]  # 0 or 1 per finger
 
-# Shapes of the object.
+# Object shapes.
 NO_OBJECT = 0
 POLYGON = 1  # convex
 DISC = 2
 
-# Rows of a tip's contact.
+# Rows of a tip contact.
 ALONG_D = 0
 ALONG_THETA = 1
 ALONG_SHEAR = 2
 
-LAYERS = 8  # layers of a footprint, from its edge inwards, that slip one after the other
-CORNERS = 8  # largest number of corners of an object
-SHEARS = CORNERS + 2  # shear of the palm at each corner, then of each tip on the other
-PALM_ROWS = 2 * CORNERS  # height and slide of each corner
-EXTRA_ROWS = PALM_ROWS + 6  # additionally d, θ and d_t of each tip on the other
+LAYERS = 8  # footprint layers that slip successively from the edge inwards
+CORNERS = 8  # maximum number of object corners
+SHEARS = CORNERS + 2  # palm shear at each corner, then tip-on-tip shear of each tip
+PALM_ROWS = 2 * CORNERS  # height and slip of each corner
+EXTRA_ROWS = PALM_ROWS + 6  # plus d, θ and d_t of each tip on the other
 
 Shears = Annotated[FloatArray, SHEARS]
 
 
 class Motion(Record):
-    """Coordinates, velocities, shears and currents of a state, or their rates of change.
+    """Coordinates, velocities, shears and currents, or their rates of change.
 
-    The rates of the bristles are those of the joints.
+    The bristles' rates of change are the joint velocities.
     """
 
     position: FloatFive  # [rad], [rad], [m], [m], [rad]
     velocity: FloatFive
-    shear: Pair  # d_t of the tips on the object [m]
+    shear: Pair  # d_t of tips on object [m]
     extra_shear: Shears  # [m]
-    bristles: Pair  # deflection of the gear bristles [rad]
+    bristles: Pair  # gear bristle deflection [rad]
     current: Pair  # [A]
 
 
 class Sample(Record):
-    """Contacts of the tips at the time of a frame; fields as in :class:`TipContact`."""
+    """Tip contacts at a frame's sample time; fields as in :class:`TipContact`."""
 
-    number: int  # -1: none
-    t: float  # since the start [s]
+    number: int  # -1 if empty
+    t: float  # time since the start [s]
     d: Pair
     theta: Pair
     gain: Pair
@@ -65,7 +65,7 @@ class Sample(Record):
 
 
 class Edge(Record):
-    """Edge of the object's outline, in the object's frame."""
+    """Edge of the object outline in the object frame."""
 
     x: float  # start point [m]
     y: float
@@ -79,51 +79,51 @@ class Parameters(Record):
 
     step: float  # sub-step [s]
     sample_period: float  # [s]
-    modulus: float  # of the real tip at zero strain [Pa]
-    radius: float  # of the tips [m]
-    deepest: float  # largest d for which their law is valid [m]
-    scale: float  # ratio of the real modulus to that of the table
+    modulus: float  # modulus of the real tip at zero strain [Pa]
+    radius: float  # tip radius [m]
+    deepest: float  # maximum d for which the contact law is valid [m]
+    scale: float  # ratio of the real modulus to the table modulus
     friction: float
     loss: float  # damping over stiffness [s]
-    shear_stiffness: float  # relative to the springs
-    shear_coupling: float  # of d_t with d and θ: 1 for springs, 0 for bristles
-    creep: float  # fraction of a stuck shear that relaxes in a sub-step
-    micro_slip: bool  # the edge of the footprint slips before the rest
+    shear_stiffness: float  # shear stiffness relative to the spring model
+    shear_coupling: float  # coupling of d_t with d and θ: 1 for springs, 0 for bristles
+    creep: float  # fraction of a stuck shear that relaxes per sub-step
+    micro_slip: bool  # the footprint edge slips first
     tips_relax: bool
-    relaxation: FloatTriple  # stiffness of each Prony term relative to the long-term stiffness
-    relaxation_step: FloatTriple  # fraction of each term that relaxes in a sub-step
+    relaxation: FloatTriple  # Prony term stiffnesses relative to the long-term stiffness
+    relaxation_step: FloatTriple  # fraction of each term that relaxes per sub-step
     rim_stiffness: float  # [N/m]
     tolerance: float  # relative energy gain allowed in smooth steps
-    half_separation: float  # of the pivots [m]
-    length: float  # of a finger [m]
-    offset: float  # of the tip from the finger's axis [m]
-    finger_present: Flags  # the tip takes part
-    shape: int  # of the object
+    half_separation: float  # half the pivot separation [m]
+    length: float  # finger length [m]
+    offset: float  # tip offset from the finger axis [m]
+    finger_present: Flags  # the finger is in the scene
+    shape: int  # object shape
     half_width: float  # [m]
     half_height: float  # [m]
     roundness: float  # radius of a disc [m]
-    factor: float  # stiffness of a tip on the object relative to a plane
-    extent: float  # distance of the farthest point from the object's centre [m]
-    corners: int  # number of corners
+    factor: float  # tip stiffness on the object relative to a plane
+    extent: float  # maximum distance of an outline point from the object centre [m]
+    corners: int  # used entries of the outline
     outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
-    mass: float  # of the object [kg]
-    inertia: float  # of the object [kg·m²]
+    mass: float  # object mass [kg]
+    inertia: float  # object moment of inertia [kg·m²]
     gravity: Pair  # x, y [m/s²]
-    table_force: float  # Coulomb friction of the table on the object [N]
-    table_torque: float  # Coulomb friction torque of the table on the object [N·m]
-    table_speed: float  # below which table friction is viscous [m/s]
-    table_spin: float  # likewise for rotation [rad/s]
+    table_force: float  # Coulomb friction between table and object [N]
+    table_torque: float  # Coulomb friction torque between table and object [N·m]
+    table_speed: float  # speed below which table friction is viscous [m/s]
+    table_spin: float  # angular speed below which it is viscous [rad/s]
     palm: float  # y of the palm [m]
     palm_friction: float
     joint_inertia: float  # [kg·m²]
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
-    stribeck: float  # additional friction at rest [N·m]
-    load_friction: Pair  # friction per gear torque, and additional part at rest
-    stribeck_speed: float  # at which the additional friction has decreased to 1/e [rad/s]
-    presliding: float  # deflection at which the bristles slip [rad]
+    stribeck: float  # additional friction at standstill [N·m]
+    load_friction: Pair  # friction per gear torque, and additional part at standstill
+    stribeck_speed: float  # speed at which additional friction decreases to 1/e [rad/s]
+    presliding: float  # slip deflection of the bristles [rad]
     torque_constant: float  # [N·m/A]
-    electric_time: float  # lag of the current [s]
+    electric_time: float  # current lag [s]
     current_limit: float  # [A]
     stall_current: float  # [A]
     no_load_speed: float  # [rad/s]
@@ -134,99 +134,99 @@ class Parameters(Record):
     stop_stiffness: float  # [N·m/rad]
     joints_held: bool
     object_held: bool
-    script_speed: float  # of a held object that moves back and forth; 0: at rest [m/s]
-    script_travel: Pair  # distance to the left and to the right [m]
+    script_speed: float  # speed of a held object moving back and forth [m/s]
+    script_travel: Pair  # travel to the left and to the right [m]
     script_x: float  # start position [m]
 
 
 class Goals(Record):
-    """Commands to the servos and loads on the object."""
+    """Servo commands and object loads."""
 
     mode: Annotated[NDArray[np.int64], 2]
     torque_on: Flags
     q: Pair  # [rad]
     current: Pair  # [A]
-    stiffness: Pair  # of the servos' position loops, relative to the factory setting
-    damping: Pair  # in excess of the factory setting, relative to its stiffness [s]
-    duty: Pair  # limit of the motor voltage as a fraction of the supply
+    stiffness: Pair  # position-loop stiffness relative to the factory setting
+    damping: Pair  # damping beyond the factory setting, relative to its stiffness [s]
+    duty: Pair  # motor voltage limit as a fraction of the supply voltage
     load: FloatTriple  # external force x, y [N] and torque [N·m] on the object
 
 
 class Finger(Record):
-    """Position of a finger: centre of its tip in the hand's frame."""
+    """Finger position: tip centre in the hand frame."""
 
-    cosine: float  # of the joint angle
+    cosine: float  # cosine of the joint angle
     sine: float
     x: float  # [m]
     y: float
-    x_q: float  # derivatives by the joint angle [m/rad]
+    x_q: float  # derivative with respect to the joint angle [m/rad]
     y_q: float
 
 
 class Gears(Record):
-    """Friction of a joint's gears, modelled by elastic bristles between the teeth."""
+    """Gear friction of a joint, modelled by elastic bristles between the teeth."""
 
-    deflection: float  # of the bristles at the begin of the step [rad]
-    level: float  # friction level at the begin of the step [N·m]
-    limited_deflection: float  # last evaluated deflection, within its limits [rad]
+    deflection: float  # bristle deflection at the start of the step [rad]
+    level: float  # friction level at the start of the step [N·m]
+    limited_deflection: float  # last evaluated deflection after limiting [rad]
     friction: float  # last evaluated friction level [N·m]
-    stiffness: float  # of the bristles, in the matrix of the step [N·m/rad]
+    stiffness: float  # bristle stiffness in the step matrix [N·m/rad]
 
 
 class TipContact(Record):
-    """Contact of one tip with the object or with the other tip.
+    """Contact of one tip with the object or the other tip.
 
-    Rows are d, θ, d_t; columns are q, x, y, φ, or q1, q2 for tip on tip.
+    Rows are d, θ, d_t. Columns are q, x, y, φ, or q1, q2 for a tip-to-tip contact.
     """
 
     d: float  # normal displacement, negative for a gap [m]
     theta: float  # tilt of the object relative to the tip [rad]
-    sine: float  # of θ
+    sine: float  # sin θ
     cosine: float
-    tangent: float  # tan θ; 0 for bristles and beyond the soft hemisphere
-    gain: float  # force relative to a plane: w(θ) and the curvature of the face
-    curvature: float  # of the touched surface [1/m]
-    travel: float  # possible increase of d in this step [m]
+    tangent: float  # tan θ, 0 for bristles and beyond the soft hemisphere
+    gain: float  # force relative to a plane, due to w(θ) and face curvature
+    curvature: float  # curvature of the touched surface [1/m]
+    travel: float  # possible increase in d during this step [m]
     rate_d: float  # [m/s]
     rate_theta: float  # [rad/s]
-    slip_rate: float  # velocity of the touched surface minus that of the tip, along t [m/s]
-    shear: float  # d_t within its limits [m]
-    shear_variance: float  # variance of the shears of its layers [m²]
-    shear_rate: float  # rate of d_t without slip [m/s]
-    force: float  # total force on the base of the tip, the sum of a pressure grid [N]
-    energy: float  # elastic [J]
+    slip_rate: float  # tangential velocity of the surface relative to the tip [m/s]
+    shear: float  # d_t after limiting [m]
+    shear_variance: float  # shear variance of the layers [m²]
+    shear_rate: float  # rate of d_t if there is no slip [m/s]
+    force: float  # total force on the tip base, the sum over a pressure grid [N]
+    energy: float  # elastic energy [J]
     normal: float  # N [N]
     tangential: float  # T [N]
-    rim: float  # depth of the rim in the object, 0 without contact [m]
-    rim_energy: float  # of the rim alone, set if ``rim`` is above 0 [J]
-    rim_d: float  # its derivatives by d [N] and by θ [N·m]
+    rim: float  # rim penetration depth, 0 without contact [m]
+    rim_energy: float  # rim energy, set if ``rim`` is above 0 [J]
+    rim_d: float  # derivatives of rim energy: d [N], θ [N·m]
     rim_theta: float
-    rows: Annotated[FloatArray, 3, 4]  # ∂d, ∂θ and the increments of d_t by the coordinates
-    stiffness: FloatTriple  # along each row
+    rows: Annotated[FloatArray, 3, 4]  # derivatives of d, θ and d_t with respect to the coordinates
+    stiffness: FloatTriple  # stiffness along each row
     damping: FloatTriple
-    along: FloatTriple  # forces along the rows, with losses
+    along: FloatTriple  # forces along the rows, including damping
     forces: Annotated[FloatArray, 4]  # generalised forces on the coordinates
 
 
 class Stage(Record):
-    """All contacts in one of the two evaluations of a step."""
+    """All contacts for one of a step's two evaluations."""
 
     on_object: Annotated[Records[TipContact], 2]
     on_tip: Annotated[Records[TipContact], 2]
-    extra_rate: Shears  # rates of the extra shears without slip [m/s]
+    extra_rate: Shears  # extra shear rates if there is no slip [m/s]
 
 
 class ExtraRow(Record):
-    """Row over the coordinates for a contact that occurs only in some scenes."""
+    """Row over all coordinates for a contact that occurs only in some scenes."""
 
     row: FloatFive
     stiffness: float
     damping: float
-    shear: int  # 1 + index of its extra shear, 0 for none
+    shear: int  # 1 + index of its extra shear, 0 if none
 
 
 class Factors(Record):
-    """Matrix of the step over all coordinates, factorised as L D Lᵀ."""
+    """Step matrix over all coordinates, factorised as L D Lᵀ."""
 
     inverse: FloatFive  # inverse pivots
     lower: Annotated[FloatArray, 5, 5]
@@ -238,14 +238,14 @@ class Plant(Record):
     parameters: Parameters
     goals: Goals
     state: Motion
-    # Present contact of each tip, the stronger of two
+    # Current contact of each tip, the stronger one if there are two.
     sensed_contact: Annotated[Records[TipContact], 2]
-    on_other_tip: Flags  # this contact is with the other tip
-    step_count: int  # sub-steps done
+    on_other_tip: Flags  # 1 if this contact is with the other tip
+    step_count: int  # number of completed sub-steps
     sample_count: int  # number of samples taken
     energy: float  # kinetic, elastic and gravitational [J]
-    energy_limit: float  # upper limit of the energy, from the work done on the hand [J]
-    limited_step_count: int  # sub-steps whose energy was reduced to this limit
+    energy_limit: float  # energy limit, from the work done on the hand [J]
+    limited_step_count: int  # number of sub-steps limited by energy
     last_state: Motion  # state before the step
     stage_state: Motion  # state of the second stage
     first: Motion  # k1 of the step
@@ -253,19 +253,19 @@ class Plant(Record):
     stages: Annotated[Records[Stage], 2]
     fingers: Annotated[Records[Finger], 2]
     gears: Annotated[Records[Gears], 2]
-    forces: FloatFive  # on the coordinates, except those of the motors
-    drag: FloatFive  # friction over velocity
-    external: Pair  # last evaluated torque of the contacts on each joint [N·m]
-    load: FloatFive  # right-hand side of the equations of the step
-    motor_by_q: Pair  # slopes of the motor torques, for the matrix
+    forces: FloatFive  # generalised forces, excluding the motors
+    drag: FloatFive  # ratio of friction to velocity
+    external: Pair  # last evaluated contact torque on each joint [N·m]
+    load: FloatFive  # right-hand side of the step equations
+    motor_by_q: Pair  # motor torque derivatives for the matrix
     motor_by_rate: Pair
-    layers: Annotated[FloatArray, 2, LAYERS]  # shear of each tip's layers [m]
-    last_layers: Annotated[FloatArray, 2, LAYERS]  # before the step
-    shear_variance: Pair  # their variance [m²]
-    relaxation_state: Annotated[FloatArray, 2, 3]  # of each tip and Prony term [N]
-    relaxation_factor: Pair  # force of each tip relative to the long-term force
+    layers: Annotated[FloatArray, 2, LAYERS]  # layer shears of each tip [m]
+    last_layers: Annotated[FloatArray, 2, LAYERS]  # layer shears before the step [m]
+    shear_variance: Pair  # variance of the layer shears [m²]
+    relaxation_state: Annotated[FloatArray, 2, 3]  # state of each tip's Prony terms [N]
+    relaxation_factor: Pair  # tip force relative to its long-term force
     palm_energy: float  # [J]
-    tips_may_touch: bool  # the contact of both tips was evaluated
-    has_extra_rows: bool  # an extra row may be active in this step
+    tips_may_touch: bool  # the tip-to-tip contact was evaluated
+    has_extra_rows: bool  # extra rows may be active in this step
     extra: Annotated[Records[ExtraRow], EXTRA_ROWS]
     factors: Factors

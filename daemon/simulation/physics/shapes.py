@@ -1,4 +1,4 @@
-"""Shapes of the simulated object: outline, inertia, and radius of the table friction."""
+"""Define shapes of the simulated object: outline, inertia and table friction radius."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shape:
-    """Outline of an object, with its centre of mass at the origin. Lengths are in m."""
+    """Outline of an object with its centre of mass at the origin. Lengths are in m."""
 
-    kind: int  # constant of plant_state
-    corners: FloatArray  # [n, 2], counter-clockwise; of a disc: its circumscribed square
-    roundness: float  # radius of a disc, else 0
+    kind: int  # shape constant from plant_state
+    corners: FloatArray  # [n, 2], counter-clockwise; for a disc, its circumscribed square
+    roundness: float  # radius of a disc, otherwise 0
     gyration: float  # radius of gyration
-    mean_radius: float  # mean distance of its points from the centre, for spinning friction
+    mean_radius: float  # mean distance of all points from the centre, for spin friction
 
     @property
     def extent(self) -> float:
-        """Largest distance of a point from the centre."""
+        """Maximum distance of a point from the centre."""
         return self.roundness or float(np.hypot(*self.corners.T).max())
 
     @property
     def half_width(self) -> float:
-        """Half the width at the height of the centre."""
+        """Half the width at the centre height."""
         x, y = np.vstack((self.corners, self.corners[:1])).T
         across = [
             x[k] - y[k] * (x[k + 1] - x[k]) / (y[k + 1] - y[k])
@@ -50,7 +50,7 @@ class Shape:
         return float(0.5 * (max(across) - min(across)))
 
     def edges(self) -> FloatArray:
-        """Return the edges, float64 [n, 5]: start x, y, outward normal x, y, length."""
+        """Return the edges as float64 [n, 5]: start x, y, outward normal x, y, length."""
         edge = np.roll(self.corners, -1, axis=0) - self.corners
         length = np.hypot(*edge.T)
         normal = np.stack((edge[:, 1], -edge[:, 0]), axis=1) / length[:, None]
@@ -58,7 +58,7 @@ class Shape:
 
 
 def shape_of(settings: Settings) -> Shape:
-    """Create the object of the settings with the function registered in `daemon.backends`."""
+    """Create the object in the settings with the function registered in `daemon.backends`."""
     simulation = settings.simulation
     found = backend("shapes", simulation.object_shape)
     shape: Shape = found.load()(simulation, *found.options(settings.plugins.tables))
@@ -66,10 +66,10 @@ def shape_of(settings: Settings) -> Shape:
 
 
 def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
-    """Return the shape of a convex polygon with 3 to 8 ``corners`` [n, 2] m, counter-clockwise.
+    """Create a convex polygon with 3 to 8 ``corners`` [n, 2] in m, counter-clockwise.
 
-    The corners may have any origin, since the shape is centred at its centre of mass. The integrals
-    over the shape are closed forms of the triangles between the centre and each edge. Raises
+    The corners may have any origin; the shape is then centred on its centre of mass. The area
+    integrals are closed-form sums over the triangles between the centre and each edge. Raises
     ValueError for other outlines.
     """
     points = np.array(corners, dtype=np.float64)
@@ -87,7 +87,7 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
         3.0 * areas.sum()
     )
     length = np.hypot(*along.T)
-    height = _cross(points, along) / length  # of the centre over each edge, inwards
+    height = _cross(points, along) / length  # inward distance of the centre from each edge
     begin = (points * along).sum(axis=1) / length / height
     end = begin + length / height
     area = (0.5 * height**2 * (end - begin)).sum()
@@ -97,12 +97,12 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
 
 
 def rectangle(simulation: SimulationSettings) -> Shape:
-    """Return a box with the width and height of the settings."""
+    """Create a box with the width and height in the settings."""
     return polygon(_trapezoid(simulation, 0.0))
 
 
 def wedge(simulation: SimulationSettings) -> Shape:
-    """Return a wedge whose faces are tilted by half the taper, with the given width at mid-height.
+    """Create a wedge with faces tilted by half the taper and the given width at mid-height.
 
     Raises ValueError if the faces meet; `profile.validation` checks profiles for this.
     """
@@ -117,14 +117,14 @@ def wedge(simulation: SimulationSettings) -> Shape:
 
 
 def disc(simulation: SimulationSettings) -> Shape:
-    """Return a disc with the radius of the settings."""
+    """Create a disc with the radius in the settings."""
     radius = simulation.object_radius
     square = radius * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
 
 
 def nothing(simulation: SimulationSettings) -> Shape:
-    """Return the shape for a scene without an object; its outline is that of the rectangle."""
+    """Create the placeholder for a scene without an object, with the rectangle's outline."""
     return polygon(_trapezoid(simulation, 0.0), NO_OBJECT)
 
 
@@ -140,6 +140,6 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _secants(t: FloatArray) -> FloatArray:
-    """Return twice the integral of sec³ to the angle whose tangent is ``t``."""
+    """Return twice the integral of sec³ from 0 to the angle whose tangent is ``t``."""
     integral: FloatArray = t * np.sqrt(1.0 + t * t) + np.arcsinh(t)
     return integral

@@ -1,8 +1,8 @@
-"""Simulated hand: commands to its servos, its state, and the contacts of its tips.
+"""Simulate the hand: servo commands, state and tip contacts.
 
-Only :meth:`SimulatedHand.advance` advances time. The state depends only on the settings and on the
-commands with their times, so runs are reproducible to the bit. Physical constants without a setting
-are plausible values chosen for this project; they are not taken from a publication.
+Only :meth:`SimulatedHand.advance` advances time. The state depends only on the settings, the
+commands and their times, so runs are reproducible bit for bit. Physical constants that are not
+settings are plausible values chosen for this project, not taken from a publication.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
 
 SPARE_SAMPLE_COUNT = 8
-ADVANCE_MAX = 10.0  # s of simulated time in one kernel call
+ADVANCE_MAX = 10.0  # s, maximum simulated time per kernel call
 
 _MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
 
 STANDARD_GRAVITY = 9.80665  # m/s²
 STEP_MAX = 0.25e-3  # s
 STEP_MIN = 0.05e-3  # s
-PHASE_MAX = 0.25  # rad, largest phase of the fastest oscillation per sub-step
-ELECTRIC_TIME = 1e-3  # s, lag of the servo's current behind its reference
-FULL_EFFORT_ERROR = 0.27  # rad of position error at which the loop commands the stall current
-TABLE_SPEED = 0.0005  # m/s, below which the friction of the table on the object is viscous
+PHASE_MAX = 0.25  # rad, maximum phase of the fastest oscillation per sub-step
+ELECTRIC_TIME = 1e-3  # s, lag of the servo current behind its reference
+FULL_EFFORT_ERROR = 0.27  # rad, position error at which the loop commands the stall current
+TABLE_SPEED = 0.0005  # m/s, speed below which table friction is viscous
 STOP_CLEARANCE = 0.05  # rad between the commanded range and the mechanical end stops
 STOP_STIFFNESS = 500.0  # N·m/rad
-RIM_STIFFNESS = 1e6  # N/m, backing plate on the object
-COMPRESSION_DEPTH = 0.4  # of the tip's radius, depth of the scripted compression
+RIM_STIFFNESS = 1e6  # N/m, backing plate against the object
+COMPRESSION_DEPTH = 0.4  # fraction of the tip radius, depth of the scripted compression
 
 
 def geometry_of(settings: Settings) -> HandGeometry:
-    """Return the lengths of the hand from the settings."""
+    """Return the hand geometry from the settings."""
     hand = settings.hand
     return HandGeometry(
         hand.pivot_separation, hand.finger_length, hand.finger_offset, settings.tip.radius
@@ -62,11 +62,12 @@ def geometry_of(settings: Settings) -> HandGeometry:
 
 
 def stiff_step(settings: Settings, table: ContactTable) -> float:
-    """Return the sub-step [s] for the stiffest oscillation of the object on deeply pressed tips."""
+    """Return the sub-step [s] for the fastest oscillation of the object on deeply pressed tips."""
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius, table.header.deepest)
     c = table(d, 0.0)
-    # Normal stiffness ∂F/∂d and shear stiffness 2F/d are similar. The factor 2 is for two tips.
+    # Normal stiffness ∂F/∂d and shear stiffness 2F/d are similar. The factor 2 accounts for two
+    # tips.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
     stiffness *= 1.0 + sum(simulation.tip_relaxation)
     shape = shape_of(settings)
@@ -76,12 +77,12 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
         turning = (shape.half_width / shape.gyration) ** 2
         fastest = math.sqrt(stiffness / simulation.object_mass * max(1.0, turning))
     step = min(max(PHASE_MAX / fastest, STEP_MIN), STEP_MAX)
-    # An integer number of sub-steps per millisecond keeps ticks and frames on the grid.
+    # An integer number of sub-steps per millisecond keeps ticks and frames aligned with sub-steps.
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
 
 def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step: float) -> None:
-    """Set the plant's parameters. Raises SettingsError for an unknown servo."""
+    """Set the plant parameters. Raises SettingsError if the servo is unknown."""
     simulation = settings.simulation
     p.step = step
     p.sample_period = 1.0 / settings.tactile.rate
@@ -124,7 +125,7 @@ def _object(p: Parameters, settings: Settings) -> None:
     for k, values in enumerate(shape.edges().tolist()):
         edge = p.outline[k]
         edge.x, edge.y, edge.normal_x, edge.normal_y, edge.length = values
-    # κ of a face with this radius; see tip.py.
+    # κ for a face with this radius; see tip.py.
     curved = shape.roundness
     p.factor = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
     if settings.tip.physics == "solid":
@@ -132,13 +133,13 @@ def _object(p: Parameters, settings: Settings) -> None:
     p.mass = mass
     p.inertia = mass * shape.gyration**2
     p.gravity[:] = simulation.gravity
-    # The component of gravity that is not along the plane presses the object on the table.
+    # The gravity component normal to the plane presses the object onto the table.
     pressing = math.sqrt(max(STANDARD_GRAVITY**2 - math.hypot(*simulation.gravity) ** 2, 0.0))
     p.table_force = simulation.table_friction * mass * pressing
     p.table_torque = p.table_force * shape.mean_radius
     p.table_speed = TABLE_SPEED
     p.table_spin = TABLE_SPEED / shape.mean_radius
-    # A single finger can't hold an object, so the object is then fixed to the bench.
+    # A single finger can't hold an object, so the object is then fixed to the test bench.
     p.object_held = (
         shape.kind == NO_OBJECT
         or len(settings.scene.fingers) == 1
@@ -163,7 +164,7 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # Critical damping of the joint with its position loop.
+    # Critical damping for the joint with its position loop.
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
@@ -186,17 +187,18 @@ def _script(p: Parameters, settings: Settings) -> None:
 
 
 class SimulatedHand:
-    """Two fingers with joints and soft tips, and an object between them, in one plane.
+    """Two fingers with joints and soft tips and an object between them, in one plane.
 
-    The tips touch the object, or each other if it is not between them. If a tip has two contacts,
-    its sensor measures the stronger one. The object may lie on the palm.
+    The tips touch the object, or each other if the object is not between them. If a tip has two
+    contacts, its sensor measures the stronger contact. The object may lie on the palm.
 
-    ``settings.scene.fingers`` selects the tips. With one finger the object is fixed to the bench,
-    as in a compression test. Without servos (``settings.servos.backend`` is ``none``) the joints
-    stay at ``settings.hand.open_angle``. If then ``simulation.compression_speed`` is above 0, the
-    object moves back and forth between both tips and presses each 0.4 radii deep.
+    ``settings.scene.fingers`` selects the tips. With one finger, the object is fixed to the test
+    bench, as in a compression test. Without servos (``settings.servos.backend`` is ``none``), the
+    joints stay at ``settings.hand.open_angle``. In this case, if ``simulation.compression_speed``
+    is above 0, the object moves back and forth between both tips and compresses each by 0.4 radii.
 
-    The array attributes are views of the state, (2,) left first, valid until the next ``advance``.
+    The array attributes are views of the state with shape (2,), left first. They are valid until
+    the next ``advance``.
     """
 
     def __init__(
@@ -206,16 +208,16 @@ class SimulatedHand:
         table: ContactTable | None = None,
         step: float | None = None,
     ) -> None:
-        """Create the hand at rest, with torque off.
+        """Create the hand at standstill with torque off.
 
         Parameters
         ----------
         settings
-            Settings of the hand and the simulation.
+            Settings of hand and simulation.
         start
             Start time [s].
         table
-            Contact table of the tip and material; None to compute it.
+            Contact table for the tip and material; None to compute it.
         step
             Sub-step [s]; None to choose it from the stiffness.
 
@@ -241,7 +243,7 @@ class SimulatedHand:
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         goals.stiffness[:] = goals.duty[:] = 1.0
-        # Store as many samples as may be in transit to the reader of a sensor.
+        # Store all samples that may be in transit to a sensor's reader.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLE_COUNT
         self._ring = np.zeros(stored, Sample.dtype)
@@ -256,18 +258,19 @@ class SimulatedHand:
         self.object_pose = state.position[2:]  # x, y, φ
         self.object_velocity = state.velocity[2:]
         felt: Any = self.plant.sensed_contact
-        self.d = felt.array["d"]  # m, negative: a gap
+        self.d = felt.array["d"]  # m, negative for a gap
         self.theta = felt.array["theta"]  # rad
-        self.force = felt.array["force"]  # F on the tip's base [N]
+        self.force = felt.array["force"]  # F on the tip base [N]
         self.normal = felt.array["normal"]  # N [N]
         self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
-        # Depth of the backing plate's rim in the object; above 0 the tip is beyond its limit.
+        # Penetration depth of the backing plate rim; above 0, the tip is beyond its limit.
         self.rim = felt.array["rim"]  # m
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
-        self.torque_on = goals.torque_on  # 1 if the servo has torque
+        self.torque_on = goals.torque_on  # 1 if the servo's torque is on
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
-        # Of each finger's tactile sensor and servo, left first. They do not change the physics.
+        # Faults of each finger's tactile sensor and servo, left first. They do not change the
+        # physics.
         self.measurement_faults = MeasurementFaults(), MeasurementFaults()
         self.servo_heat = ServoHeat.of(settings), ServoHeat.of(settings)
         self._run(0)
@@ -278,7 +281,7 @@ class SimulatedHand:
         return self.start + self._done * self.step
 
     def advance(self, t: float) -> None:
-        """Advance to the last sub-step at or before ``t`` [s], unless it has passed already."""
+        """Advance to the last sub-step at or before ``t`` [s] unless it has already passed."""
         if t > self._torque_until:
             self._advance(self._torque_until)
             self.torque_on[:] = 0
@@ -286,7 +289,7 @@ class SimulatedHand:
         self._advance(t)
 
     def _advance(self, t: float) -> None:
-        # The addend 1e-6 prevents rounding down when t is a multiple of the sub-step.
+        # Adding 1e-6 prevents rounding down when t is a multiple of the sub-step.
         remaining = int((t - self.start) * self._per_step + 1e-6) - self._done
         steps_max = int(ADVANCE_MAX * self._per_step)
         while remaining > 0:
@@ -295,11 +298,11 @@ class SimulatedHand:
             remaining -= count
 
     def refresh(self) -> None:
-        """Evaluate the contacts after the state was changed from outside; time does not advance."""
+        """Evaluate the contacts after an external change in state, without advancing time."""
         self._run(0)
 
     def place_object(self) -> None:
-        """Move the object back to its start position, at rest and without load."""
+        """Move the object back to its start pose with no velocity or load."""
         self.object_pose[:], self.object_velocity[:] = self._first_pose, 0.0
         self.load()
         self.refresh()
@@ -309,8 +312,8 @@ class SimulatedHand:
     ) -> None:
         """Set a servo's mode, torque, goal angle [rad] and goal current [A].
 
-        Modes have the Dynamixel numbers: 0 current, 3 position, 5 current-based position. Raises
-        ValueError for another mode or a goal that is not finite.
+        Mode numbers are those of Dynamixel: 0 current, 3 position, 5 current-based position. Raises
+        ValueError for another mode or a non-finite goal.
         """
         if mode not in _MODES:
             raise ValueError(f"operating mode {mode} is not simulated; {_MODES} are")
@@ -322,7 +325,7 @@ class SimulatedHand:
         self._goal_current[joint] = goal_current
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
-        """Set a servo's position gains and its limit of the motor voltage (fraction of supply)."""
+        """Set a servo's position gains and motor voltage limit (fraction of supply)."""
         goals = self.plant.goals
         goals.stiffness[joint], goals.damping[joint] = stiffness, damping
         goals.duty[joint] = duty
@@ -333,31 +336,31 @@ class SimulatedHand:
         return scale * self.current.item(joint)
 
     def hold_torque_until(self, t: float) -> None:
-        """Switch off the torque of both servos at ``t`` [s]; infinity cancels this."""
+        """Switch off torque of both servos at ``t`` [s]; infinity cancels this."""
         self._torque_until = t
 
     def apply_load(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
-        """Apply this force [N] and torque [N·m] to the object from now on; zeros end it."""
+        """Apply a permanent force [N] and torque [N·m] to the object; zeros remove the load."""
         self.plant.goals.load[:] = force_x, force_y, torque
 
     def load(self, push: float = 0.0, twist: float = 0.0) -> None:
-        """Load the object from now on with a ``push`` [N] and a ``twist`` [N·m]; zeros end it.
+        """Apply a permanent ``push`` [N] and ``twist`` [N·m] to the object; zeros remove the load.
 
-        The push acts along the faces, away from the palm. It keeps its direction when the object
-        turns.
+        The push acts along the faces, away from the palm. Its direction stays the same when the
+        object rotates.
         """
         angle = self.object_pose.item(2)
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
 
     @property
     def sample_count(self) -> int:
-        """Number of contact samples; sample k was taken at ``start`` + k / tactile.rate."""
+        """Number of contact samples; sample k is taken at ``start`` + k / tactile.rate."""
         return self.plant.sample_count
 
     def sample(self, number: int) -> Sample:
-        """Return sample ``number``, which is valid until a newer one replaces it.
+        """Return sample ``number``, which is valid until a newer sample replaces it.
 
-        Raises LookupError if it was not taken yet or was overwritten.
+        Raises LookupError if it has not been taken yet or has been overwritten.
         """
         row = self._rows[number % len(self._rows)]
         if row.number != number:

@@ -1,7 +1,7 @@
-"""Linear equations of a step: factorisation as L D Lᵀ, and solution. ``g`` is γh of `plant`.
+"""Solve the linear equations of a step by L D Lᵀ factorisation. ``g`` is γh of `plant`.
 
-The matrix always includes the tips on the object. Extra rows are added for the object on the palm
-and for the tips on each other.
+The matrix always includes the tip contacts with the object. Extra rows are added for the object on
+the palm and for tip-to-tip contact.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 
 @inner_kernel
 def joint_pivot(plant: Plant, joint: int, g: float) -> float:
-    """Return the diagonal entry of a joint: inertia, friction, end stop and motor."""
+    """Return a joint's diagonal entry: inertia, friction, end stop and motor."""
     motor = plant.motor_by_rate[joint] + g * plant.motor_by_q[joint]
     pivot: float = plant.parameters.joint_inertia + g * (
         plant.drag[joint] + g * (joint_stiffness(plant, joint) + motor)
@@ -33,7 +33,7 @@ def joint_pivot(plant: Plant, joint: int, g: float) -> float:
 
 @inner_kernel
 def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
-    """Return the product of a tip's row ``r`` and the ``rates`` of the coordinates."""
+    """Return the product of a tip's row ``r`` and the coordinate ``rates``."""
     rate: float = (
         tip.rows[r, 0] * rates[finger]
         + tip.rows[r, 1] * rates[2]
@@ -45,7 +45,7 @@ def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract g K r from the load: K from the first stage, r positions and shears of ``k``."""
+    """Subtract g K r from the load, with first-stage K and positions and shears r of ``k``."""
     for finger in range(2):
         tip = plant.stages[0].on_object[finger]
         rows, stiffness = tip.rows, tip.stiffness
@@ -60,7 +60,7 @@ def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def factorise(plant: Plant, g: float) -> None:
-    """Factorise M + gD + g²K of the first stage over all five coordinates."""
+    """Factorise the first stage's M + gD + g²K over all five coordinates."""
     p = plant.parameters
     full = plant.factors.lower
     for i in range(5):
@@ -110,7 +110,7 @@ def factorise(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def solve(plant: Plant, k: Motion) -> None:
-    """Solve for the load and set the velocities of ``k``; those of held parts are 0."""
+    """Solve for the load and set the velocities of ``k``, which are 0 for held parts."""
     full, out = plant.factors.lower, k.velocity
     for i in range(5):
         value = plant.load[i]
@@ -126,7 +126,7 @@ def solve(plant: Plant, k: Motion) -> None:
 
 @inner_kernel
 def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
-    """Return the product of an extra row and the ``rates`` of the coordinates."""
+    """Return the product of an extra row and the coordinate ``rates``."""
     rate: float = 0.0
     for j in range(5):
         rate += extra.row[j] * rates[j]
@@ -135,7 +135,7 @@ def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract g K r of the extra rows from the load; r are positions and extra shears of ``k``."""
+    """Subtract the extra rows' g K r from the load; r are positions and extra shears of ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.stiffness == 0.0:
@@ -149,7 +149,7 @@ def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def add_extra_shears(plant: Plant, k: Motion, g: float) -> None:
-    """Add the effect of the solved velocities of ``k`` to its extra shears: g row·k."""
+    """Add the effect of the solved velocities to the extra shears of ``k``: g row·k."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.shear > 0 and extra.stiffness != 0.0:

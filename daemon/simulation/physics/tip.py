@@ -1,53 +1,53 @@
-"""Soft tip of the simulated hand: its contact law, and its contact with the object.
+"""Simulate a soft tip: its contact law and its contact with the object.
 
-All elastic forces are the gradient of one energy, so the contact can't create energy:
+All elastic forces are the gradient of a single energy, so the contact can't create energy:
 
     U = w(θ) κ [ U₀(d, θ) + F(d, θ) (sin θ d_t + s cos θ d_t²/d) ] + U_rim(d, θ)
 
-U₀ and F are energy and force from the contact table, for a plane face. With a constant modulus E,
-F = πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1 the second term is then
-πE(d² d_t tan θ + d d_t²), the tangential energy of the parallel-distributed model. For other
-materials F introduces their effective modulus. w(θ) is 1 on the soft hemisphere and fades to 0
-towards the side of the finger. U_rim is a stiff spring between the rim of the backing plate and the
-object. A plane reaches the rim at d = a(1 − |sin θ|), the end of the soft range. From slightly
-before, a(1 − √(sin² θ + 0.03²)), U₀ is continued linearly in d and F is constant.
+U₀ and F are energy and force from the contact table for a plane face. With a constant modulus E, F
+= πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1, the second term is then πE(d² d_t tan θ + d
+d_t²), the tangential energy of the parallel-distributed model. For other materials, F introduces
+their effective modulus. w(θ) is 1 on the soft hemisphere and fades to 0 towards the side of the
+finger. U_rim is a stiff spring between the rim of the backing plate and the object. A plane reaches
+the rim at d = a(1 − |sin θ|), the end of the soft range. Beyond a slightly smaller d, a(1 − √(sin²
+θ + 0.03²)), U₀ is continued linearly in d, and F is constant.
 
-This is the law ``simulation.tip_law = "springs"``. With ``"bristles"`` the term sin θ d_t is
-omitted. The tangential force T = 2 s F cos θ d_t/d, 2πE s d d_t for a constant E, then comes from a
-bristle at the centre of the contact. Tilt and compression do not bend it, and d_t only follows the
-slide at that point. The force upright, the force at d_t = 0 and the sensor are the same for both
-laws. So the bristles test a controller that compensates the tangential terms of the springs against
-a tip without these terms.
+This is the contact law ``simulation.tip_law = "springs"``. With ``"bristles"``, the term sin θ d_t
+is omitted. The tangential force T = 2 s F cos θ d_t/d (2πE s d d_t for a constant E) then comes
+from a bristle at the centre of the contact. Tilt and compression do not bend this bristle, and d_t
+only follows the sliding motion at that point. The upright force, the force at d_t = 0 and the
+sensor are the same for both laws. The bristles therefore allow a controller that compensates the
+springs' tangential terms to be tested on a tip without these terms.
 
-The tip touches the nearest point of the object. On a face, the contact is along the normal of the
-face. On a corner it is along the line to the corner, as on the plane normal to that line. On a disc
-it is along the line to the centre. The axis of a disc is normal to the plane of the hand, so its
-face is curved about one axis, with radius R. To leading order in d, the contact with the springs of
-the tip differs from that of the tangent plane in two ways. The footprint is narrower along the tilt
-by κ² = R/(R + a), since the curvatures add to 1/a + 1/R, and force and energy are κ times those of
-the plane for any θ. For a constant modulus, a = 20 mm and d up to 8 mm, integrals over the springs
-agree with this within 1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and within 3 % and 9 %
-for R = 10 mm. The frame of the sensor is computed from these springs (`sensor.sensor_model`), so
-its sum differs by the same amount. The force of a solid tip is proportional to d^(3/2) and √κ, as
-in Hertz's theory for a sphere on a cylinder in the limit of small d. Its frame is that of the plane
-times this factor.
+The tip touches the nearest point of the object. On a face, the contact direction is the face
+normal. At a corner, it is the line to the corner, as for a plane normal to that line. On a disc, it
+is the line to the centre. The axis of a disc is normal to the hand plane, so its face is curved
+about one axis with radius R. To leading order in d, the contact of the spring model differs from
+that with the tangent plane in two ways. The footprint is narrower along the tilt by κ² = R/(R + a),
+since the curvatures add to 1/a + 1/R, and force and energy are κ times those of the plane for any
+θ. For a constant modulus, a = 20 mm and d up to 8 mm, integrals over the springs agree with this to
+within 1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9 % for R = 10 mm.
+The sensor frame is computed from these springs (`sensor.sensor_model`), so its sum differs by the
+same amount. The force of a solid tip is proportional to d^(3/2) and √κ, as in Hertz's theory for a
+sphere on a cylinder in the limit of small d. Its frame is the plane's frame multiplied by this
+factor.
 
-Friction is Coulomb's: d_t stays between the two shears at which |T| = μN. If the ratio |T|/N of the
-model can't reach μ (with a constant E and s = 1 it is at most 1 at θ = 0), the tip slips at its
-largest ratio. Losses are viscous and proportional to the stiffness of the soft part, so they
-increase with the contact.
+Coulomb friction limits d_t to the range between the two shears at which |T| = μN. If the model's
+ratio |T|/N can't reach μ (with a constant E and s = 1, its maximum at θ = 0 is 1), the tip slips at
+the maximum ratio. Damping is viscous and proportional to the stiffness of the soft part, so it
+increases with the contact.
 
 The shear of a stuck tip may relax by creep and by micro-slip. Both are off by default; a tip then
 sticks or slips as a whole and has no memory. Micro-slip is the behaviour of springs with individual
 Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed by w = ℓ − h, has the pressure
-Ew/ℓ. When the face has moved by u, it has the shear traction Eu/ℓ and slips if u > μw. All layers
-w = 0 … d are equally stiff, since r dr = −ℓ dℓ. So from rest
+Ew/ℓ. When the face has moved by u, the spring has the shear traction Eu/ℓ and slips if u > μw. All
+layers w = 0 … d are equally stiff, since r dr = −ℓ dℓ. Starting from zero shear, this gives
 
     T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
 
 and the whole tip slips at u = μd. This is an Iwan model with uniformly distributed limits. Its
-layers are scaled with the footprint. Their mean is d_t of the tip, and their variance adds to d_t²
-in the energy of the tip.
+layers scale with the footprint. Their mean is the tip's d_t, and their variance adds to d_t² in the
+tip energy.
 """
 
 from __future__ import annotations
@@ -69,14 +69,14 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.lookup import lookup_at, normal_at, stiffness_ahead
 from softfinger.kinematics.contact.table_record import Table
 
-D_MIN = 1e-9  # m, lower limit of d for a contact
-_FADE_FROM = 1.15  # rad, where w(θ) begins to fade
-_FADE_TO = 1.35  # rad, where w(θ) reaches 0
-# Of the radius, lower bound of the distance from the tip's centre to a corner.
+D_MIN = 1e-9  # m, minimum d for a contact
+_FADE_FROM = 1.15  # rad, start of the fade of w(θ)
+_FADE_TO = 1.35  # rad, end of the fade, where w(θ) = 0
+# Fraction of the radius, minimum distance from the tip centre to a corner.
 _CORNER_DISTANCE_MIN = 1e-3
-_FRICTION_TOLERANCE = 5e-13  # relative tolerance of the friction limit
-_RELAXATION_MIN = 0.02  # lower bound of the relaxation factor of a tip that recovers late
-_RIM_ROUNDING = 0.03  # of the radius, from the end of the soft range to the rim at θ = 0
+_FRICTION_TOLERANCE = 5e-13  # relative tolerance for the friction limit
+_RELAXATION_MIN = 0.02  # minimum relaxation factor, for tips with delayed recovery
+_RIM_ROUNDING = 0.03  # fraction of the radius from the end of the soft range to the rim at θ = 0
 
 
 @inner_kernel
@@ -93,7 +93,7 @@ def fade(theta: float) -> tuple[float, float]:
 
 @inner_kernel
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
-    """Return the largest ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of the largest ratio.
+    """Return the maximum ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ with maximum ratio.
 
     ζ is the shear relative to the shear at which T = 0.
     """
@@ -108,7 +108,7 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
 
 @inner_kernel
 def clear_contact(tip: TipContact) -> None:
-    """Clear the contact of a tip, except d, θ and the gain."""
+    """Clear a tip's contact, except for d, θ and the gain."""
     tip.force = 0.0
     tip.energy = 0.0
     tip.rim = 0.0
@@ -128,10 +128,10 @@ def clear_contact(tip: TipContact) -> None:
 
 @inner_kernel
 def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) -> None:
-    """Compute the forces, stiffness and losses of a ``tip`` along d, θ and d_t.
+    """Compute the forces, stiffness and damping of ``tip`` along d, θ and d_t.
 
-    With ζ the shear d_t, v its variance, γ = ``gain`` = w(θ) κ, ρ = ``ratio`` = s cos θ/d and
-    χ = ``shear_coupling``, 1 for springs and 0 for bristles, within the soft range:
+    Let ζ be the shear d_t, v its variance, γ = ``gain`` = w(θ) κ, ρ = ``ratio`` = s cos θ/d, and χ
+    = ``shear_coupling`` (1 for springs, 0 for bristles). Within the soft range:
 
         T = t0 + t1 ζ             t0 = χ γ F sin θ,  t1 = 2 γ F ρ
         N = n0 + n1 ζ + n2 ζ²     n0 = γ ∂U₀/∂d − χ t0 tan θ + ∂U_rim/∂d
@@ -140,8 +140,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         |T| ≤ μ N limits ζ on both sides of ``neutral`` = −χ d tan θ/2s, where T = 0
         losses: loss · stiffness · rate    stiffness = γ/cos θ (∂F/∂d, 2d/3 ∂U₀/∂d) and t1
 
-    ``factor`` is κ. The inputs in the tip are d, θ, travel, rates, slip rate, shear, its variance
-    and the rim. The other fields are set, except the rows and forces over the coordinates.
+    ``factor`` is κ. The input fields of ``tip`` are d, θ, travel, rates, slip rate, shear, shear
+    variance and rim. All other fields are set, except for the rows and the generalised forces.
     """
     d = tip.d
     sine = tip.sine
@@ -166,7 +166,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     stiffness_d = 0.0
     stiffness_theta = 0.0
     stiffness_t = 0.0
-    ahead = 0.0  # possible increase of the soft part's stiffness in this step
+    ahead = 0.0  # possible increase in soft stiffness during this step
     if gain > 0.0:
         inverse_cosine = 1.0 / cosine
         leaning = sine * inverse_cosine
@@ -174,7 +174,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         ahead = stiffness_ahead(table, 2.0 * math.pi * p.modulus * gain, tip.travel)
         ahead *= inverse_cosine
     if gain > 0.0 and d > D_MIN:
-        # d limited to the soft range; d_soft_d and d_soft_theta are the derivatives of d_soft.
+        # d_soft is d limited to the soft range; d_soft_d and d_soft_theta are its derivatives.
         radius = p.radius
         d_soft = d
         d_soft_d = 1.0
@@ -201,13 +201,13 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         slope *= scale
         slope_d *= scale
         slope_theta *= scale
-        # Beyond the range, continue U₀ with its slope ∂U₀/∂d.
+        # Beyond this range, extrapolate U₀ with its slope ∂U₀/∂d.
         inverse_d = 1.0 / d_soft
         over = d - d_soft
         soft = scale * soft + slope * over
         soft_theta = scale * soft_theta + (slope_theta + slope_d * d_soft_theta) * over
 
-        # T and N are polynomials of the shear: T = t0 + t1 d_t, N = n0 + n1 d_t + n2 d_t².
+        # T and N are polynomials in the shear: T = t0 + t1 d_t, N = n0 + n1 d_t + n2 d_t².
         firm = p.shear_stiffness
         ratio = firm * cosine * inverse_d
         coupled = p.shear_coupling * sine
@@ -217,13 +217,13 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         n1 = gain * d_soft_d * force_d * coupled - t1 * tangent
         n2 = gain * d_soft_d * ratio * (force_d - force * inverse_d)
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
-        neutral = -0.5 * tangent * d_soft / firm  # where T = 0
+        neutral = -0.5 * tangent * d_soft / firm  # shear at which T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # Most steps are far from slip; two comparisons detect these.
+        # Most steps are far from slip, which two comparisons detect.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction
-        # The tolerance keeps a shear that was just limited from being limited again.
+        # The tolerance prevents a shear that has just been limited from being limited again.
         stuck = friction * normal * (1.0 + _FRICTION_TOLERANCE)
         if abs(tangential) > stuck or curvature * (shear - neutral) ** 2 > at_neutral:
             slope_there = n1 + 2.0 * n2 * neutral
@@ -234,7 +234,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
             tangential = t0 + t1 * shear
         normal += n2 * shear_variance
 
-        # U's second term and its derivatives.
+        # Second term of U and its derivatives.
         bent = firm * sine * inverse_d
         sheared = coupled * shear + ratio * shear * shear + ratio * shear_variance
         by_soft = force_d * sheared - force * ratio * inverse_d * shear * shear
@@ -252,9 +252,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     else:
         shear = 0.0
 
-    # Losses: a separating tip must not pull, and the loss of the shear stays within friction. A
-    # stuck tip does not slide, except for the term tan θ ḋ of the springs, which keeps the virtual
-    # work consistent.
+    # Damping: a separating tip must not pull, and shear damping stays within friction. A stuck tip
+    # does not slide, except for the spring term tan θ ḋ, which keeps the virtual work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
     loss = p.loss
@@ -297,9 +296,10 @@ def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: flo
 
 @inner_kernel
 def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
-    """Add the stiffness of the rim to a tip that may reach it in this step.
+    """Add the rim stiffness to a tip that may reach the rim in this step.
 
-    The row of the rim is at most the row of d plus a times that of θ. Twice each is an upper bound.
+    The rim row is at most the d row plus a times the θ row, so twice each stiffness is an upper
+    bound.
     """
     hard = 2.0 * p.rim_stiffness
     tip.stiffness[ALONG_D] += hard
@@ -318,11 +318,11 @@ def touch_object(
     side = 1.0 - 2.0 * finger
     radius = p.radius
     mu, mv, distance, curved = nearest(p, rx * nx + ry * ny, ry * nx - rx * ny)
-    # m points from the tip's centre into the object; t is m turned by 90°.
+    # m points from the tip centre into the object; t is m rotated by 90°.
     mx = mu * nx - mv * ny
     my = mu * ny + mv * nx
     d = radius - distance
-    # Tip axis (±cos q, −sin q); θ is the angle from it to m.
+    # θ is the angle from the tip axis (±cos q, −sin q) to m.
     ux = side * its.cosine
     uy = -its.sine
     cosine = ux * mx + uy * my
@@ -333,7 +333,7 @@ def touch_object(
     tip.sine = sine
     tip.cosine = cosine
 
-    # Rows over (q, x, y, φ); the contact point is at ``distance`` m from the tip's centre.
+    # Rows over (q, x, y, φ). The contact point is ``distance`` · m away from the tip centre.
     px = rx + distance * mx
     py = ry + distance * my
     rotation_m = my * px - mx * py
@@ -345,8 +345,8 @@ def touch_object(
     y_rate = now.velocity[3]
     rotation_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
-    # The matrix of the integrator uses the stiffness at the end of the step, so that it is correct
-    # during an impact. Losses use the present stiffness.
+    # The integrator matrix uses the stiffness at the end of the step to be correct during an
+    # impact. Damping uses the current stiffness.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
         tip.gain = fade(theta)[0] * p.factor * plant.relaxation_factor[finger]
@@ -357,8 +357,8 @@ def touch_object(
     theta_y = 0.0
     theta_rotation = 1.0
     if curved >= 0.0:
-        # m points to the centre of curvature, which is fixed in the object: the corner, or the
-        # centre of the disc.
+        # m points to the centre of curvature, which is fixed to the object: the corner or the disc
+        # centre.
         inverse = 1.0 / max(distance + curved, _CORNER_DISTANCE_MIN * radius)
         theta_q -= v_t * inverse
         theta_x = -my * inverse
@@ -376,7 +376,7 @@ def touch_object(
     tip.rate_theta = (
         theta_q * q_rate + theta_x * x_rate + theta_y * y_rate + theta_rotation * rotation_rate
     )
-    # Velocity of the object minus that of the tip at the contact, along t.
+    # Velocity of the object relative to the tip at the contact, along t.
     t_q = side * distance - v_t
     tip.slip_rate = t_q * q_rate - my * x_rate + mx * y_rate + rotation_t * rotation_rate
     tip.shear = now.shear[finger]
@@ -403,7 +403,7 @@ def touch_object(
 
 @inner_kernel
 def relax_shears(plant: Plant) -> None:
-    """Relax the shears after a sub-step, with the contacts from its begin."""
+    """Relax the shears after a sub-step, using the contacts from its start."""
     p, state = plant.parameters, plant.state
     for finger in range(2):
         tip, layers = plant.stages[0].on_object[finger], plant.layers[finger]
@@ -438,10 +438,10 @@ def relax_shears(plant: Plant) -> None:
 
 @inner_kernel
 def relax_tips(plant: Plant) -> None:
-    """Advance the relaxation of each tip on the object by a sub-step; set its factor ρ.
+    """Advance each tip's relaxation on the object by one sub-step and set its factor ρ.
 
-    ρ = 1 + Σ r_i (1 − h_i/F∞) with ḣ_i = (F∞ − h_i)/τ_i scales all forces of the tip, and F∞ is the
-    long-term force. A suddenly pressed tip is stiffer by Σ r_i at first. A suddenly released tip
+    ρ = 1 + Σ r_i (1 − h_i/F∞) with ḣ_i = (F∞ − h_i)/τ_i scales all tip forces, where F∞ is the
+    long-term force. A suddenly pressed tip is initially stiffer by Σ r_i. A suddenly released tip
     recovers with a delay.
     """
     p = plant.parameters

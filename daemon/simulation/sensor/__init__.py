@@ -1,1 +1,1 @@
-"""Simulated pressure sensor: readings, imperfections, and arrival times of frames."""
+"""Simulated pressure sensor: readings, imperfections and frame arrival times."""

@@ -1,14 +1,14 @@
-"""Model of the simulated pressure sensor: from a contact to the counts that a board would send.
+"""Model the simulated pressure sensor: convert a contact to the counts sent by a board.
 
-Delayed and lost frames are in `simulated_tactile`. The imperfections have the usual forms; the
+`simulated_tactile` handles delayed and lost frames. The imperfections have the usual forms; the
 profiles ``velostat`` and ``capacitive`` use them.
 
-The pressure of a plane face is computed by `sensing.pressure_grid`, that of a cylindrical face, as
-on a disc, here. Both use the same springs: over each point of the base there is a vertical spring
-as long as the hemisphere is high, and the face compresses it. An estimator that assumes a plane
-face sees a narrower footprint and estimates a smaller d: 0.72 of the true value for R = a, 0.83 for
-R = 2a. Its θ is 1 % to 12 % too small, more so for larger d, and its gain is above 1, which
-compensates the force.
+`sensing.pressure_grid` computes the pressure of a plane face; this module computes the pressure of
+a cylindrical face, as on a disc. Both use the same spring model: above each point of the base, the
+face compresses a vertical spring whose length is the height of the hemisphere. An estimator that
+assumes a plane face sees a narrower footprint and therefore underestimates d: it finds 0.72 of the
+true value for R = a, and 0.83 for R = 2a. Its θ is 1 % to 12 % too small (the error increases with
+d), and its gain is above 1, which compensates the force.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, coun
 FloatArray = NDArray[np.float64]
 
 PLAY_COUNT = 4
-_FINENESS = 60.0  # points of the model per radius of the tip, at least
+_FINENESS = 60.0  # minimum number of model points per tip radius
 
 
 class SensorModel:
-    """Pressure sensor under one simulated tip, with the range of the board and imperfections.
+    """Pressure sensor under one simulated tip, with the board's range and imperfections.
 
-    ``gain`` is the ratio of the reading to the pressure of the material. ``dead`` has the cells
-    (row, col) that always read 0. Models with equal arguments and calls give equal frames.
+    ``gain`` is the ratio of the reading to the material's pressure. ``dead`` lists the cells (row,
+    col) that always read 0. Models with the same arguments and calls give the same frames.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class SensorModel:
         self._plays = np.zeros((PLAY_COUNT if flaws.tactile_hysteresis > 0.0 else 0, *shape))
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
-        self._warmer = np.zeros(1)  # relative drift of the gain
+        self._warmer = np.zeros(1)  # relative gain drift
         self._full_scale = board.full_count * board.pascal_per_count
         self._signal = np.zeros(shape)  # counts
         self._normals = np.zeros(shape)
@@ -94,12 +94,12 @@ class SensorModel:
 
     @property
     def active(self) -> NDArray[np.bool_]:
-        """Cells that are not dead, bool [rows, cols]."""
+        """True for cells that are not dead, bool [rows, cols]."""
         return self._sensitivity > 0.0
 
     @property
     def has_memory(self) -> bool:
-        """True if readings also depend on earlier contacts."""
+        """True if readings depend on earlier contacts."""
         flaws = self._flaws
         return (
             flaws.tactile_hysteresis > 0.0
@@ -116,11 +116,10 @@ class SensorModel:
         t: float = 0.0,
         curvature: float = 0.0,
     ) -> None:
-        """Write the counts of the next frame into ``out``, uint16 [rows, cols] contiguous.
+        """Write the counts of the next frame to ``out``, contiguous uint16 [rows, cols].
 
-        ``d`` [m] ≤ 0 means no contact. Tilts [rad] are as for :meth:`SensorGrid.pressure`. ``t``
-        [s] is the time of the frame, for creep, response and drift. ``curvature`` is as for
-        :meth:`press`.
+        ``d`` [m] ≤ 0 means no contact. Tilts [rad] are as in :meth:`SensorGrid.pressure`. ``t`` [s]
+        is the frame time, for creep, response and drift. ``curvature`` is as in :meth:`press`.
         """
         self.press(d, tilt_x, tilt_y, t, curvature)
         self.read(out)
@@ -135,12 +134,12 @@ class SensorModel:
         fraction: float = 1.0,
         shear: float = 0.0,
     ) -> None:
-        """Apply the contact of time ``t`` to the cells without reading them.
+        """Apply the contact at time ``t`` to the cells without reading them.
 
-        ``curvature`` [1/m] is the curvature of the face in the plane of ``tilt_x``, 0 for a plane:
-        the face is a cylinder with its axis along the finger's y. All pressure is multiplied by
-        ``fraction``. A solid tip shows the curvature only by this factor. It also shows the
-        ``shear`` [N] along x, applied at the height a.
+        ``curvature`` [1/m] is the face curvature in the plane of ``tilt_x``, 0 for a plane. The
+        face is a cylinder with its axis along the finger's y. All pressures are multiplied by
+        ``fraction``. For a solid tip, the curvature only acts through this factor, and the frame
+        also shows the ``shear`` [N] along x, applied at height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
         flaws, pressure = self._flaws, self._pressure
@@ -170,10 +169,10 @@ class SensorModel:
 
     @cached_property
     def _points(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Sample points: position across the cylinder's axis, and height of the hemisphere [m].
+        """Sample points: position across the cylinder axis, and hemisphere height [m].
 
-        Both have the shape [lines, points of a line]; the height is 0 beyond the rim. The other two
-        are the matrices that average over cells, with blur, along y and x.
+        Both have the shape [lines, points per line]; the height is 0 beyond the rim. The other two
+        results are the matrices that average over cells, including blur, along y and x.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -185,14 +184,14 @@ class SensorModel:
         return across_x * x + across_y * y, height, *means
 
     def _curved(self, d: float, n_x: float, n_y: float, roundness: float) -> FloatArray:
-        """Return the pressure [Pa] of a cylinder of radius R = ``roundness`` [m] on each cell.
+        """Return the pressure [Pa] on each cell due to a cylinder of radius R = ``roundness`` [m].
 
-        The normal (n_x, n_y, …) points from the tip's centre to the axis, at the distance
-        a − d + R. With the coordinate p across the axis,
+        The normal (n_x, n_y, …) points from the tip centre to the axis at a distance a − d + R.
+        With the coordinate p across the axis,
 
             z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
 
-        The pressure of a cell is the mean over its sample points.
+        A cell's pressure is the mean over its sample points.
         """
         tilted = n_x * n_x + n_y * n_y
         if not (d > 0.0 and tilted < 1.0):
@@ -211,13 +210,13 @@ class SensorModel:
         return np.asarray(along_y @ pressure @ along_x)
 
     def press_evenly(self, pressure: float) -> None:
-        """Apply a uniform pressure [Pa], like a bladder, instead of the last press."""
+        """Replace the last press with a uniform pressure [Pa], as from a bladder."""
         self._pressure[:] = pressure
 
     def read(
         self, out: NDArray[np.uint16], faults: MeasurementFaults | None = None, t: float = 0.0
     ) -> None:
-        """Write the counts of the cells into ``out``, with the ``faults`` at time ``t`` [s]."""
+        """Write the cell counts to ``out``, with the ``faults`` at time ``t`` [s]."""
         flaws = self._flaws
         felt = self._pressure
         if flaws.tactile_exponent != 1.0 or flaws.tactile_fold > 0.0:
@@ -247,14 +246,14 @@ class SensorModel:
 
 
 def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
-    """Apply hysteresis: each cell reads more during unloading than during loading.
+    """Apply hysteresis: each cell reads higher during unloading than during loading.
 
     This is a Prandtl-Ishlinskii model: the output of a cell is the mean of PLAY_COUNT generalised
-    play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each follows an increasing
-    pressure p at once. It follows a decreasing one only when it is above (1 + h_k) p, with h_k
-    evenly distributed over 0 … 2·excess. So the loading curve is the pressure itself, the unloading
-    curve ends at (1 + excess) p, loops are closed, inner loops lie inside, and zero pressure always
-    reads 0.
+    play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each operator follows an
+    increasing pressure p immediately. It follows a decreasing pressure only when its state is above
+    (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. The loading curve is therefore the
+    pressure itself, the unloading curve ends at (1 + excess) p, loops are closed, inner loops lie
+    inside outer loops, and zero pressure always reads 0.
     """
     widths = 2.0 * excess * (np.arange(PLAY_COUNT) + 0.5) / PLAY_COUNT
     np.minimum(state, (1.0 + widths)[:, None, None] * pressure, out=state)
@@ -263,17 +262,17 @@ def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
 
 
 def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) -> FloatArray:
-    """Return each cell's pressure with a first-order lag, z of dz/dt = (p − z)/time.
+    """Return each cell's pressure p with a first-order lag: z in dz/dt = (p − z)/time.
 
     p + share · z is the creep of a standard linear solid. The solution is exact for a pressure that
-    changed linearly during ``elapsed`` [s]. ``state`` [2, rows, cols] has the last p and z, and is
-    updated.
+    changes linearly during ``elapsed`` [s]. ``state`` [2, rows, cols] contains the last p and z and
+    is updated.
     """
     before = state[0]
     lagged: FloatArray = state[1]
     ratio = elapsed / time
     decay = math.exp(-ratio)
-    # Mean of the decay over the interval; for short intervals it is 1 − r/2 + …
+    # Mean decay over the interval; for short intervals it is 1 − r/2 + …
     mean = -math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0
     lagged *= decay
     lagged += (mean - decay) * before + (1.0 - mean) * pressure
@@ -282,10 +281,10 @@ def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) ->
 
 
 def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float) -> FloatArray:
-    """Return the readings for the pressure p: (p/full_scale)^exponent · full_scale.
+    """Return the readings (p/full_scale)^exponent · full_scale for pressures p.
 
-    Above ``fold`` [Pa], unless that is 0, p is replaced by fold²/p: beyond the range of its contact
-    resistance, a cell reads less with more pressure.
+    Above ``fold`` [Pa] (0 disables this), p is replaced by fold²/p: beyond the range of its contact
+    resistance, a cell's reading decreases with pressure.
     """
     if fold > 0.0:
         pressure = np.minimum(pressure, fold * fold / np.maximum(pressure, fold))
@@ -297,9 +296,9 @@ def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float)
 def drift(
     value: FloatArray, deviation: float, time: float, elapsed: float, normals: FloatArray
 ) -> None:
-    """Advance the drift of each cell's zero, or of the gain: an Ornstein-Uhlenbeck process.
+    """Advance the zero or gain drift, modelled as an Ornstein-Uhlenbeck process.
 
-    ``value`` starts at 0 after a tare and approaches the standard ``deviation`` with the
+    ``value`` starts at 0 after a tare, and its standard deviation approaches ``deviation`` with the
     correlation time ``time`` [s]. ``normals`` are standard normal numbers.
     """
     decay = math.exp(-elapsed / time)
@@ -308,10 +307,10 @@ def drift(
 
 
 def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: FloatArray) -> None:
-    """Compute the crosstalk of each line: ``fraction`` of the mean signal of the line.
+    """Compute the crosstalk of each line as ``fraction`` of its mean signal.
 
-    Cells of a resistive matrix share their drive and sense lines, and current leaks along them. The
-    results are written to ``rows`` [rows] and ``cols`` [cols].
+    The cells of a resistive matrix share drive and sense lines, and current leaks along these
+    lines. The results are written to ``rows`` [rows] and ``cols`` [cols].
     """
     np.multiply(fraction, signal.mean(axis=1), out=rows)
     np.multiply(fraction, signal.mean(axis=0), out=cols)
@@ -320,11 +319,11 @@ def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: Float
 def count(
     signal: FloatArray, active: NDArray[np.bool_], ends: tuple[int, int], out: NDArray[np.uint16]
 ) -> None:
-    """Round a signal to counts in ``out``; cells that are not ``active`` read 0.
+    """Round a signal to counts in ``out``; inactive cells read 0.
 
-    ``ends`` are the threshold, below which counts are set to 0, and the largest count.
+    ``ends`` contains the threshold below which counts are set to 0, and the maximum count.
     """
     lowest, full = ends
     value = np.clip(signal + 0.5, 0.0, full + 0.5)
     value[~active | (value < lowest)] = 0.0
-    out[:] = value  # truncates to integers
+    out[:] = value  # truncation to integers

@@ -1,4 +1,4 @@
-"""Tactile sensor under one tip of the simulated hand, in this process and without a thread."""
+"""Simulate the tactile sensor under one tip of the simulated hand, without a thread."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from softfinger.daemon.types import Frame
 
 
 def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
-    """Return the pressure sensor under one simulated tip."""
+    """Create the pressure sensor model for one simulated tip."""
     simulation, tactile = settings.simulation, settings.tactile
     return SensorModel(
         make_grid(settings, finger),
@@ -36,25 +36,25 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
 
 
 class StageTouch(NamedTuple):
-    """Contact of a tip with something other than the hand's object, at one instant."""
+    """Contact of a tip with something other than the object at one instant."""
 
     d: float  # m
     theta: float  # rad
-    pressure: float  # uniform pressure on all cells instead, if above 0 [Pa]
+    pressure: float  # if above 0, uniform pressure on all cells instead [Pa]
 
 
 class SimulatedTactile:
-    """Frames of one fingertip of a :class:`SimulatedHand`.
+    """Source of frames for one fingertip of a :class:`SimulatedHand`.
 
-    The sensor is defined by the settings of the hand. Frame k samples the contact at
-    k / ``tactile.rate`` after the hand's start. It arrives ``simulation.tactile_delay`` later, or
-    later still, or never (see :class:`Arrivals`). As on hardware, the sample time is not known: it
-    is taken as ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is
-    computed, when it is requested; ``seq`` counts the others too. The hand's ``measurement_faults``
+    The hand's settings define the sensor. Frame k samples the contact at k / ``tactile.rate`` after
+    the hand's start. It arrives ``simulation.tactile_delay`` later, with an additional delay, or
+    not at all (see :class:`Arrivals`). As on hardware, the sample time is unknown; it is assumed to
+    be ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is computed,
+    and only when requested; ``seq`` also counts the other frames. The hand's ``measurement_faults``
     are applied.
 
-    If ``stage`` is set, it presses the tip instead of the hand's object. It is a function of the
-    time since the hand's start [s].
+    If ``stage`` is set, it replaces the contact with the object. It is a function of the time since
+    the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:
@@ -80,7 +80,7 @@ class SimulatedTactile:
         self._relaxation = list(
             zip(simulation.tip_relaxation, simulation.tip_relaxation_times, strict=True)
         )
-        # Lagged plate force of each term [N]
+        # Lagged plate force of each term [N].
         self._relaxation_state = [0.0] * len(self._relaxation)
         self._pressed = -1  # number of the newest sample applied to the cells
         self._frame: Frame | None = None
@@ -99,7 +99,7 @@ class SimulatedTactile:
         self.latest()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame, or None before the first one or if not open."""
+        """Return the newest frame, or None before the first frame or if not open."""
         now = self._clock.now()
         if self._open and self._arrivals.take(now):
             self._hand.advance(now)
@@ -107,9 +107,9 @@ class SimulatedTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return the numbers of ``frames`` that arrived since open and of ``missed`` ones.
+        """Return the numbers of ``frames`` received and ``missed`` since opening.
 
-        ``resyncs`` and ``skipped_bytes`` stay 0.
+        ``resyncs`` and ``skipped_bytes`` are always 0.
         """
         arrivals = self._arrivals
         return {
@@ -124,8 +124,8 @@ class SimulatedTactile:
         self._open = False
 
     def _read(self, number: int, arrival: float) -> None:
-        """Compute the frame of a sample, if the plant still has it, and make it the newest."""
-        # Cells with memory also depend on the samples without a computed frame.
+        """Compute a sample's frame if the plant still stores it, and make it the newest."""
+        # Cells with memory also depend on samples whose frame is not computed.
         first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
             self._press(each)
@@ -151,7 +151,7 @@ class SimulatedTactile:
         return next(self._replayed)
 
     def _relaxation_factor(self, d: float, theta: float) -> float:
-        """Return a tip's relaxation factor under the plate, one frame later, as in the plant."""
+        """Advance a tip's relaxation under the plate by one frame; return its factor."""
         lasting = float(self._hand.table(d, theta).force)
         state, factor = self._relaxation_state, 1.0
         for k, (strength, time) in enumerate(self._relaxation):
@@ -160,7 +160,7 @@ class SimulatedTactile:
         return max(factor, 0.0)
 
     def _press(self, number: int) -> bool:
-        """Apply sample ``number`` to the cells; return False if the plant no longer has it."""
+        """Apply sample ``number`` to the cells; return False if the plant no longer stores it."""
         if self.stage is not None:
             touch = self.stage(number * self._period)
             factor = self._relaxation_factor(max(touch.d, 0.0), touch.theta)
@@ -181,9 +181,9 @@ class SimulatedTactile:
             shear = float(sample.tangential[finger]) * (1.0 - d / self._radius)
             self._model.press(d, theta, 0.0, number * self._period, curvature, factor, shear)
             return True
-        # Remove the part of the factor due to curvature, which the sensor model computes itself.
+        # Remove the curvature part of the factor, which the sensor model computes itself.
         factor *= math.sqrt(1.0 + curvature * self._radius)
-        # Force is proportional to d²: half a tip on the edge of the face has half the force.
+        # Force is proportional to d². If half the tip is beyond the face edge, the force is halved.
         relaxation_factor = float(sample.relaxation_factor[finger])
         d *= math.sqrt(factor / relaxation_factor)
         self._model.press(d, theta, 0.0, number * self._period, curvature, relaxation_factor)
@@ -191,14 +191,14 @@ class SimulatedTactile:
 
 
 class Arrivals:
-    """Arrival times of the frames 0, 1, … of a sensor.
+    """Arrival times of a sensor's frames 0, 1, ….
 
-    Frame k is sampled at start + k · period and due ``delay`` later [s]. It is lost with the
-    probability ``dropped``. Otherwise it is late by a uniformly distributed time of up to
-    ``jitter`` [s]; frames never overtake each other.
+    Frame k is sampled at start + k · period and due ``delay`` [s] later. It is lost with
+    probability ``dropped``. Otherwise, it is late by a uniformly distributed time of up to
+    ``jitter`` [s]. Frames never overtake each other.
     """
 
-    # Covers rounding errors of the clock, so that a frame due now counts as arrived.
+    # Allow for clock rounding errors, so that a frame due now counts as arrived.
     _SLACK = 1e-9
 
     def __init__(
@@ -216,12 +216,12 @@ class Arrivals:
         self._dropped = dropped
         self._jitter = jitter
         self._random = np.random.default_rng(seed)
-        self.number = -1  # of the newest frame
-        self.arrival = start  # time at which it arrived [s]
+        self.number = -1  # number of the newest frame
+        self.arrival = start  # arrival time of the newest frame [s]
         self.arrived = 0  # frames
-        self.missed = 0  # lost frames before the newest
+        self.missed = 0  # number of lost frames before the newest
         self._next = -1
-        self.next_arrival = start + delay  # of the frame after the newest [s]
+        self.next_arrival = start + delay  # arrival time of the next frame [s]
         self._plan()
 
     def take(self, now: float) -> bool:
@@ -236,7 +236,7 @@ class Arrivals:
         return self.number > newest
 
     def _plan(self) -> None:
-        """Determine the next frame that is not lost, and its arrival time."""
+        """Determine the next frame that is not lost and its arrival time."""
         self._next += 1
         while self._dropped > 0.0 and self._random.random() < self._dropped:
             self._next += 1

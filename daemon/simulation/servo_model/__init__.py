@@ -1,5 +1,5 @@
-"""Emulated Dynamixel servos: registers, their effects, and the packets on the bus.
+"""Emulated Dynamixel servos: registers, their effects, and bus packets.
 
-The input are bytes with times, the output are bytes; there is no port. The package shares only the
-control table and the CRC with the client.
+Input and output are bytes with times; there is no port. This package shares only the control table
+and the CRC with the client.
 """

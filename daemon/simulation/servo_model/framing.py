@@ -1,6 +1,6 @@
-"""Dynamixel Protocol 2.0 framing on the servo side: byte stuffing, packets and their parser.
+"""Implement Dynamixel Protocol 2.0 framing on the servo side: byte stuffing, packets and parser.
 
-It shares only the CRC with the client, so that tests of one against the other are meaningful.
+This module shares only the CRC with the client, so that tests against the client are meaningful.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BULK_READ: Final = 0x92
 BULK_WRITE: Final = 0x93
 FAST_BULK_READ: Final = 0x9A
 
-# Error numbers of a status packet; the additional bit 7 (ALERT) means a hardware error.
+# Error numbers in a status packet; the additional bit 7 (ALERT) indicates a hardware error.
 OK: Final = 0x00
 RESULT_FAIL: Final = 0x01
 INSTRUCTION_ERROR: Final = 0x02
@@ -39,7 +39,7 @@ DATA_LIMIT: Final = 0x06
 ACCESS: Final = 0x07
 ALERT: Final = 0x80
 
-MAX_LENGTH: Final = 1024  # longest packet that a servo accepts
+MAX_LENGTH: Final = 1024  # maximum packet length accepted by a servo
 _PREFIX: Final = HEADER + b"\x00"
 _STUFFED: Final = HEADER + b"\xfd"
 _UNSTUFFED: Final = re.compile(rb"\xff\xff\xfd[^\xfd]")
@@ -59,24 +59,24 @@ def status(packet_id: int, error: int, data: bytes = b"") -> bytes:
 
 
 def fast_head(length: int) -> bytes:
-    """Return the beginning of the single reply to a fast group read."""
+    """Return the start of the combined reply to a fast group read."""
     return _PREFIX + bytes((BROADCAST, length & 0xFF, length >> 8 & 0xFF, STATUS))
 
 
 def old_status(packet_id: int) -> bytes:
-    """Return a status packet of Protocol 1.0 without error or data."""
+    """Return a Protocol 1.0 status packet without error or data."""
     body = bytes((packet_id, 2, 0))
     return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
 
 
 def old_pings(data: bytes) -> list[int]:
-    """Return the IDs in the Protocol 1.0 pings in ``data``."""
+    """Return the IDs of all Protocol 1.0 pings in ``data``."""
     found = re.finditer(rb"\xff\xff([\x00-\xfe]\x02\x01)(.)", data, re.DOTALL)
     return [m[1][0] for m in found if ~sum(m[1]) & 0xFF == m[2][0]]
 
 
 class Packet(NamedTuple):
-    """One received packet. ``valid`` is False if only its CRC was wrong."""
+    """Received packet. ``valid`` is False if only its CRC is wrong."""
 
     id: int
     instruction: int
@@ -93,21 +93,21 @@ def _packet(raw: bytes) -> Packet:
 
 
 class PacketParser:
-    """Parser that finds packets in a byte stream like a servo.
+    """Packet parser that behaves like a real servo.
 
-    A header inside a packet (FF FF FD not followed by FD, which stuffing prevents) discards the
-    packet before it, and so does silence of more than ``gap`` seconds within a packet. A packet
-    that was sent without stuffing is therefore never executed.
+    A packet is discarded if a header occurs inside it (FF FF FD not followed by FD, which stuffing
+    prevents), or if it is interrupted by more than ``gap`` seconds of silence. A packet sent
+    without stuffing is therefore never executed.
     """
 
     def __init__(self, gap: float = 0.0015) -> None:
         self.gap = gap
-        self.dropped = 0  # bytes outside of packets
+        self.dropped = 0  # number of bytes outside packets
         self._buffer = bytearray()
         self._last = 0.0
 
     def feed(self, data: bytes, t: float) -> list[Packet]:
-        """Return the packets that are complete with ``data``, which arrived at time t [s]."""
+        """Return the packets completed by ``data``, which arrived at time t [s]."""
         if t - self._last > self.gap:
             self._drop(len(self._buffer))
         self._last = t
@@ -127,7 +127,7 @@ class PacketParser:
         while True:
             start = buffer.find(_PREFIX)
             if start < 0:
-                # Keep bytes that may be the beginning of a header.
+                # Keep bytes that may be the start of a header.
                 keep = next((n for n in (3, 2, 1) if buffer.endswith(_PREFIX[:n])), 0)
                 self._drop(len(buffer) - keep)
                 return None

@@ -1,6 +1,6 @@
-"""Registers of an emulated servo: access rights, defaults, ranges, bytes and invalid writes.
+"""Define an emulated servo's registers: access rights, defaults, ranges and invalid writes.
 
-The further effects of a write are in :mod:`simulation.servo_model.servo`.
+:mod:`simulation.servo_model.servo` implements the effects of writes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One register. ``low`` and ``high`` are the limits of its value by the table alone."""
+    """One register. ``low`` and ``high`` are its limits according to the table alone."""
 
     address: int
     size: int
@@ -45,7 +45,7 @@ class Item:
 
     @property
     def saved(self) -> bool:
-        """True for a register in EEPROM."""
+        """True for EEPROM registers."""
         return self.address < reg.RAM
 
 
@@ -62,7 +62,7 @@ def _gain(address: int, default: int) -> Item:
 
 
 def _items_of(model: ServoModel, firmware: int) -> list[Item]:
-    """Return all registers of a model and firmware, sorted by address."""
+    """Return all registers for a model and firmware, sorted by address."""
     low, high = model.voltage_min, model.voltage_max
     items = [
         _read_only(reg.MODEL_NUMBER, 2, model.number),
@@ -133,9 +133,9 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
 
 
 class ControlTable:
-    """Memory of the registers, with access by value and by the address range of a packet.
+    """Register memory with access by value and by a packet's address range.
 
-    Addresses between the registers read as 0. The servo may write to ``memory`` directly.
+    Addresses between registers read as 0. The servo may write directly to ``memory``.
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
@@ -159,20 +159,20 @@ class ControlTable:
     # --- values ----------------------------------------------------------------------------------
 
     def get(self, address: int) -> int:
-        """Return the value of the item at an address."""
+        """Return the value of the item at ``address``."""
         value: int = self._unpack[address](self.memory, address)[0]
         return value
 
     def set(self, address: int, value: int) -> None:
-        """Store a value regardless of access rights; too large a value is truncated."""
+        """Store a value regardless of access rights; excess bits are truncated."""
         item = self.at[address]
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
 
     def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
-        """Restore the factory defaults from address ``first`` on, except in the items at ``keep``.
+        """Restore factory defaults from address ``first`` upwards, except for items at ``keep``.
 
-        With ``first`` at `control_table.RAM` this has the effect of a power-up.
+        If ``first`` is `control_table.RAM`, this has the effect of a power-up.
         """
         for item in self.items:
             if item.address >= first and item.address not in keep:
@@ -181,31 +181,32 @@ class ControlTable:
     # --- reading ---------------------------------------------------------------------------------
 
     def holds(self, address: int, length: int) -> bool:
-        """Return True if the address range lies inside the table."""
+        """Return True if the address range is inside the table."""
         return length > 0 and address + length <= self.size
 
     def resolve(self, address: int) -> int:
-        """Return the real address of a byte; an indirect data byte refers to another address."""
+        """Return the actual address of a byte; an indirect data byte refers to another address."""
         pointer = self._indirect.get(address)
         if pointer is None:
             return address
         return self.memory[pointer] | self.memory[pointer + 1] << 8
 
     def read(self, address: int, length: int) -> bytes:
-        """Return the bytes of a range inside the table, with indirect data resolved."""
+        """Return the bytes of a table range with indirect data resolved."""
         return bytes(self.memory[self.resolve(i)] for i in range(address, address + length))
 
     def reads(self, address: int, length: int, first: int, last: int) -> bool:
-        """Return True if reading the range includes any byte of ``first`` … ``last``."""
+        """Return True if the range includes any byte of ``first`` … ``last``."""
         return any(first <= self.resolve(i) <= last for i in range(address, address + length))
 
     # --- writing ---------------------------------------------------------------------------------
 
     def plan(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
-        """Return the effect of a write: the error number, and the items with their new values.
+        """Return the effect of a write: error number, and items with their new values.
 
-        A partly written item gives DATA_LENGTH, a read-only or undefined byte ACCESS, and a value
-        outside the item's range DATA_RANGE. After an error the write must not change any item.
+        The error is DATA_LENGTH for a partially written item, ACCESS for a read-only or undefined
+        byte, and DATA_RANGE for a value outside the item's range. After an error, the write must
+        not change any item.
         """
         if not data:
             return framing.DATA_LENGTH, []
@@ -228,7 +229,7 @@ class ControlTable:
         return next(filter(None, refusals), framing.OK), plan
 
     def _refusal(self, item: Item, value: int) -> int:
-        """Return the error of writing ``value`` due to other registers; OK if it is allowed."""
+        """Return the error if other registers prohibit writing ``value``, otherwise OK."""
         memory, address = self.memory, item.address
         if address in _GOALS:
             if memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:

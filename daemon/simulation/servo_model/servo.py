@@ -1,12 +1,12 @@
-"""Emulated Dynamixel X servo: the effects of its registers on a joint of a plant.
+"""Emulate a Dynamixel X servo: the effects of its registers on a plant joint.
 
-It models torque, operating modes, limits, profiles, bus watchdog, hardware errors, shutdown and
-reboot. Packets are in :mod:`simulation.servo_model.servo_bus`. PWM mode, which no known client
-uses, is refused as out of range. The integral gain and a startup from the RAM backup have no
-effect.
+The model includes torque, operating modes, limits, profiles, bus watchdog, hardware errors,
+shutdown and reboot. Packets are handled in :mod:`simulation.servo_model.servo_bus`. PWM mode, which
+is not used by any known client, is rejected as out of range. The integral gain and startup from a
+RAM backup have no effect.
 
-The manuals leave two points open. Here, a write that breaks any rule changes no register, and
-torque on after a shutdown is refused with RESULT_FAIL.
+Two details are not specified in the manuals. Here, a write that violates any rule does not change
+any register, and switching torque on after a shutdown is rejected with RESULT_FAIL.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
     ServoJoint,
 )
 
-REBOOT_TIME = 0.34  # s without an answer
-JUMP_COUNTS = 130  # counts (0.2 rad at the shaft) by which the zero of the encoder jumps
-FAR_GOAL = 0.05  # rad between goal and present angle at torque on, above which a goal counts as far
+REBOOT_TIME = 0.34  # s without a reply
+JUMP_COUNTS = 130  # counts (0.2 rad at the shaft), jump of the encoder zero
+FAR_GOAL = 0.05  # rad, minimum distance of a far goal from the angle at torque on
 _WATCHED_REGISTERS = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 _TUNING_REGISTERS = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
 _CLEAR_FIRMWARE = 42
@@ -40,17 +40,17 @@ _CLEAR_KEY = b"\x01DXL\x22"
 
 
 def prepared(model: ServoModel, mode: int) -> dict[int, int]:
-    """Return the EEPROM values that the daemon needs: no return delay, and the mode."""
+    """Return the EEPROM values required by the daemon: no return delay, and the mode."""
     needed = {reg.RETURN_DELAY_TIME: 0}
     return needed | {reg.OPERATING_MODE: mode} if mode in model.modes else needed
 
 
 class EmulatedServo:
-    """Servo on joint ``joint`` of ``plant``, with factory settings except the values in ``eeprom``.
+    """Servo on joint ``joint`` of ``plant``, with factory defaults except for ``eeprom`` values.
 
-    ``health`` may be set from outside. A ``silent`` servo neither receives nor answers. With
-    ``frozen`` its measured values and its time stay constant. With ``refuses`` it answers every
-    read with an error.
+    ``health`` may be set externally. A ``silent`` servo neither receives nor replies. The measured
+    values and clock of a ``frozen`` servo stay constant. If ``refuses`` is set, the servo replies
+    to every read with an error.
     """
 
     def __init__(
@@ -67,19 +67,19 @@ class EmulatedServo:
     ) -> None:
         self.model = model
         self.firmware = model.firmware if firmware is None else firmware
-        self.fast_reads = model.fast_read(self.firmware)  # answers fast sync and fast bulk read
+        self.fast_reads = model.fast_read(self.firmware)  # supports fast sync and fast bulk read
         self.table = ControlTable(model, self.firmware)
         self._memory = self.table.memory
         self.silent = self.frozen = self.refuses = False
         self.health = ServoHealth(model, heat)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self.recorder = BusRecorder(t)
-        self._watched = 0.0  # time at which the watchdog was last restarted
+        self._watched = 0.0  # last restart time of the watchdog
         self._booted = t
         self._boot_at = -math.inf  # end of a reboot
         self._next_step = math.inf
         self._next_sense = t
-        self._registered: tuple[int, bytes] | None = None  # write that waits for an action
+        self._registered: tuple[int, bytes] | None = None  # write waiting for an action
         for address, value in eeprom.items():
             self.table.set(address, value)
         self._start(t)
@@ -92,12 +92,12 @@ class EmulatedServo:
 
     @property
     def shadow(self) -> int:
-        """Second ID, whose instructions are executed without an answer; 253 and up disable it."""
+        """Second ID, whose instructions are executed without a reply; 253 and above disable it."""
         return self._memory[reg.SHADOW_ID]
 
     @property
     def old_protocol(self) -> bool:
-        """True if it is set to Protocol 1.0, of which this emulator only answers the ping."""
+        """True if set to Protocol 1.0, for which this emulator only supports ping."""
         return self._memory[reg.PROTOCOL_TYPE] == 1
 
     @property
@@ -110,7 +110,7 @@ class EmulatedServo:
         return self._memory[reg.RETURN_DELAY_TIME] * reg.RETURN_DELAY_UNIT
 
     def answers_reads(self, servo_id: int, fast: bool) -> bool:
-        """Return True if it answers a group read of ``servo_id``."""
+        """Return True if this servo replies to a group read of ``servo_id``."""
         memory = self._memory
         if memory[reg.ID] != servo_id or not memory[reg.STATUS_RETURN_LEVEL]:
             return False
@@ -118,7 +118,7 @@ class EmulatedServo:
 
     @property
     def alert(self) -> int:
-        """Alert bit of its status packets."""
+        """Alert bit in status packets."""
         return framing.ALERT if self._memory[reg.HARDWARE_ERROR_STATUS] else 0
 
     @property
@@ -128,7 +128,7 @@ class EmulatedServo:
 
     @property
     def watchdog(self) -> float:
-        """Time of the bus watchdog [s]; 0 while it is off or has stopped the motor."""
+        """Bus watchdog time [s]; 0 while it is off or has stopped the motor."""
         ticks = self._memory[reg.BUS_WATCHDOG]
         return ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else 0.0
 
@@ -141,7 +141,7 @@ class EmulatedServo:
         return self._memory[reg.OPERATING_MODE]
 
     def awake(self, t: float) -> bool:
-        """Return True if it is neither silent nor rebooting at time t."""
+        """Return True if the servo is neither silent nor rebooting at time t."""
         return not self.silent and t >= self._boot_at
 
     # --- time ------------------------------------------------------------------------------
@@ -152,14 +152,14 @@ class EmulatedServo:
         self.recorder.heard(t, self._memory[reg.TORQUE_ENABLE] != 0)
 
     def next_event(self) -> float:
-        """Return the time [s] at which :meth:`act` must be called next."""
+        """Return the time [s] of the next required :meth:`act` call."""
         due = min(self._next_step, self._next_sense)
         if self._boot_at > -math.inf:
             return min(due, self._boot_at)
         return min(due, self._watched + self.watchdog) if self._armed else due
 
     def act(self, t: float) -> None:
-        """Handle the events due at time t; the plant must have been advanced to t."""
+        """Handle events due at time t; the plant must already have been advanced to t."""
         if self._boot_at > -math.inf:
             if t < self._boot_at:
                 self._next_sense = max(self._next_sense, self._boot_at)
@@ -183,7 +183,7 @@ class EmulatedServo:
     # --- instructions ----------------------------------------------------------------------
 
     def read(self, address: int, length: int, t: float) -> bytes | None:
-        """Return the bytes of an address range, or None if the servo refuses the read."""
+        """Return the bytes of an address range, or None if the servo rejects the read."""
         table = self.table
         if self.refuses or not table.holds(address, length):
             return None
@@ -194,7 +194,7 @@ class EmulatedServo:
         return table.read(address, length)
 
     def write(self, address: int, data: bytes, t: float) -> int:
-        """Write an address range; return the error number, 0 for success."""
+        """Write an address range; return the error number, which is 0 for success."""
         error, plan = self.table.plan(address, data)
         values = {item.address: value for item, value in plan}
         self.recorder.goals(values, self._joint, self.torque_on, error != framing.OK)
@@ -215,7 +215,7 @@ class EmulatedServo:
         return framing.OK
 
     def register(self, address: int, data: bytes) -> int:
-        """Store a write until :meth:`action`; return the error number."""
+        """Store a write until :meth:`action` is called; return the error number."""
         error, _ = self.table.plan(address, data)
         if not error:
             self._registered = address, data
@@ -223,7 +223,7 @@ class EmulatedServo:
         return error
 
     def action(self, t: float) -> int:
-        """Execute the write that was registered last; return the error number."""
+        """Execute the last registered write; return the error number."""
         if self._registered is None:
             return framing.INSTRUCTION_ERROR
         (address, data), self._registered = self._registered, None
@@ -231,7 +231,7 @@ class EmulatedServo:
         return self.write(address, data, t)
 
     def reboot(self, t: float) -> None:
-        """Switch torque off, and restore the RAM as after a power-up after REBOOT_TIME."""
+        """Switch torque off, and restart with power-up RAM values after REBOOT_TIME."""
         self.table.set(reg.TORQUE_ENABLE, 0)
         self._joint.drive()
         self._next_step = math.inf
@@ -239,7 +239,7 @@ class EmulatedServo:
         self._next_sense = self._boot_at
 
     def factory_reset(self, option: bytes, t: float) -> int:
-        """Restore factory defaults (FF: all, 01: not ID, 02: not ID and baud rate), then reboot."""
+        """Restore defaults (FF: all, 01: except ID, 02: except ID and baud rate), then reboot."""
         if len(option) != 1:
             return framing.DATA_LENGTH
         keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option[0])
@@ -251,7 +251,7 @@ class EmulatedServo:
         return framing.OK
 
     def clear(self, parameters: bytes, t: float) -> int:
-        """Reset the position to a single turn; this fails while the shaft moves."""
+        """Reset the position to a single turn; this fails while the shaft is moving."""
         if self.firmware < _CLEAR_FIRMWARE:
             return framing.INSTRUCTION_ERROR
         if parameters != _CLEAR_KEY:
@@ -266,7 +266,7 @@ class EmulatedServo:
         return framing.OK
 
     def report(self, t: float) -> dict[str, Any]:
-        """Return the state of the servo and the record of received goals."""
+        """Return the servo state and the record of received goals."""
         stopped = self._memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR
         return {
             "id": self.id,
@@ -280,7 +280,7 @@ class EmulatedServo:
         }
 
     def fault(self, kind: str, t: float) -> None:
-        """Begin one of SERVO_FAULTS. ``recover`` leaves a latched hardware error until a reboot."""
+        """Start one of SERVO_FAULTS. ``recover`` does not clear a latched hardware error."""
         match kind:
             case "silent" | "answer":
                 self.silent = kind == "silent"
@@ -345,7 +345,7 @@ class EmulatedServo:
         self._joint.tune()
 
     def _start(self, t: float) -> None:
-        """Start after power-up or at the end of a reboot."""
+        """Start up after power-up or reboot."""
         table = self.table
         table.reset(first=reg.RAM)
         self.health.restart()
@@ -353,7 +353,7 @@ class EmulatedServo:
         self._joint.forget_turns()
         self._registered = None
         self._reset_goals()
-        if self._memory[reg.STARTUP_CONFIGURATION] & 1:  # 0 if the firmware lacks this register
+        if self._memory[reg.STARTUP_CONFIGURATION] & 1:  # 0 if the firmware lacks this register.
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.hold()
         self._next_step = math.inf
@@ -363,7 +363,7 @@ class EmulatedServo:
     # --- internal events -------------------------------------------------------------------
 
     def _stop(self) -> None:
-        """Stop by the bus watchdog: hold the present position, with torque still on."""
+        """Apply a bus watchdog stop: hold the present position with torque still on."""
         table = self.table
         if self.mode == reg.CURRENT_MODE:
             table.set(reg.GOAL_CURRENT, 0)
@@ -381,7 +381,7 @@ class EmulatedServo:
             self._fail(bit)
 
     def _fail(self, bit: int) -> None:
-        """Set a hardware error and its alert bit, and shut down if the mask has its bit."""
+        """Set a hardware error and its alert bit; shut down if it is in the shutdown mask."""
         status = self.table.get(reg.HARDWARE_ERROR_STATUS) | 1 << bit
         self.table.set(reg.HARDWARE_ERROR_STATUS, status)
         if self.table.shut_down and self.torque_on:
@@ -390,25 +390,25 @@ class EmulatedServo:
 
 
 class BusRecorder:
-    """Record of the goals sent to a servo, for tests of a daemon against its limits.
+    """Record of the goals sent to a servo, to test the daemon's limits.
 
-    Goals are in counts as received. They are recorded even if the servo refused them.
+    Goals are recorded in counts as received, even if the servo rejects them.
     """
 
     def __init__(self, t: float) -> None:
-        self._goals: dict[int, tuple[int, int]] = {}  # register → lowest and highest value, counts
+        self._goals: dict[int, tuple[int, int]] = {}  # register → minimum and maximum counts
         self._refused = 0
-        self._torque_on = 0  # number of times
+        self._torque_on = 0  # number of torque-on events
         self._torque_t: float | None = None
         self._far = 0
         self._farthest = 0.0  # rad
         self._last = t  # time of the last packet
-        self._quiet = 0.0  # s, longest silence with torque on
+        self._quiet = 0.0  # s, longest silence while torque is on
         self._fired = 0
         self._fired_t: float | None = None
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
-        """Record a write, except goals near the present angle while torque is off."""
+        """Record a write, except for goals near the present angle while torque is off."""
         goals = _WATCHED_REGISTERS & values.keys()
         self._refused += refused and bool(goals)
         for address in goals:
@@ -419,7 +419,7 @@ class BusRecorder:
             self._goals[address] = min(least, value), max(greatest, value)
 
     def torque_on(self, t: float, joint: ServoJoint, mode: int, position: int) -> None:
-        """Record torque on at time t with this goal [counts]."""
+        """Record torque on at time t with the goal ``position`` [counts]."""
         self._torque_on += 1
         self._torque_t = self._last = t
         if mode in POSITION_MODES:
@@ -434,12 +434,12 @@ class BusRecorder:
         self._last = t
 
     def fired(self, t: float) -> None:
-        """Record that the bus watchdog stopped the motor."""
+        """Record a motor stop by the bus watchdog."""
         self._fired += 1
         self._fired_t = t
 
     def report(self, t: float, joint: ServoJoint, torque: bool) -> dict[str, Any]:
-        """Return the record at time t for JSON, in SI units and joint coordinates."""
+        """Return the record at time t in JSON format, with SI units and joint coordinates."""
         angles = [joint.goal_angle(each) for each in self._goals.get(reg.GOAL_POSITION, ())]
         currents = [joint.goal_current(each) for each in self._goals.get(reg.GOAL_CURRENT, ())]
         quiet = t - self._last
@@ -460,5 +460,5 @@ class BusRecorder:
 
 
 def _away(joint: ServoJoint, position: int) -> float:
-    """Return the distance between a goal and the present angle of the joint [rad]."""
+    """Return the distance between a goal and the present joint angle [rad]."""
     return abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))

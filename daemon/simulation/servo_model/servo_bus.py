@@ -1,10 +1,10 @@
-"""Bus of emulated Dynamixel servos: instruction packets in, status packets out, byte by byte.
+"""Emulate a bus of Dynamixel servos: instruction packets in, status packets out.
 
-Input and output are bytes with times, so that tests and fuzzers need no port;
-:mod:`simulation.emulator.pty_bus` adds the pseudo-terminal. In group reads a servo answers after
-the previous one in the list, so servos after a missing one stay silent. Control table backups,
-which no known client uses, are answered with an instruction error. Servos that are set to Protocol
-1.0 answer only its ping.
+Input and output are bytes with times, so tests and fuzzers need no port;
+:mod:`simulation.emulator.pty_bus` adds the pseudo-terminal. In group reads, each servo replies
+after the previous one in the list, so servos after a missing servo stay silent. Control table
+backups, which are not used by any known client, return an instruction error. Servos that are set to
+Protocol 1.0 reply only to its ping.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
 _GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}
 _FAST_READS = frozenset((framing.FAST_SYNC_READ, framing.FAST_BULK_READ))
 _READS = _GROUP_READS | {framing.PING, framing.READ}
-_FACTORY_RESET_GUARD = 42  # firmware that ignores a broadcast reset of everything
+_FACTORY_RESET_GUARD = 42  # first firmware that ignores a full factory reset by broadcast
 _SPAN = struct.Struct("<HH")  # address, length
 _ITEM = struct.Struct("<BHH")  # ID, address, length
 
 
 class TimedReply(NamedTuple):
-    """Bytes to send ``delay`` s after the wire is free; ``late`` delays only this reply."""
+    """Bytes to send ``delay`` [s] after the wire is free; ``late`` delays only this reply."""
 
     delay: float
     data: bytes
@@ -50,7 +50,7 @@ class TimedReply(NamedTuple):
 
 
 class ServoBus:
-    """Servos that share one wire and one plant. Damaged packets are not answered."""
+    """Servos that share one wire and one plant. They do not reply to corrupted packets."""
 
     def __init__(
         self,
@@ -64,9 +64,9 @@ class ServoBus:
         self.faults = FaultSource(seed)
         self.parser = PacketParser()
         self.lag = 0.0  # s by which a reading may be older than its reply
-        self.packets = 0  # packets received
+        self.packets = 0  # number of packets received
         self._now = -math.inf
-        self._due = -math.inf  # no servo has an event before this time
+        self._due = -math.inf  # time before which no servo has an event
 
     @classmethod
     def from_settings(
@@ -79,11 +79,11 @@ class ServoBus:
         factory: bool = False,
         t: float = 0.0,
     ) -> ServoBus:
-        """Create the servos of the settings, one per joint, left first.
+        """Create the servos in the settings, one per joint, left first.
 
-        ``baud`` > 0 and ``ids`` replace the rate and the IDs of the settings. With ``factory`` all
-        other registers have their factory defaults. Raises ValueError for a rate that the model
-        does not support.
+        ``baud`` > 0 and ``ids`` replace the baud rate and the IDs in the settings. If ``factory``
+        is True, all other registers have their factory defaults. Raises ValueError if the model
+        does not support the baud rate.
         """
         servos = settings.servos
         model = by_name(servos.model)
@@ -107,11 +107,11 @@ class ServoBus:
 
     @property
     def now(self) -> float:
-        """Time up to which the bus was advanced [s]."""
+        """Time to which the bus has been advanced [s]."""
         return self._now
 
     def advance(self, t: float) -> None:
-        """Advance plant and servos to time t [s], with the events of each servo at their times."""
+        """Advance plant and servos to time t [s], handling each servo event at its time."""
         if t <= self._now:
             return
         if t >= self._due:
@@ -125,17 +125,17 @@ class ServoBus:
         self._now = t
 
     def next_event(self) -> float:
-        """Return the time of the next servo event [s]; it may be too early, but never too late."""
+        """Return the time of the next servo event [s], which may be early but never late."""
         return self._due
 
     # --- bytes -----------------------------------------------------------------------------
 
     def feed(self, data: bytes, t: float, baud: int = 0) -> bytes:
-        """Return the answers to ``data``, which arrives at time t, without their delays."""
+        """Return the replies to ``data``, which arrives at time t, without their delays."""
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
-        """Return the answers to ``data`` with their delays. ``baud`` 0 reaches all servos."""
+        """Return the replies to ``data`` with their delays; ``baud`` 0 reaches all servos."""
         if t >= self._due or t > self._now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []
@@ -171,7 +171,7 @@ class ServoBus:
         ]
 
     def fault(self, kind: str, value: float, t: float) -> None:
-        """Begin a fault; ``value`` is a probability for LINE_FAULTS, an ID for SERVO_FAULTS."""
+        """Start a fault; ``value`` is a probability for LINE_FAULTS, an ID for SERVO_FAULTS."""
         self._due = -math.inf
         if kind in LINE_FAULTS:
             setattr(self.faults.rates, kind.replace("-", "_"), value)
@@ -180,7 +180,7 @@ class ServoBus:
                 servo.fault(kind, t)
 
     def report(self, t: float) -> list[dict[str, Any]]:
-        """Return the state and the record of each servo."""
+        """Return each servo's state and record."""
         self.advance(t)
         return [servo.report(t) for servo in self.servos]
 
@@ -196,18 +196,18 @@ class ServoBus:
         if packet.id == BROADCAST:
             return self._broadcast(packet, servos, t)
         if instruction == framing.STATUS:
-            return []  # the answer of another servo, or an echo
-        # Status return level: 0 answers only pings, 1 also reads, 2 everything.
+            return []  # reply of another servo, or an echo
+        # Status return level: 0 replies only to pings, 1 also to reads, 2 to all instructions.
         needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)
         replies = []
         for servo in servos:
             if servo.id == packet.id:
-                # The reply uses level, delay and ID from before the instruction.
+                # The reply uses the level, delay and ID from before the instruction.
                 level = servo.table.get(reg.STATUS_RETURN_LEVEL)
                 delay, name = servo.return_delay, servo.id
                 error, data = _execute(servo, instruction, packet.parameters, t)
                 if level >= needed:
-                    # The alert bit is that from after the instruction.
+                    # The reply uses the alert bit from after the instruction.
                     status = framing.status(name, error | servo.alert, data)
                     replies.append(TimedReply(delay, status))
             elif servo.shadow == packet.id:
@@ -229,7 +229,7 @@ class ServoBus:
             _write_each(_sync_items(data), servos, t)
         elif instruction == framing.BULK_WRITE:
             _write_each(_bulk_items(data), servos, t)
-        else:  # other broadcast instructions are executed without an answer
+        else:  # Other broadcast instructions are executed without a reply.
             for servo in servos:
                 guarded = servo.firmware >= _FACTORY_RESET_GUARD and data == b"\xff"
                 if instruction != framing.FACTORY_RESET or not guarded:
@@ -254,7 +254,7 @@ class ServoBus:
                     [_status(servo, *_execute(servo, framing.READ, span, t)) for servo in same]
                 )
                 continue
-            # Each CRC covers all bytes before it, including the earlier CRCs.
+            # Each CRC covers all preceding bytes, including earlier CRCs.
             (servo,) = same
             values = servo.read(address, length, t)
             error = framing.ACCESS if values is None else framing.OK
@@ -271,9 +271,9 @@ class ServoBus:
 
 @lru_cache(maxsize=32)
 def _requested(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], bytes]:
-    """Return (ID, address, length) of each part of a group read, and the head of a fast reply.
+    """Return (ID, address, length) for each part of a group read, and the start of a fast reply.
 
-    The result is empty if the packet is incomplete or contains an ID twice.
+    The result is empty if the packet is incomplete or contains the same ID twice.
     """
     requested: list[tuple[int, int, int]] = []
     if instruction not in _SYNC_READS:
@@ -290,7 +290,7 @@ def _requested(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]
 def _write_each(
     items: Iterable[tuple[int, int, bytes]], servos: list[EmulatedServo], t: float
 ) -> None:
-    """Write each servo's part of a group write: ID, address, data."""
+    """Write each item (ID, address, data) of a group write."""
     for servo_id, address, data in items:
         for servo in servos:
             if servo_id in (servo.id, servo.shadow):
@@ -321,7 +321,7 @@ def _status(servo: EmulatedServo, error: int, data: bytes = b"") -> TimedReply:
 
 
 def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> tuple[int, bytes]:
-    """Execute an instruction on a servo; return error number and data of the reply."""
+    """Execute an instruction on a servo; return the reply's error number and data."""
     match instruction:
         case framing.PING:
             return framing.OK, struct.pack("<HB", servo.model.number, servo.firmware)
@@ -352,10 +352,10 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
 
 
 def _at_once(replies: list[TimedReply]) -> list[TimedReply]:
-    """Return the replies of servos with the same ID as one garbled reply, in which 0 bits win.
+    """Merge the replies of servos with the same ID into one corrupted reply; 0 bits win.
 
-    Servos never start at exactly the same time, so even equal replies collide: each begins one byte
-    after the previous one.
+    Servos never start at exactly the same time, so even identical replies collide. Here, each reply
+    begins one byte after the previous one.
     """
     if len(replies) < 2:
         return replies

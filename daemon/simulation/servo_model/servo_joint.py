@@ -1,9 +1,9 @@
-"""Physical side of an emulated servo: the connection of its registers to a joint of the plant.
+"""Emulate the physical side of a servo: connect its registers to a joint of the plant.
 
 `ServoJoint` converts counts to angles (turns, homing offset, drive direction), follows the profile,
 drives the plant according to the operating mode, and writes the present values to the control
 table. `ServoHealth` models heat (`ServoHeat`), supply voltage and overload. The manuals do not
-specify the time until overload; here it is OVERLOAD_TIME of current at the configured limit.
+specify the time to overload; here, it is OVERLOAD_TIME of current at the configured limit.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
-STEP_TIME = 0.001  # s, step of trajectories and velocity mode
-OVERLOAD_TIME = 2.0  # s at the current limit
+STEP_TIME = 0.001  # s, time step for trajectories and velocity mode
+OVERLOAD_TIME = 2.0  # s at the current limit until overload
 SENSE_INTERVAL = 0.010  # s between checks of heat, voltage and overload
-_VOLTAGE = 0  # bit of the hardware error status
+_VOLTAGE = 0  # bit in the hardware error status
 POSITION_MODES = (
     reg.POSITION_MODE,
     reg.EXTENDED_POSITION_MODE,
@@ -30,12 +30,12 @@ POSITION_MODES = (
 )
 _PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # counts/s per unit
 _PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-_ARRIVAL_COUNTS = 20  # counts, tolerance of arrival at the goal
+_ARRIVAL_COUNTS = 20  # counts, tolerance for arrival at the goal
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 
 
 class ServoJoint:
-    """Joint ``joint`` of ``plant``, driven by a servo with the control table ``table``."""
+    """Joint ``joint`` of ``plant``, driven by a servo with control table ``table``."""
 
     def __init__(
         self,
@@ -53,9 +53,9 @@ class ServoJoint:
         self._joint = joint
         self._scale = scale
         self.stuck: int | None = None  # reading of a stuck encoder [counts]
-        self.shift = 0  # error of the encoder's zero [counts]
-        self._turns = 0  # whole turns that were subtracted from the position
-        self._load = scale.direction / model.stall_current  # load per ampere, with the servo's sign
+        self.shift = 0  # encoder zero error [counts]
+        self._turns = 0  # full turns subtracted from the position
+        self._load = scale.direction / model.stall_current  # load per ampere, with servo sign
         self._speed = scale.direction * reg.VELOCITY_UNIT / scale.velocity / model.no_load_speed
 
     @property
@@ -70,7 +70,7 @@ class ServoJoint:
 
     @property
     def current_limit(self) -> float:
-        """Current limit of the registers [A]."""
+        """Current limit according to the registers [A]."""
         if not self._model.senses_current:
             return self._model.stall_current
         return self._table.get(reg.CURRENT_LIMIT) * self._model.current_unit
@@ -78,13 +78,13 @@ class ServoJoint:
     # --- position ----------------------------------------------------------------------------
 
     def encoder(self) -> int:
-        """Return the count of the encoder over all turns."""
+        """Return the multi-turn encoder count."""
         if self.stuck is not None:
             return self.stuck
         return self._scale.position_counts(self._plant.q.item(self._joint)) + self.shift
 
     def forget_turns(self) -> int:
-        """Reset the position to a single turn; return its decrease [counts]."""
+        """Reset the position to a single turn; return the decrease [counts]."""
         before = self._turns
         self._turns = self.encoder() // reg.COUNTS_PER_TURN
         return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
@@ -95,12 +95,12 @@ class ServoJoint:
         return self.sign * within + self._table.get(reg.HOMING_OFFSET)
 
     def goal_angle(self, counts: float) -> float:
-        """Return the joint angle [rad] of a goal position."""
+        """Return the joint angle [rad] for a goal position."""
         within = self.sign * (counts - self._table.get(reg.HOMING_OFFSET))
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_current(self, counts: int) -> float:
-        """Return a goal current [A], positive closing; for a limit the sign has no meaning."""
+        """Return a goal current [A], positive when closing; the sign of a limit has no meaning."""
         return self._scale.amperes(self.sign * counts)
 
     # --- trajectory --------------------------------------------------------------------------
@@ -117,7 +117,7 @@ class ServoJoint:
         target = float(table.get(reg.GOAL_POSITION))
         acceleration, speed = table.get(reg.PROFILE_ACCELERATION), table.get(reg.PROFILE_VELOCITY)
         if not speed:
-            profile.hold(target)  # a profile velocity of 0 disables the profile
+            profile.hold(target)  # Profile velocity 0 disables the profile.
         elif memory[reg.DRIVE_MODE] & 4:
             profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
         else:
@@ -132,7 +132,7 @@ class ServoJoint:
         return mode == reg.VELOCITY_MODE
 
     def follow(self) -> None:
-        """Advance the trajectory, or the position of velocity mode, by one STEP_TIME."""
+        """Advance the trajectory, or the position in velocity mode, by STEP_TIME."""
         mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             self.profile.step(STEP_TIME)
@@ -146,10 +146,10 @@ class ServoJoint:
     # --- plant -------------------------------------------------------------------------------
 
     def tune(self) -> None:
-        """Pass gains and PWM registers to the plant; the integral gain has no effect.
+        """Pass the gain and PWM registers to the plant; the integral gain has no effect.
 
-        The torque of the servo is K_P·error − K_D·Δposition per millisecond, with K_P = P / 128 and
-        K_D = D / 16 (e-Manual, position PID gain).
+        The servo torque is K_P·error − K_D·Δposition per millisecond, with K_P = P / 128 and K_D =
+        D / 16 (e-Manual, position PID gain).
         """
         get, (d, _, p) = self._table.get, self._model.position_gains
         stiffness = get(reg.POSITION_P_GAIN) / p
@@ -158,7 +158,7 @@ class ServoJoint:
         self._plant.tune(self._joint, stiffness, damping, duty)
 
     def drive(self) -> None:
-        """Command the plant according to the registers."""
+        """Drive the plant according to the registers."""
         memory, table, joint = self._memory, self._table, self._joint
         mode = memory[reg.OPERATING_MODE]
         if not memory[reg.TORQUE_ENABLE]:
@@ -183,7 +183,7 @@ class ServoJoint:
             ampere = plant.measured_current(joint)
             if self._model.senses_current:
                 current = scale.current_counts(ampere)
-            else:  # the register is present load, 0.1 %
+            else:  # The register contains the present load in 0.1 %.
                 current = round(1000.0 * self._load * ampere)
             current = max(-32768, min(32767, self.sign * current))
             velocity = self.sign * scale.velocity_counts(plant.dq.item(joint))
@@ -210,15 +210,15 @@ class ServoJoint:
 
 
 ROOM_TEMPERATURE = 25.0  # °C
-_THERMOMETER_LAG = 4.0  # s, lag of the thermometer
-_CONVECTION = 0.006  # 1/K, relative increase of the cooling with the temperature difference
-_STEP_MAX = 1.0  # s, longest step
-# counts; without this tolerance, rounding of the square root prevents arrival.
+_THERMOMETER_LAG = 4.0  # s
+_CONVECTION = 0.006  # 1/K, relative increase in cooling with temperature difference
+_STEP_MAX = 1.0  # s, maximum step
+# counts; without this tolerance, square root rounding would prevent arrival.
 _ARRIVAL_TOLERANCE = 1e-6
 
 
 class Profile:
-    """Trajectory to a goal, velocity- or time-based, with its position and velocity.
+    """Velocity- or time-based trajectory to a goal, with its position and velocity.
 
     A limit of 0 means no limit.
     """
@@ -227,8 +227,8 @@ class Profile:
         self.position = 0.0  # counts
         self.velocity = 0.0  # counts/s
         self.target = 0.0
-        self.speed = 0.0  # velocity limit, 0: none [counts/s]
-        self.acceleration = 0.0  # acceleration limit, 0: none [counts/s²]
+        self.speed = 0.0  # velocity limit, 0 for none [counts/s]
+        self.acceleration = 0.0  # acceleration limit, 0 for none [counts/s²]
 
     @property
     def busy(self) -> bool:
@@ -236,7 +236,7 @@ class Profile:
         return self.position != self.target or self.velocity != 0.0
 
     def hold(self, position: float) -> None:
-        """Rest at a position."""
+        """Stop at ``position``."""
         self.position = self.target = position
         self.velocity = 0.0
 
@@ -247,7 +247,7 @@ class Profile:
             self.hold(target)
 
     def aim_in(self, target: float, duration: float, ramp: float) -> None:
-        """Set a target to be reached in ``duration`` s, with ramps of ``ramp`` s (time-based)."""
+        """Set a target to reach in ``duration`` [s] with ramps of ``ramp`` [s] (time-based)."""
         if duration <= 0.0:
             self.hold(target)
             return
@@ -256,7 +256,7 @@ class Profile:
         self.aim(target, speed, speed / ramp if ramp > 0.0 else 0.0)
 
     def step(self, dt: float) -> None:
-        """Advance by dt [s] on a trapezoidal profile without overshoot."""
+        """Advance by dt [s] on a trapezoidal profile that does not overshoot."""
         distance = self.target - self.position
         if distance == 0.0 and self.velocity == 0.0:
             return
@@ -267,7 +267,7 @@ class Profile:
             return
         limit = self.speed if self.speed > 0.0 else math.inf
         if self.acceleration > 0.0:
-            # Highest speed from which it can stop at the target, including the coming step.
+            # Maximum speed that allows stopping at the target, including the next step.
             a = self.acceleration
             stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
             speed = math.copysign(min(limit, stop), distance)
@@ -286,10 +286,10 @@ class Profile:
 class ServoHeat:
     """Thermal model of one servo. ``ambient`` [°C] may be changed at any time.
 
-    It is independent of the daemon's model (`kinematics.hand.servo_heat`) and has other constants.
-    The resistance of copper increases with temperature, convection at the case increases with the
-    temperature difference, and the thermometer lags behind the case. ``heating``, ``cooling`` and
-    ``capacity`` are factors of the values of the servo model.
+    This model is independent of the daemon's model (`kinematics.hand.servo_heat`) and uses
+    different constants. Copper resistance increases with temperature, convection at the case
+    increases with the temperature difference, and the thermometer lags behind the case temperature.
+    ``heating``, ``cooling`` and ``capacity`` scale the servo model's values.
     """
 
     def __init__(
@@ -304,7 +304,7 @@ class ServoHeat:
 
     @classmethod
     def of(cls, settings: Settings) -> Self:
-        """Return a servo of the settings' model at ambient temperature."""
+        """Create the thermal model for the servo in the settings, at ambient temperature."""
         simulation = settings.simulation
         heat = cls(by_name(settings.servos.model), *simulation.servo_heat)
         heat.ambient = simulation.ambient
@@ -337,7 +337,7 @@ class ServoHeat:
 class ServoHealth:
     """Supply voltage, heat and overload of a servo.
 
-    ``supply``, the voltage without load [V], and ``heat`` may be changed from outside.
+    ``supply`` (no-load voltage [V]) and ``heat`` may be changed externally.
     """
 
     def __init__(self, model: ServoModel, heat: ServoHeat | None = None) -> None:
@@ -354,17 +354,17 @@ class ServoHealth:
 
     @property
     def voltage(self) -> float:
-        """Supply voltage less the voltage drop due to the servo's current [V]."""
+        """Supply voltage minus the voltage drop due to the servo current [V]."""
         return self.supply - reg.SAG * self._current
 
     def restart(self) -> None:
-        """Restart as after a power-up; temperatures stay."""
+        """Restart as after a power-up; temperatures are retained."""
         self._overload = 0.0
 
     def sense(self, table: ControlTable, current: float, pressed: bool) -> list[int]:
-        """Advance by SENSE_INTERVAL seconds and return the bits of the present hardware errors.
+        """Advance by SENSE_INTERVAL and return the bits of all current hardware errors.
 
-        ``current`` is in A; ``pressed`` is True if it is at the configured limit.
+        ``pressed`` is True if ``current`` [A] is at the configured limit.
         """
         self._current = abs(current)
         self.heat.step(current, SENSE_INTERVAL)
