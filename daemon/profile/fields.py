@@ -1,4 +1,4 @@
-"""Define the number types of settings with their bounds, and the base class of sections."""
+"""Define the number types for settings, with their bounds, and the base class for sections."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pydantic_core import PydanticCustomError
 from softfinger.daemon.backends import Kind, backend, known, known_servo_models
 from softfinger.daemon.errors import PluginError
 
-# Every number has two bounds, because implausible values are typing errors and must not reach an
-# integral. Whether a bound itself is allowed depends on the quantity.
+# Every number has two bounds, because implausible values are typing errors and must not be used in
+# computations. Whether a bound itself is allowed depends on the quantity.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
@@ -34,20 +34,21 @@ Processor = Annotated[int, Field(ge=0, le=1023)]
 
 
 def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
-    """Declare a key of a section.
+    """Declare a key in a section.
 
-    The profile reference, documentation and JSON schema are generated from these declarations.
+    The profile reference, the documentation and the JSON schema are generated from these
+    declarations.
 
     Parameters
     ----------
     default
-        Value of the built-in simulated hand.
+        Value for the built-in simulated hand.
     unit
-        SI unit of the value or of each of its elements; empty if it has none.
+        SI unit of the value or of each element, empty for a dimensionless value.
     description
         Meaning of the value, in one or two sentences.
     **options
-        Bounds and examples, as in :func:`pydantic.Field`.
+        Bounds and examples, passed to :func:`pydantic.Field`.
     """
     if unit:
         options["json_schema_extra"] = {"unit": unit}
@@ -55,16 +56,16 @@ def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
 
 
 class Section(BaseModel):
-    """Base class of all sections: immutable and strict.
+    """Base class of all sections, which are immutable and strict.
 
-    Unknown keys are errors. An integer is accepted for a float, but strings are never converted.
+    Unknown keys are errors. Integers are accepted as floats, but strings are never converted.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 def names_backend(kind: Kind) -> AfterValidator:
-    """Return a validator of backend names whose errors are worded like those of a Literal."""
+    """Return a backend name validator whose error messages are worded like those of a Literal."""
 
     def check(name: str) -> str:
         try:
