@@ -1,4 +1,4 @@
-"""Run ``softfinger status``: describe the state of the running hand in one line."""
+"""Run ``softfinger status``: describe the running hand's state in one line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the next state; return 1 if the hand has a fault, 2 if no state arrives."""
+    """Print the next state. Return 1 if the hand has a fault, 2 if no state arrives."""
     try:
         with Hand(arguments.address, keys=arguments.keys) as hand:
             state = hand.state()
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def describe(state: HandState) -> str:
-    """Return a line with mode, mean force and the object's angle and width, or the fault."""
+    """Return a line with the mode, mean force, object angle and object width, or the fault."""
     if state.fault:
         return f"{state.mode}: {state.fault}"
     parts = [state.mode]
@@ -51,7 +51,7 @@ def describe(state: HandState) -> str:
 
 
 def why_invalid(state: HandState) -> str:
-    """Return the reason why the fingers' estimates are invalid; empty if they are valid."""
+    """Return the reason why the fingers' estimates are invalid, or an empty string."""
     reasons = {name: state.finger(name).invalid for name in FINGERS}
     return "; ".join(
         f"{name} not valid: {reason}"
