@@ -1,6 +1,6 @@
 """Look up servo, tactile and shape backends by name, and import them on demand.
 
-Built-in backends are listed in a dict. Plugins are entry points of installed packages, in the
+Built-in backends are listed in `BUILT_IN`. Plugins are entry points of installed packages, in the
 groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A plugin is a class,
 or for a shape a function, with the same arguments as the built-in backends. It may define these
 attributes:

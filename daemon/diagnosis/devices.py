@@ -78,7 +78,7 @@ def check_servos(settings: Settings) -> list[Finding]:
 
 
 def _wait_for(line: ServoLine, settings: Settings) -> None:
-    """Wait up to ``servos.open_timeout`` for servos that have not replied yet, like `run`."""
+    """Wait up to ``servos.open_timeout`` for servos that have not replied yet, as `run` does."""
     end = time.monotonic() + settings.servos.open_timeout
     missing = [settings.servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
     while missing:

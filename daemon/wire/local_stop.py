@@ -126,7 +126,7 @@ def _name(address: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Yield candidate folders: for a system service, for a login session, and as fallback."""
+    """Yield candidate folders: for a system service, for a login session, and fallbacks."""
     for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"):
         if place := os.environ.get(name):
             yield Path(place.split(":")[0]) / "softfinger"
@@ -141,7 +141,7 @@ def _folders() -> Iterator[Path]:
 
 
 def _own_folder() -> tuple[Path, str]:
-    """Return the first usable folder and a notice about unusable ones; create it if necessary.
+    """Return the first usable folder, created if necessary, and a notice about unusable ones.
 
     Raises OSError if all candidates are unusable.
     """

@@ -16,7 +16,7 @@ from softfinger.daemon.wire.schema import TactileFrame
 
 
 class Softfinger(Robot):
-    """LeRobot robot for the softfinger hand.
+    """LeRobot `Robot` implementation for the softfinger hand.
 
     Connecting does not switch on the torque or move the hand. The first action arms the hand. If
     the hand is disarmed or enters a fault state later, the next action does not arm it again and
@@ -57,7 +57,7 @@ class Softfinger(Robot):
         config = self.config
         hand = Hand(config.address, client="lerobot", timeout=config.timeout, keys=config.keys)
         try:
-            hand.state(config.start_timeout)  # The first start may take long, due to compilation.
+            hand.state(config.start_timeout)  # The first start is slow because of compilation.
             hand.status()
             self._waiting = hand.frames()
             self._frames: dict[str, TactileFrame] = {}

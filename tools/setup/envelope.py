@@ -145,7 +145,7 @@ def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, 
 def grasped(
     settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
 ) -> Cell:
-    """Grasp an object on the table, then apply its weight in the direction out of the fingers.
+    """Grasp an object on the table, then apply its weight so that it pulls the object out.
 
     The daemon's settings contain the object's width or diameter ``size`` [m], friction and weight
     (``mass`` [kg]), but not its shape. The daemon always assumes a block.

@@ -223,7 +223,7 @@ class Site:
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Send the next picture at each request of a page, with the rows that it does not have yet.
+        """Send a page the next picture each time it requests one, with the rows that it lacks.
 
         A new scene is sent before the picture.
         """
@@ -240,7 +240,7 @@ class Site:
             await page.send(f'{picture[:-1]},"rows":[{",".join(fresh)}]}}')
 
     async def _command(self, page: ServerConnection) -> None:
-        """Execute a page's commands, if it has the token, and send the replies."""
+        """Execute the commands of a page that has the token, and send the replies."""
         assert page.request is not None
         allowed = self._send is not None and self._allows(page.request)
         async for text in page:

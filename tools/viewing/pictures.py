@@ -162,7 +162,7 @@ class Pictures:
     def clear(self) -> None:
         """Discard all data except the hand's settings, before data from another time are read."""
         self.feed = StreamState()
-        self.states = 0  # number of states since the last call
+        self.states = 0  # number of states since the last `clear`
         self.time = math.nan  # Unix time of the newest state [s]
         self._truth: dict[str, Any] | None = None
         self._gaps = {topic: Gaps() for topic in TOPICS}
@@ -444,7 +444,7 @@ def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
 
 
 def _flat(points: FloatArray) -> FloatArray:
-    """Return x and y alternately, rounded to four decimals (up to a tenth of a pixel)."""
+    """Return x and y alternately, rounded to four decimals (at most a tenth of a pixel)."""
     return np.clip(points, -_NUMBER_MAX, _NUMBER_MAX).round(4).ravel()
 
 
