@@ -91,7 +91,7 @@ def backend(kind: Kind, name: str) -> Backend:
 
 
 def needs_hand(servos: str, tactile: str) -> bool:
-    """Return True if the servo or tactile backend of this name needs the simulated hand."""
+    """Return True if the named servo backend or tactile backend needs the simulated hand."""
     return bool(backend("servos", servos).hand or backend("tactile", tactile).hand)
 
 

@@ -25,7 +25,7 @@ from softfinger.gym.environment import FORCE, Observation, SoftFingerEnv
 from softfinger.tools import style
 from softfinger.tools.sweep import Sweep, add_sweep
 
-SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # per generation, per generation, per sample
+SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, episodes per sample
 STEPS = 200
 FEATURES = 5
 _WEIGHT_SCALE = 0.2  # factor for the weights, because an action of 1 is fast (1 rad/s)

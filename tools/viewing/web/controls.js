@@ -1,5 +1,5 @@
 
-// One command of each kind is in transit at a time. Meanwhile only the newest other command is stored.
+// One command of each kind is in transit at a time. Of those that follow, only the newest is sent next.
 const client = "page " + Math.random().toString(16).slice(2, 6);
 const one = selector => document.querySelector(selector);
 const lanes = {}, settings = {};
