@@ -1,14 +1,15 @@
 """Look up servo, tactile and shape backends by name, and import them on demand.
 
-Built-in backends are entries of a dict. Plugins are entry points of installed packages, in the
+Built-in backends are listed in `BUILT_IN`. Plugins are entry points of installed packages, in the
 groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A plugin is a class,
-or a function for a shape, with the same arguments as the built-in ones. It may define these
+or for a shape a function, with the same arguments as the built-in backends. It may define these
 attributes:
 
-- ``metal``: True if it is real hardware, which is the default.
-- ``hand``: True if it needs the simulated hand, which is then passed as to the built-in backends. A
-  servo plugin may give a class here, which replaces `SimulatedHand` and takes its arguments.
-- ``Settings``: a pydantic model of the profile's table ``[plugins.NAME]``, preferably derived from
+- ``metal``: True (default) if the backend is real hardware.
+- ``hand``: True if the plugin needs the simulated hand, which is then passed to it in the same way
+  as to the built-in backends. A servo plugin may specify a class here, which replaces
+  `SimulatedHand` and must take the same arguments.
+- ``Settings``: a pydantic model for the profile table ``[plugins.NAME]``, preferably derived from
   `profile.fields.Section`. The validated settings are passed as the last argument.
 """
 
@@ -30,21 +31,21 @@ Kind = Literal["servos", "tactile", "shapes"]
 
 
 class Backend(NamedTuple):
-    """Hold a backend's loader and its requirements."""
+    """Loader and requirements of a backend."""
 
     load: Callable[[], Any]
     metal: bool = True  # True for real hardware
-    hand: Any = False  # True, or for servos the hand's class, if it needs a simulated hand
-    source: str = ""  # name, package and version of a plugin
-    section: type[BaseModel] | None = None  # settings model of a plugin
+    hand: Any = False  # True or, for servos, a hand class if it needs a simulated hand
+    source: str = ""  # plugin name, package and version
+    section: type[BaseModel] | None = None  # plugin's settings model
 
     @property
     def name(self) -> str:
-        """Name of a plugin, empty for a built-in backend."""
+        """Plugin name, or empty for a built-in backend."""
         return self.source.partition(" ")[0]
 
     def options(self, tables: Mapping[str, Any]) -> tuple[BaseModel, ...]:
-        """Return a plugin's validated settings as a tuple of one, empty if it has none."""
+        """Return a plugin's validated settings in a tuple, which is empty if it has no settings."""
         if self.section is None:
             return ()
         return (self.section.model_validate(tables.get(self.name, {})),)
@@ -84,30 +85,30 @@ BUILT_IN: dict[Kind, dict[str, Backend]] = {
 def backend(kind: Kind, name: str) -> Backend:
     """Return the backend with this name.
 
-    Raises KeyError for an unknown name, and PluginError for an unusable plugin.
+    Raises KeyError if the name is unknown and PluginError if the plugin is unusable.
     """
     return BUILT_IN[kind].get(name) or _plugin(kind, name)
 
 
 def needs_hand(servos: str, tactile: str) -> bool:
-    """Return True if the named servos or sensors are parts of the simulated hand."""
+    """Return True if the named servo backend or tactile backend needs the simulated hand."""
     return bool(backend("servos", servos).hand or backend("tactile", tactile).hand)
 
 
 def known(kind: Kind) -> list[str]:
-    """Return the names of all backends of a kind, built-in ones first."""
+    """Return the names of all backends of one kind, beginning with the built-in ones."""
     return list(dict.fromkeys([*BUILT_IN[kind], *(entry.name for entry in plugins(kind))]))
 
 
 def plugins(kind: Kind) -> list[EntryPoint]:
-    """Return the entry points of a kind without duplicates."""
-    from importlib.metadata import entry_points  # slow to import, and rarely needed
+    """Return the entry points of one kind, without duplicates."""
+    from importlib.metadata import entry_points  # slow import, rarely needed
 
     return list(dict.fromkeys(entry_points(group=f"softfinger.{kind}")))
 
 
 def source(entry: EntryPoint) -> str:
-    """Return a plugin's name with the package that provides it."""
+    """Return a plugin's name, with the name and version of its package."""
     package = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "no package"
     return f"{entry.name} of {package}"
 
@@ -122,7 +123,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
     (entry,) = entries
     try:
         made = entry.load()
-    except Exception as error:  # a plugin may raise anything
+    except Exception as error:  # A plugin may raise any exception.
         why = f"{type(error).__name__}: {error}"
         raise PluginError(f"{source(entry)} fails to load: {why}") from error
     metal, hand = getattr(made, "metal", True), getattr(made, "hand", False)

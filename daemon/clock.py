@@ -1,6 +1,6 @@
-"""Provide the clocks of the pipeline: real, simulated and virtual time.
+"""Provide the pipeline's clocks: real, simulated and virtual time.
 
-The pipeline reads time only from its clock, never from the system.
+The pipeline reads the time only from its clock, never directly from the system.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from softfinger.daemon.types import FINGERS
 
 
 class Clock(Protocol):
-    """Time for the pipeline, in seconds."""
+    """The pipeline's time source, in seconds."""
 
-    pauses_when_late: bool  # the hand's time pauses while this machine is late
+    pauses_when_late: bool  # True if the hand's time pauses whenever this machine is late
 
     def now(self) -> float:
         """Return the monotonic time [s]."""
@@ -28,19 +28,19 @@ class Clock(Protocol):
         """Return the Unix time [s] that corresponds to `now`."""
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until monotonic time ``t``; return the lateness of the wake-up [s].
+        """Sleep until monotonic time ``t`` and return the wake-up delay [s].
 
-        Return at once if ``t`` has passed.
+        Return immediately if ``t`` has passed.
         """
 
 
 class LoopClock(Clock, Protocol):
-    """Clock of the loop, which also measures the machine's own time."""
+    """The loop's clock, which also measures the machine's own time."""
 
-    behind: float  # s by which `now` lags the machine since the clock was created
+    behind: float  # s, lag of `now` behind the machine's time since the clock was created
 
     def host(self) -> float:
-        """Return the machine's monotonic time [s], which measures work and lateness."""
+        """Return the machine's monotonic time [s], used to measure computing time and delay."""
 
 
 def make_clock(settings: Settings) -> LoopClock:
@@ -57,7 +57,7 @@ def make_clock(settings: Settings) -> LoopClock:
 
 
 def emulated(settings: Settings) -> bool:
-    """Return True if all ports belong to a running `softfinger emulate`."""
+    """Return True if all ports belong to a running ``softfinger emulate``."""
     ports = []
     if backend("servos", settings.servos.backend).metal:
         ports.append(settings.servos.port)
@@ -68,16 +68,16 @@ def emulated(settings: Settings) -> bool:
 
 
 class Deadline:
-    """Time of a daemon's next tick [s], beyond which an emulated hand does not advance.
+    """Start time of the daemon's next tick [s], beyond which an emulated hand must not advance.
 
-    The value, by the daemon's clock, is in a file beside the emulator's ports, which both processes
-    map into memory.
+    The time is that of the daemon's clock. It is stored in a file in the emulator's port folder,
+    and both processes map this file into memory.
     """
 
     NAME = ".deadline"
 
     def __init__(self, path: Path, create: int = 0) -> None:
-        """Map ``path``; ``create`` is `os.O_CREAT` or 0. Raises OSError."""
+        """Map the file at ``path``; ``create`` is `os.O_CREAT` or 0. Raises OSError."""
         file = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | create, 0o600)
         try:
             os.ftruncate(file, 8)
@@ -87,7 +87,7 @@ class Deadline:
 
     @classmethod
     def of(cls, port: str) -> Deadline | None:
-        """Return the deadline of the emulator that owns ``port``, or None without one."""
+        """Return the deadline of the emulator that owns ``port``, or None if there is none."""
         try:
             return cls(Path(port).with_name(cls.NAME))
         except OSError:
@@ -95,7 +95,7 @@ class Deadline:
 
     @property
     def t(self) -> float:
-        """Time that was set last [s], initially 0."""
+        """Last value that was set [s], initially 0."""
         return self._value[0]
 
     @t.setter
@@ -106,8 +106,8 @@ class Deadline:
 class RealClock:
     """The machine's monotonic clock.
 
-    The last ``spin`` s of a sleep are a busy wait, which hides the system's wake-up latency of tens
-    of microseconds. That processor time is not available to other threads.
+    Each sleep ends with a busy wait of ``spin`` s, which hides the system's wake-up latency of tens
+    of microseconds. During the busy wait, the processor is not available to other threads.
     """
 
     now = staticmethod(time.monotonic)
@@ -120,7 +120,7 @@ class RealClock:
         self._spin = spin
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until ``t``; a signal handler may run meanwhile without ending the sleep."""
+        """Sleep until ``t``, even if a signal handler runs during the sleep."""
         now = time.monotonic
         delay = t - self._spin - now()
         if delay > 0.0:
@@ -131,12 +131,12 @@ class RealClock:
 
 
 class HandClock:
-    """Clock of a simulated or emulated hand, which waits for a late machine.
+    """Clock of a simulated or emulated hand, which pauses while the machine is late.
 
-    The time is constant between two sleeps, and each sleep ends exactly at its deadline, however
-    late the machine wakes up. Lateness shorter than the time to the next deadline is caught up. Any
-    further lateness does not exist for the hand and is added to ``behind``. An emulated hand reads
-    from ``due`` how far its time may advance.
+    The time is constant between two sleeps. After a sleep it equals the sleep's deadline, even if
+    the machine woke up late. If the machine is late by less than the time to the next deadline, it
+    catches up. Any additional delay is hidden from the hand and added to ``behind``. An emulated
+    hand reads from ``due`` how far its time may advance.
     """
 
     pauses_when_late = True
@@ -148,7 +148,7 @@ class HandClock:
         self.behind = 0.0
 
     def now(self) -> float:
-        """Return the hand's time [s]: the deadline of the last sleep."""
+        """Return the hand's time [s], which is the last sleep's deadline."""
         return self._now
 
     def wall(self) -> float:
@@ -160,7 +160,7 @@ class HandClock:
         return self._machine.host()
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until the hand's time is ``t``; if that is past, add the delay to ``behind``."""
+        """Sleep until the hand's time is ``t``; if already late, add the delay to ``behind``."""
         self._now = max(t, self._now)
         if self._due is not None:
             self._due.t = self._now
@@ -173,9 +173,9 @@ class HandClock:
 
 
 class VirtualClock:
-    """Clock that advances only when the loop sleeps, as fast as the machine allows.
+    """Clock that advances only when the loop sleeps, so the loop runs at full speed.
 
-    All its times start at ``start``, so two runs with the same seed are identical.
+    All times begin at ``start``, so two runs with the same seed are identical.
     """
 
     behind = 0.0
@@ -189,10 +189,10 @@ class VirtualClock:
         return self._now
 
     wall = now
-    host = now  # computation takes no virtual time
+    host = now  # Computations take zero virtual time.
 
     def sleep_until(self, t: float) -> float:
-        """Advance the time to ``t`` unless it has passed; return 0, as it is never late."""
+        """Advance the time to ``t`` unless ``t`` has passed; return 0, since it is never late."""
         if t > self._now:
             self._now = t
         return 0.0

@@ -1,7 +1,7 @@
-"""Define the exceptions that several packages share, all derived from `SoftfingerError`.
+"""Define the exceptions that several packages share. All are derived from `SoftfingerError`.
 
-An exception used by only one package is defined there, from the same base class. This module
-imports neither Numba nor ZeroMQ.
+An exception that only one package uses is defined in that package, with the same base class. This
+module does not import Numba or ZeroMQ.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 class SettingsError(SoftfingerError):
-    """Unusable settings. The message lists every error with file, key, found and expected."""
+    """Unusable settings. For each error, the message gives file, key, found and expected value."""
 
 
 class PluginError(SoftfingerError):
@@ -50,41 +50,41 @@ class PluginError(SoftfingerError):
 
 
 class AddressError(SoftfingerError):
-    """Socket that cannot be bound because its address is in use or not available."""
+    """Failure to bind a socket, because its address is in use or not available."""
 
 
 class KeyFileError(SoftfingerError):
-    """Keys that cannot be created or read. The message names the file and the remedy."""
+    """Failure to create or read keys. The message names the file and the remedy."""
 
 
 class NoDescriptor(KeyFileError):
-    """Keys that cannot be read because the limit of open files is reached.
+    """Failure to read keys because the limit of open files has been reached.
 
     The keys themselves may be valid.
     """
 
 
 class ServoError(SoftfingerError):
-    """Unusable servos: port missing or busy, or a servo absent or misconfigured.
+    """Unusable servos: the port is missing or busy, or a servo is absent or misconfigured.
 
-    The message lists every problem on its own line, with its remedy.
+    The message lists each problem with its remedy on a separate line.
     """
 
 
 class ServosSilent(ServoError):
-    """Servos that do not answer, with no other problem found; they may still be starting."""
+    """Servos that have not replied, without any other problem. They may still be starting."""
 
 
 class TactileError(SoftfingerError):
-    """Unusable tactile sensor: port missing, busy or silent, or a wrong grid size."""
+    """Unusable tactile sensor: the port is missing, busy or silent, or the grid size is wrong."""
 
 
 class RecordingError(SoftfingerError):
-    """Recording that cannot be written or read. The message names the file and the problem."""
+    """Failure to write or read a recording. The message names the file and the problem."""
 
 
 class Reason(StrEnum):
-    """Reason for rejecting a command, for programs: ``reason`` in the reply."""
+    """Machine-readable reason for rejecting a command: ``reason`` in the reply."""
 
     LATE = "late"
     STOPPED = "stopped"
@@ -99,7 +99,7 @@ class Reason(StrEnum):
 
     @property
     def meaning(self) -> str:
-        """Explanation of the reason in a sentence, for the documentation."""
+        """Explanation of the reason, for the documentation."""
         return _MEANINGS[self]
 
 
@@ -122,20 +122,20 @@ _MEANINGS = {
 
 
 class Refused(SoftfingerError):
-    """Rejected command. The message is sent to the client in the reply."""
+    """Rejected command. The reply to the client contains the message."""
 
     def __init__(self, text: str, reason: Reason | str = Reason.STATE) -> None:
-        """``reason`` is a `Reason`, or any text from a daemon of another version."""
+        """``reason`` is a `Reason`, or another string if the daemon has a different version."""
         super().__init__(text)
         self.reason = reason
 
 
 class NoStream(SoftfingerError):
-    """Timeout without a message from the stream. The message names the address."""
+    """Timeout without any stream message. The error text names the address."""
 
 
 class NotInTime(SoftfingerError, TimeoutError):
-    """Timeout while waiting for a condition. The message contains the last state."""
+    """Timeout while waiting for a condition. The error text contains the last state."""
 
 
 class HandClosed(SoftfingerError):
@@ -147,4 +147,4 @@ class WrongThread(SoftfingerError):
 
 
 class HandFault(SoftfingerError):
-    """Fault that the hand latched during a wait. The message is the fault's text."""
+    """Fault that the hand latched during a wait. The error text describes the fault."""

@@ -1,8 +1,8 @@
-"""Read files named by users within size limits, and write files safely in shared folders.
+"""Read user-specified files within size limits, and write files safely in shared folders.
 
-A path from a user or another file may be a device, a pipe without a writer, or a file larger than
-memory. In a shared folder such as /tmp, another user may have placed a link or a file at the path
-that we write to, and the link's target would be overwritten.
+A path from a user or another file may lead to a device, a pipe without a writer, or a file that is
+larger than memory. In a shared folder such as /tmp, another user may have placed a file or a link
+at the output path. Writing through the link would overwrite its target.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from softfinger.kinematics.compiled.own_folder import (
     user_cache,
 )
 
-SIZE_MAX = 16 << 20  # bytes, largest file read at once, and largest unpacked part of a file
+SIZE_MAX = 16 << 20  # bytes, limit for reading a whole file and for an unpacked part of a file
 
 _WORLD_WRITABLE = stat.S_IWOTH
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading. Raises OSError also for a device or a pipe."""
-    mode = path.stat().st_mode  # because opening a device may already act on it
+    """Open a regular file for reading. Raises OSError, including for a device or a pipe."""
+    mode = path.stat().st_mode  # Check before opening, because opening can affect a device.
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, "a device or a pipe, expected a file", str(path))
     no_wait = getattr(os, "O_NONBLOCK", 0)
@@ -36,7 +36,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_file(path: Path, most: int = SIZE_MAX) -> bytes:
-    """Return a file's bytes. Raises OSError as `open_regular`, or for more than ``most`` bytes."""
+    """Read a file. Raises OSError like `open_regular`, or if it exceeds ``most`` bytes."""
     with open_regular(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
@@ -45,9 +45,10 @@ def read_file(path: Path, most: int = SIZE_MAX) -> bytes:
 
 
 def unpacked_size_max(file: BinaryIO) -> int:
-    """Return the limit of a file's unpacked size: 32 times its size on disk, at least 8 MiB.
+    """Return the limit for a file's unpacked size: 32 times its size on disk, at least 8 MiB.
 
-    Recordings compress to between a third and a tenth. Holes in a sparse file do not count as size.
+    Recordings compress to between a third and a tenth of their size. Holes in a sparse file do not
+    count towards its size.
     """
     found = os.fstat(file.fileno())
     room = 512 * found.st_blocks if HAS_OWNERS else found.st_size
@@ -55,11 +56,11 @@ def unpacked_size_max(file: BinaryIO) -> int:
 
 
 def runtime_folder() -> Path:
-    """Return the user's runtime folder, where an emulated hand links its ports by default.
+    """Return the user's runtime folder, which by default contains an emulated hand's port links.
 
-    The folder is in XDG_RUNTIME_DIR or /run/user. Otherwise it is named after the user in the
-    folder of temporary files, or in the home folder if another user owns that name. Raises
-    RuntimeError if there is no home folder either.
+    The folder is in XDG_RUNTIME_DIR or /run/user. If neither is usable, it is in the temporary
+    folder and named after the user. If another user owns a folder of this name, it is in the home
+    folder. Raises RuntimeError if there is no home folder either.
     """
     named = os.environ.get("XDG_RUNTIME_DIR", "")
     for folder in (Path(named), Path(f"/run/user/{os.geteuid()}")):
@@ -76,7 +77,7 @@ def runtime_folder() -> Path:
 
 
 def runtime_fault() -> str:
-    """Explain why the runtime folder is unusable, with the remedy; empty if it is usable."""
+    """Return the reason why the runtime folder is unusable, or an empty string if it is usable."""
     try:
         require_own(runtime_folder())
     except FileNotFoundError:
@@ -87,27 +88,27 @@ def runtime_fault() -> str:
 
 
 def shared_folder() -> Path:
-    """Return the user's folder among temporary files, which another user may have created."""
+    """Return the user's folder in the temporary folder, where another user may have created it."""
     return Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
 
 
 def home_folder() -> Path:
-    """Return the fallback folder in the user's home. Raises RuntimeError without a home."""
+    """Return the fallback folder in the user's home folder. Raises RuntimeError without one."""
     return user_cache() / "run"
 
 
 def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:
-    """Open a UTF-8 text file at a user's path for overwriting or appending.
+    """Open a UTF-8 text file at a user-specified path for overwriting or appending.
 
-    Raises OSError as `open`. Raises PermissionError if another user owns the path and it is a link,
-    or a file in a world-writable folder.
+    Raises OSError like `open`. Raises PermissionError if the path is another user's link, or
+    another user's file in a world-writable folder.
     """
     mode: Literal["a", "w"] = "a" if append else "w"
     return open(path, mode, encoding="utf-8", newline=newline, opener=_open)
 
 
 def write_bytes(path: Path) -> BinaryIO:
-    """Open a binary file for overwriting, with the checks of `write_text`."""
+    """Open a binary file for overwriting, with the same checks as `write_text`."""
     return open(path, "wb", opener=_open)
 
 
@@ -115,7 +116,7 @@ def _open(path: str, flags: int) -> int:
     try:
         there = os.lstat(path)
         _refuse_foreign(path, there)
-        # Follow an existing link of our own, but no link that is created after this check.
+        # Follow this user's existing link, but not a link that is created after this check.
         follow = stat.S_ISLNK(there.st_mode)
     except FileNotFoundError:
         follow = False

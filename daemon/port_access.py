@@ -1,21 +1,21 @@
-"""Explain why a serial port cannot be opened and how to get access to it."""
+"""Give advice for serial ports that cannot be opened."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join only to open a port
+_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join merely to open a port
 
 
 def port_group_remedy(path: str) -> str:
-    """Return advice for a missing port; a port outside /dev belongs to an emulated hand."""
+    """Return advice for a missing port. A port outside /dev belongs to an emulated hand."""
     return "plug the adapter in" if path.startswith("/dev/") else "start `softfinger emulate`"
 
 
 def grant(path: str) -> str:
-    """Return the command that gives this user access, usually membership of the port's group."""
-    import grp  # missing on some systems that run a client
+    """Return the command that gives this user access, usually by joining the port's group."""
+    import grp  # not available on some client systems
 
     try:
         status = Path(path).stat()

@@ -1,7 +1,7 @@
 """Real-time control of two rotational fingers with soft hemispherical tips.
 
-This module exports the public API. Each name is imported on first access, so a client program that
-uses only `Hand` or `AsyncHand` loads neither Numba nor the control loop.
+This module exports the public API. Each name is imported on first access. A client program that
+uses only `Hand` or `AsyncHand` therefore does not load Numba or the control loop.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ _MODULES = {name: module for module, names in _PUBLIC.items() for name in names.
 
 
 class SoftfingerError(Exception):
-    """Base class of all exceptions raised by this package."""
+    """Base class of all exceptions that this package raises."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Command line entry point: ``python -m softfinger``."""
+"""Run the command line: ``python -m softfinger``."""
 
 import sys
 

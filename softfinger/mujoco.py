@@ -1,19 +1,20 @@
-"""Soft tips in MuJoCo: the contact law and the pressure grids of this package in a MuJoCo scene.
+"""Simulate soft tips, with this package's contact law and pressure grids, in a MuJoCo scene.
 
-:class:`SoftTips` turns spheres of any MuJoCo model into soft hemispheres. A passive-force callback
-(`mjcb_passive`) applies the contact table's force with friction, and a user sensor holds the
-pressure under each tip. :class:`MujocoHand` is the hand of a profile; the daemon uses it with
+:class:`SoftTips` turns spheres in any MuJoCo model into soft hemispheres. A passive-force callback
+(`mjcb_passive`) applies the force from the contact table, with friction. A user sensor returns the
+pressure under each tip. :class:`MujocoHand` is a profile's hand; the daemon uses it if
 ``servos.backend = "mujoco"``.
 
-The law is the kernel of the simulated hand (`simulation.physics.tip`). In 3D the shear is a vector
-in the face: its component along the tilt is d_t, and its component across the tilt enters as a
-variance, because U contains ρ(ζ² + v). The forces f are those at the end of the step
-(docs/mujoco.md). They are linearly implicit along the rows R of d, θ and both shears:
+The contact law is the kernel that the simulated hand uses (`simulation.physics.tip`). In 3D the
+shear is a vector in the face. Its component along the tilt is d_t. Its component across the tilt
+enters as a variance, because U contains ρ(ζ² + v). The forces f are computed for the end of the
+step (docs/mujoco.md). They are linearly implicit in d, θ and both shears, whose Jacobian rows
+are R:
 
     (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
 
-K and D are the law's stiffness and damping, h is the time step, and a is the acceleration due to
-all other forces in the last step. At rest, f equals the law's force.
+K and D are the contact law's stiffness and damping, h is the time step, and a is the acceleration
+due to all other forces in the last step. At rest, f equals the contact law's force.
 """
 
 from __future__ import annotations
@@ -55,9 +56,9 @@ __all__ = ["MujocoHand", "SoftTips"]
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
 _ROWS = 4  # rows per tip: d, θ, shear along and across the tilt
-_GAP_MAX = 0.005  # m, gap within which a contact may begin in the next step
-_VALUE_MIN = 1e-9  # smallest contact depth [m], friction force [N] and sin θ with a tilt direction
-_SHEAR = 2  # row of the shear along the tilt
+_GAP_MAX = 0.005  # m, largest gap that can close within the next step
+_VALUE_MIN = 1e-9  # smallest nonzero contact depth [m], friction force [N] and sin θ
+_SHEAR = 2  # row index of the shear along the tilt
 _UNSUPPORTED = (
     "tip_relaxation",
     "tip_micro_slip",
@@ -65,23 +66,24 @@ _UNSUPPORTED = (
     "joint_load_friction",
     "joint_stribeck",
 )
-_IMPEDANCE = 0.9999  # for joint friction; with MuJoCo's default 0.9 joints creep by mrad/s
+# Impedance of joint friction; with MuJoCo's default of 0.9, the joints creep by mrad/s.
+_IMPEDANCE = 0.9999
 
 
 class Touch(Record):
-    """One tip on a face in 3D; vectors are in world coordinates."""
+    """One tip on a face in 3D, with vectors in world coordinates."""
 
     contact: TipContact
     normal: FloatTriple  # m, unit vector from the tip's centre into the face
-    along: FloatTriple  # t, unit vector in the face, opposite to the lean of the tip's axis
+    along: FloatTriple  # t, unit vector in the face, opposite to the tip axis's tilt
     across: FloatTriple  # m × t, the rotation axis of θ
-    shear: FloatTriple  # displacement of the face relative to the tip [m]
-    shear_across: float  # [m]
+    shear: FloatTriple  # m, face displacement relative to the tip
+    shear_across: float  # m
 
 
 @inner_kernel
 def _set_frame(touch: Touch, geometry: FloatArray) -> None:
-    """Set m, t, m × t and θ from the tip's centre, axis and foremost point."""
+    """Compute m, t, m × t and θ from the tip's centre, axis and foremost point."""
     m, t, tip = touch.normal, touch.along, touch.contact
     m[:] = geometry[7:] - geometry[1:4]
     m /= math.sqrt((m * m).sum())
@@ -99,7 +101,7 @@ def _set_frame(touch: Touch, geometry: FloatArray) -> None:
 
 @inner_kernel
 def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -> float:
-    """Evaluate the law for a two-dimensional shear; return the force across, damping included."""
+    """Evaluate the contact law for a 2D shear; return the force across, including damping."""
     tip = touch.contact
     stiffness = limit = 0.0
     for _ in range(2):
@@ -110,7 +112,7 @@ def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -
         total = math.hypot(tip.tangential, stiffness * touch.shear_across)
         if total <= limit * (1.0 + 1e-9):
             break
-        # Slip: scale both shears, and with them the force, back onto the friction cone.
+        # The tip slips: scale both shears so that the force returns to the friction cone.
         tip.shear += (limit / total - 1.0) * tip.tangential / stiffness
         touch.shear_across *= limit / total
     touch.shear[:] = tip.shear * touch.along + touch.shear_across * touch.across
@@ -124,11 +126,11 @@ def press(
     touches: Records[Touch], parameters: Records[Parameters], tables: Records[Table],
     geometry: FloatArray, jacobians: FloatArray, velocity: FloatArray, dt: float, work: Work,
 ) -> None:  # fmt: skip
-    """Evaluate all tips into ``work``: rows R [4n, nv], the force along each row, and B.
+    """Evaluate all tips and store rows R [4n, nv], the force along each row, and B in ``work``.
 
-    ``geometry`` [n, 10] holds d, centre, axis and foremost point of each tip. ``jacobians``
-    [n, 4, 3, nv] holds the position and rotation Jacobians of the tip, then those of the touched
-    geom. ``dt`` [s] is the time since the last call.
+    ``geometry`` [n, 10] contains d, centre, axis and foremost point of each tip. ``jacobians``
+    [n, 4, 3, nv] contains the tip's position and rotation Jacobians, followed by those of the
+    touched geom. ``dt`` [s] is the time since the last call.
     """
     p, data, rates = parameters[0], tables[0], np.zeros(_ROWS)
     rows, force, implicit = work
@@ -153,7 +155,7 @@ def press(
             touch.shear[:] = rows[first : first + _ROWS] = 0.0
             continue
         tip.rate_d, tip.rate_theta, tip.slip_rate = rates[0], rates[1], rates[2]
-        # Rotate the shear into the current face, keep its length, and add this step's motion.
+        # Rotate the shear into the current face without changing its length, then add the motion.
         along, across = (touch.shear * touch.along).sum(), (touch.shear * touch.across).sum()
         within = along * along + across * across
         scale = math.sqrt((touch.shear**2).sum() / within) if within > 0.0 else 0.0
@@ -181,9 +183,9 @@ def solve(
 ) -> None:  # fmt: skip
     """Solve for the forces f at the end of the step.
 
-    Adds −Rᵀf to ``passive`` and writes the acceleration −M⁻¹Rᵀf to ``own``. ``inertial`` is M⁻¹Rᵀ
-    stored as rows [4n, nv], ``acceleration`` [nv] is the acceleration of the last step. The normal
-    forces are kept non-negative and the friction forces within the friction cone.
+    Add −Rᵀf to ``passive`` and write the acceleration −M⁻¹Rᵀf to ``own``. ``inertial`` is M⁻¹Rᵀ,
+    stored as rows [4n, nv]. ``acceleration`` [nv] is the acceleration in the last step. Normal
+    forces are clipped at 0, and friction forces are scaled onto the friction cone.
     """
     p = parameters[0]
     rows, force, implicit = work
@@ -193,7 +195,7 @@ def solve(
         push = p.step * implicit[i] * rows[i]
         matrix[i, :n] += (push * inertial).sum(axis=1)
         matrix[i, n] = force[i] + (push * (acceleration - own)).sum()
-    # Pivoting is not needed: B ≥ 0 is diagonal and A positive, so all leading minors are positive.
+    # Pivoting is unnecessary: B ≥ 0 is diagonal and A is positive, so all leading minors are > 0.
     for i in range(n):
         matrix[i] /= matrix[i, i]
         for k in range(n):
@@ -210,31 +212,33 @@ def solve(
 
 
 class SoftTips:
-    """Context manager that turns spheres of a MuJoCo model into soft tips.
+    """Context manager that turns spheres in a MuJoCo model into soft tips.
 
-    While it is open it occupies MuJoCo's global callbacks ``mjcb_passive`` and ``mjcb_sensor``, so
-    only one model at a time can have soft tips. A user sensor named ``TIP_pressure`` with
-    ``needstage="vel"`` receives the cell pressures [Pa], updated ``tactile.rate`` times per second.
+    While the context is active, it uses MuJoCo's global callbacks ``mjcb_passive`` and
+    ``mjcb_sensor``, so only one model at a time can have soft tips. A user sensor named
+    ``TIP_pressure`` with ``needstage="vel"`` receives the cell pressures [Pa], which are updated
+    ``tactile.rate`` times per second.
 
     Parameters
     ----------
     model, data
         The MuJoCo scene.
     settings
-        Settings of the tip, its material, the pressure grid and friction.
+        Settings for the tip, its material, the pressure grid and friction.
     tips
-        Names of sphere geoms of radius ``settings.tip.radius``. The z axis of each geom is the axis
-        of the hemisphere and points out of the finger.
+        Names of sphere geoms with the radius ``settings.tip.radius``. Each geom's z axis is the
+        hemisphere's axis and points out of the finger.
     touching
-        Names of the geoms that the tips touch. Each tip contacts the nearest one, represented by
-        its tangent plane. Disable MuJoCo's own collisions for these geoms and for the tips.
+        Names of the geoms that the tips can touch. Each tip contacts the nearest of these geoms,
+        represented by its tangent plane. Disable MuJoCo's own collisions for these geoms and for
+        the tips.
     table
-        Contact table of the tip; built from the settings if None.
+        The tip's contact table. If None, it is built from the settings.
 
     Raises
     ------
     SettingsError
-        If the scene or the settings use a feature that is not supported here.
+        If the scene or the settings use an unsupported feature.
     """
 
     def __init__(
@@ -267,7 +271,7 @@ class SoftTips:
         self._grids = [make_grid(settings, k % 2) for k in range(n)]
         self._sensors: list[tuple[int, FloatArray, FloatArray]] = []
         for k, name in enumerate(tips):
-            with suppress(KeyError):  # the sensor is optional
+            with suppress(KeyError):  # The sensor is optional.
                 cells = data.sensor(f"{name}_pressure").data.reshape(self._grids[k].shape)
                 self._sensors.append((k, cells, np.zeros(cells.shape)))
         self._t, self._period, self._due = data.time, 1.0 / settings.tactile.rate, -math.inf
@@ -282,7 +286,7 @@ class SoftTips:
         mujoco.set_mjcb_sensor(None)
 
     def pressure(self, k: int, out: FloatArray | None = None) -> FloatArray:
-        """Return the cell pressures [Pa] of tip ``k``, float64 [rows, cols]."""
+        """Return tip ``k``'s cell pressures [Pa], float64 [rows, cols]."""
         touch, tip = self.touches[k], self.touches[k].contact
         frame = self.data.geom_xmat[self._tips[k]].reshape(3, 3)
         d = min(max(tip.d, 0.0), self._parameters.deepest)
@@ -290,12 +294,12 @@ class SoftTips:
         return self._grids[k].pressure(*self._law, d, x, y, self._scale * tip.gain, out)
 
     def add_forces(self, model: Any, data: Any) -> None:
-        """Add the tip forces to ``qfrc_passive`` (callback `mjcb_passive`)."""
+        """Add the tip forces to ``qfrc_passive``. This is the `mjcb_passive` callback."""
         if data is not self.data:
             return
         geometry, touching, fromto = self._geometry, self._touching, np.zeros(6)
         dt, self._t = data.time - self._t, data.time
-        if dt < 0.0:  # the scene was reset
+        if dt < 0.0:  # The scene was reset.
             self._all["shear"] = self._own[:] = dt = 0.0
             self._due = -math.inf
         for k, tip in enumerate(self._tips):
@@ -313,7 +317,7 @@ class SoftTips:
         solve(*law, work, self._inertial, data.qacc, data.qfrc_passive, self._own)
 
     def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
-        """Fill the pressure sensors, which MuJoCo clears in each step (callback `mjcb_sensor`)."""
+        """Set the pressure sensors in each step, because MuJoCo clears them (`mjcb_sensor`)."""
         if data is self.data and stage == mujoco.mjtStage.mjSTAGE_VEL:
             is_due = data.time >= self._due
             self._due = data.time + self._period - 1e-9 if is_due else self._due
@@ -322,10 +326,10 @@ class SoftTips:
 
 
 def hand_mjcf(settings: Settings, p: Parameters) -> str:
-    """Return the profile's hand and a box in front of it as MJCF.
+    """Return the MJCF model of the profile's hand with a box in front of it.
 
-    The hand moves in the xy plane; z points towards the viewer. ``p`` are the parameters from
-    `set_parameters`. Raises SettingsError unless the object is a rectangle and the hand has two
+    The hand moves in the xy plane, and z points towards the viewer. `set_parameters` computes the
+    parameters ``p``. Raises SettingsError unless the object is a rectangle and the hand has two
     fingers.
     """
     shape, count = settings.simulation.object_shape, len(settings.scene.fingers)
@@ -334,8 +338,8 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
     fingers = sensors = ""
     for k, (name, side) in enumerate((("left", 1), ("right", -1))):
         end = f"{side * p.offset:.9g} {p.length:.9g} 0"
-        # z is the hemisphere's axis. The sensor's x points away from the palm on the left finger
-        # and towards it on the right one; its y points towards the viewer.
+        # z is the hemisphere's axis. The sensor's x axis points away from the palm on the left
+        # finger and towards it on the right finger. The y axis points towards the viewer.
         fingers += f"""
 <body pos="{-side * p.half_separation:.9g} 0 0">
 <joint name="{name}" axis="0 0 {-side}" range="{p.stop_low[k]:.9g} {p.stop_high[k]:.9g}"
@@ -366,7 +370,7 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
 
 @kernel
 def set_currents(plants: Records[Plant], control: FloatArray) -> None:
-    """Set the current references [A] of both servos; the motor currents follow with a lag."""
+    """Set both servos' current references [A], which the motor currents follow with a lag."""
     state = plants[0].state
     for j in range(2):
         control[j] = current_reference(plants[0], j, state.position[j], state.velocity[j])
@@ -374,30 +378,30 @@ def set_currents(plants: Records[Plant], control: FloatArray) -> None:
 
 @kernel
 def feel(plants: Records[Plant], touches: Records[Touch], ring: Records[Sample]) -> None:
-    """Copy the contacts of the MuJoCo tips into the plant and record the samples that are due."""
+    """Copy the MuJoCo tip contacts into the plant and record the samples that are due."""
     plant = plants[0]
     for k in range(2):
         plant.stages[0].on_object[k] = touches[k].contact
         tip = plant.stages[0].on_object[k]
-        if touches[k].across[2] < 0.0:  # planar θ, shear and force are signed
+        if touches[k].across[2] < 0.0:  # Planar θ, shear and force are signed.
             tip.theta, tip.sine = -tip.theta, -tip.sine
             tip.tangential, tip.shear = -tip.tangential, -tip.shear
     settle(plant, ring)
 
 
 class Options(Section):
-    """Settings in the profile's table ``[plugins.mujoco]``."""
+    """Settings in the profile table ``[plugins.mujoco]``."""
 
     timestep: Annotated[float, Field(ge=1e-4, le=0.002)] = 0.001  # s, MuJoCo's time step
 
 
 class MujocoHand(SimulatedHand):
-    """Simulated hand with MuJoCo mechanics and the usual motor model; `energy` is always 0."""
+    """Simulated hand with MuJoCo mechanics and the standard motor model; `energy` is always 0."""
 
     def __init__(
         self, settings: Settings, start: float = 0.0, table: ContactTable | None = None
     ) -> None:
-        """Build the scene at rest. Raises SettingsError for unsupported settings."""
+        """Build the scene at rest. Raises SettingsError if the settings are not supported."""
         step = Options.model_validate(settings.plugins.tables.get("mujoco", {})).timestep
         table = table or make_table(settings, make_material(settings.material))
         parameters = Parameters()
@@ -418,7 +422,7 @@ class MujocoHand(SimulatedHand):
                 set_currents(plant.array, data.ctrl)
                 data.qfrc_applied[2:] = plant.goals.load
                 mujoco.mj_step2(self.model, data)
-                mujoco.mj_step1(self.model, data)  # updates the contacts for feel
+                mujoco.mj_step1(self.model, data)  # update the contacts for `feel`
                 state.position[:], state.velocity[:] = data.qpos, data.qvel
                 state.current[:] = data.act
                 self._done = plant.step_count = self._done + 1
@@ -433,4 +437,4 @@ class MujocoServos(SimulatedServos):
     Settings = Options
 
     def __init__(self, *scene: Any) -> None:
-        super().__init__(*scene[:3])  # the last one, the options, belongs to the hand
+        super().__init__(*scene[:3])  # The last argument contains the hand's options.

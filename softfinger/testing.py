@@ -1,8 +1,8 @@
-"""Conformance checks for authors of backend plugins.
+"""Provide conformance checks for backend plugins.
 
-Each check takes the settings of a profile that names the backend, for example
-``check_tactile(load(Path("profile.toml")))``. It creates the backend as the daemon would and raises
-AssertionError with the value found and the value expected.
+Each check takes the settings of a profile that uses the backend, for example
+``check_tactile(load(Path("profile.toml")))``. It creates the backend in the same way as the daemon.
+If the check fails, it raises AssertionError with the value found and the value expected.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from softfinger.daemon.types import FINGERS, Frame, Goal, Reading
 
 __all__ = ["check_servos", "check_shape", "check_tactile", "load"]
 
-_POLL = 1e-3  # s, one control tick
+_POLL = 1e-3  # s, poll interval, like a control tick
 
 
 def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:
-    """Open the tactile board of each finger twice and check ``frames`` of its frames.
+    """Open each finger's tactile board twice and check ``frames`` frames.
 
-    ``patience`` [s] limits the wait for them. The hand needs no object.
+    ``patience`` [s] limits the waiting time. The check works without an object in the hand.
     """
     clock = make_clock(settings)
     for name in settings.scene.fingers:
         sensor = make_sensor(settings, clock, None, FINGERS.index(name))
         assert sensor is not None, "tactile.backend: found none, expected a board"
-        for _ in range(2):  # the daemon reopens a board after losing its port
+        for _ in range(2):  # The daemon reopens a board after losing its port.
             sensor.open()
             try:
                 _check_frames(settings, sensor, frames, time.monotonic() + patience)
                 _check_counters(sensor)
             finally:
                 sensor.close()
-            sensor.latest()  # must not raise
+            sensor.latest()  # This call must not raise an exception.
         sensor.close()
 
 
@@ -68,12 +68,12 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
 def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0) -> None:
     """Connect to the servos twice and read them.
 
-    With ``torque`` the servos are also switched on at their present position and off again; the
+    If ``torque`` is True, the torque is also switched on at the present position and off again. The
     joints must not move by more than 0.05 rad. ``patience`` [s] limits each wait.
     """
     servos = make_servos(settings, make_clock(settings), None)
     assert servos is not None, "servos.backend: found none, expected servos"
-    for _ in range(2):  # the daemon reconnects to servos that stopped answering
+    for _ in range(2):  # The daemon reconnects to servos that have stopped replying.
         servos.connect()
         try:
             reading = Reading()
@@ -114,7 +114,7 @@ def _check_counters(backend: Servos | TactileSensor) -> None:
 
 
 def check_shape(settings: Settings) -> None:
-    """Create the object's shape and compare its properties with those of its corners."""
+    """Create the object's shape and check its properties against values from its corners."""
     shape = shape_of(settings)
     assert isinstance(shape, Shape), f"found {type(shape).__name__}, expected a Shape"
     if shape.kind == DISC:

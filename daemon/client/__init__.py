@@ -1,4 +1,4 @@
-"""Client library: control the hand and read its stream from a notebook or program.
+"""Control the hand and read its stream from a notebook or a program.
 
 ::
 
@@ -12,5 +12,5 @@
         for state in hand.stream():
             ...
 
-`AsyncHand` is the same for asyncio. A client needs only the two addresses of the daemon.
+`AsyncHand` is the asyncio version. A client needs only the daemon's two addresses.
 """

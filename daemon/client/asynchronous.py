@@ -1,4 +1,4 @@
-"""`AsyncHand`: the asyncio version of `client.hand.Hand`."""
+"""Provide `AsyncHand`, the asyncio version of `client.hand.Hand`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class AsyncSubscription(Subscriber[_Record]):
         return await self.next(self._timeout)
 
     async def next(self, timeout: float | None) -> _Record:
-        """Return the next record. Raises NoStream if none arrives within ``timeout`` s."""
+        """Return the next record. Raises NoStream if no record arrives within ``timeout`` s."""
         for milliseconds in self._waits(timeout):
             if await self._socket.poll(milliseconds):
                 record = self._take(await self._socket.recv_multipart())
@@ -45,7 +45,7 @@ class AsyncSubscription(Subscriber[_Record]):
         raise no_stream(self._address, self._topic, timeout or 0.0)
 
     async def skip(self) -> None:
-        """Drop queued messages, so that the next record is a new one."""
+        """Drop queued messages, so that `next` returns a new record."""
         self._require_open()
         while await self._socket.poll(0):
             self._take(await self._socket.recv_multipart())
@@ -58,7 +58,7 @@ class AsyncSubscription(Subscriber[_Record]):
 
 
 class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
-    """Hand for use in one event loop: ``async with AsyncHand() as hand: …``.
+    """Asyncio version of `client.hand.Hand`: ``async with AsyncHand() as hand: …``.
 
     Parameters, methods and exceptions are those of `Hand`.
     """
@@ -73,7 +73,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         self.close()
 
     async def state(self, timeout: float | None = None) -> HandState:
-        """Wait for a new state and return it; queued states are dropped. Raises NoStream."""
+        """Drop queued states, then wait for a new state and return it. Raises NoStream."""
         if self._states is None:
             self._states = self.stream()
         else:
@@ -89,7 +89,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> AsyncSubscription[Event]:
-        """Subscribe to the daemon's events: modes, faults, warnings."""
+        """Subscribe to the daemon's events, such as mode changes, faults and warnings."""
         return self._subscription(EVENT, timeout)
 
     def _subscription(self, topic: bytes, timeout: float | None) -> AsyncSubscription[Any]:
@@ -97,7 +97,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return AsyncSubscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     async def collect(self, seconds: float) -> list[HandState]:
-        """Return all states of the next ``seconds`` s of the daemon's clock. Raises NoStream."""
+        """Collect all states for ``seconds`` s of the daemon's clock. Raises NoStream."""
         async with self.stream(self.timeout) as states:
             collected = [await anext(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)
@@ -110,7 +110,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
     async def wait_for(
         self, condition: Callable[[HandState], object], timeout: float = 10.0
     ) -> HandState:
-        """Return the first new state for which ``condition`` holds.
+        """Wait for a new state that satisfies ``condition``, and return it.
 
         Raises the same exceptions as `Hand.wait_for`.
         """
@@ -125,14 +125,14 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
                     return state
 
     async def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
-        """Send one command, without arguments that are None, and return the reply.
+        """Send one command and return the reply. Arguments that are None are omitted.
 
         Raises
         ------
         Refused
-            If the daemon refuses the command; the message gives the reason.
+            If the daemon refuses the command. The message gives the reason.
         NoAnswer
-            If no reply arrives in time.
+            If the reply does not arrive in time.
         """
         attempts = Attempts(self._request(name, numbers), self.timeout)
         where, keys = self.command_address, self._keys
@@ -152,5 +152,5 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
                 raise
 
     async def status(self) -> dict[str, Any]:
-        """Return the daemon's mode, fault, torque, and counters of servos and sensors."""
+        """Return the daemon's mode, fault, torque state, and servo and sensor counters."""
         return await self.command("status")

@@ -1,4 +1,4 @@
-"""Sending commands to a daemon: single requests with their replies, and a method per command."""
+"""Send commands to a daemon, as single requests or through one method per command."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ _Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)
 
-RETRY_DELAY = 0.05  # s until a late command is sent again
+RETRY_DELAY = 0.05  # s, delay before a late command is sent again
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux only
-LOCAL_STOP_TIMEOUT = 0.5  # s, timeout of a stop over the local socket
-# if ``torque_off`` is ``unconfirmed``.
+LOCAL_STOP_TIMEOUT = 0.5  # s, timeout for a stop over the local socket
+# This warning is logged if ``torque_off`` is ``unconfirmed``.
 UNCONFIRMED_TEXT = "the servos have not confirmed torque off yet"
 
 
 class NoAnswer(SoftfingerError):
-    """The daemon did not answer in time."""
+    """The daemon did not reply in time."""
 
 
 class Attempts:
-    """Retry policy for a command, within the timeout of its caller.
+    """Retry policy for one command, within the caller's timeout.
 
-    After a stall the daemon refuses commands that became too old with the reason ``late``. They
-    have no effect. All attempts carry the same key, so the daemon carries out the command at most
-    once, and not after a stop or another command in between.
+    After a stall, the daemon refuses commands that have become too old, with the reason ``late``.
+    Such commands have no effect. All attempts have the same key, so the daemon carries out the
+    command at most once. It refuses a repeated attempt that follows a stop or another command.
     """
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
@@ -66,12 +66,12 @@ class Attempts:
         return max(self._end - _now(), 0.0)
 
     def again(self, reply: dict[str, Any]) -> bool:
-        """Return True if the command must be sent again after `RETRY_DELAY` s."""
+        """Return True if the command must be sent again, after `RETRY_DELAY` s."""
         return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * RETRY_DELAY
 
 
 def _now() -> float:
-    """Return monotonic time [s], including suspension where the system supports it."""
+    """Return the monotonic time [s], including time spent in suspend if the system supports it."""
     return time.clock_gettime(_CLOCK) if _CLOCK is not None else time.monotonic()
 
 
@@ -83,10 +83,10 @@ def send(
 ) -> dict[str, Any]:
     """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
 
-    A command that the daemon refuses as late is sent again within ``timeout``. A warning is logged
-    if the reply takes longer than 1 s; without logging handlers it goes to standard error. If the
-    daemon runs on this machine as the same user, a ``stop`` uses a local socket and does not queue
-    behind other clients.
+    If the daemon refuses the command as late, it is sent again until ``timeout`` expires. If the
+    reply takes longer than 1 s, a warning is logged; without logging handlers it goes to standard
+    error. If the same user runs the daemon on this machine, a ``stop`` is sent over a local socket
+    and bypasses the queues of other clients.
     """
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
@@ -99,7 +99,7 @@ def send(
 
 
 def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) -> dict[str, Any]:
-    """Make one attempt and return the reply; see `send`."""
+    """Make one attempt to send a command and return the reply; see `send`."""
     request, timeout, remaining = attempts.request, attempts.timeout, attempts.remaining()
     if request.get("command") == "stop":
         stopped = stop_locally(address, min(remaining, LOCAL_STOP_TIMEOUT))
@@ -137,7 +137,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
 
 
 def _number(what: str, value: Any) -> float:
-    """Return a number, also a NumPy scalar or 0-d array, as a float for msgpack.
+    """Convert a number, including a NumPy scalar or 0-d array, to a float for msgpack.
 
     Raises Refused for other types.
     """
@@ -147,13 +147,13 @@ def _number(what: str, value: Any) -> float:
         if isinstance(value, Real) and not isinstance(value, bool):
             return float(value)
     except OverflowError:
-        pass  # the integer exceeds the largest float
+        pass  # The integer exceeds the float range.
     text = f"{what}: expected a number, found {type(value).__name__} {str(value)[:40]!r}"
     raise Refused(text, Reason.REQUEST)
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """Return the reply without ``ok``. Raises Refused with the reason if it is not ok.
+    """Return the reply without ``ok``. Raises Refused, with the reason, if it is a refusal.
 
     A warning is logged if the servos have not confirmed that torque is off.
     """
@@ -166,7 +166,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_done(command: str, status: dict[str, Any]) -> bool:
-    """Return True if the daemon's status already matches the goal of a refused command."""
+    """Return True if a refused command's goal has already been reached, according to the status."""
     mode = status.get("mode", "fault")
     if command == "arm":
         return mode not in ("disarmed", "fault")
@@ -176,11 +176,11 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 
 
 class HandClient(Generic[_Done]):
-    """Base of `Hand` and `AsyncHand`, with the addresses and a method for each command.
+    """Base class of `Hand` and `AsyncHand`, with the addresses and a method for each command.
 
-    Commands raise Refused with the daemon's reason, and NoAnswer without a reply. A command that
-    the daemon refuses as late is sent again within ``timeout``. ``arm``, ``disarm``, ``clear`` and
-    ``release`` may be repeated: arming an armed hand is not an error.
+    Commands raise Refused, with the daemon's reason, or NoAnswer if the daemon does not reply. If
+    the daemon refuses a command as late, it is sent again until ``timeout`` expires. ``arm``,
+    ``disarm``, ``clear`` and ``release`` may be repeated: arming an armed hand is not an error.
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context
@@ -236,15 +236,15 @@ class HandClient(Generic[_Done]):
         raise NotImplementedError
 
     def arm(self) -> _Done:
-        """Switch torque on; the joints hold their positions."""
+        """Switch the torque on. The joints hold their positions."""
         return self._carry_out("arm")
 
     def disarm(self) -> _Done:
-        """Switch torque off."""
+        """Switch the torque off."""
         return self._carry_out("disarm")
 
     def tare(self) -> _Done:
-        """Set the zero of the unloaded sensors to their present readings."""
+        """Use the present readings of the unloaded sensors as zero offsets."""
         return self._carry_out("tare")
 
     def move(self, left: float | None = None, right: float | None = None) -> _Done:
@@ -252,19 +252,19 @@ class HandClient(Generic[_Done]):
         return self._carry_out("move", left=left, right=right)
 
     def grasp(self, force: float | None = None) -> _Done:
-        """Close and grip with ``force`` [N] on each tip, by default the force of the settings."""
+        """Close and grip with ``force`` [N] per tip, by default the force from the settings."""
         return self._carry_out("grasp", force=force)
 
     def rotate(self, angle: float) -> _Done:
-        """Turn the grasped object to ``angle`` [rad] in the hand's frame."""
+        """Rotate the grasped object to ``angle`` [rad] in the hand's frame."""
         return self._carry_out("rotate", angle=angle)
 
     def hold(self, force: float | None = None, angle: float | None = None) -> _Done:
-        """Send streamed setpoints, for example at 50 to 100 Hz.
+        """Send one of a stream of setpoints, for example at 50 to 100 Hz.
 
-        Give the ``force`` [N] of each tip, the ``angle`` [rad] of the object, or both. A hand that
-        does not grip yet grasps first. The angle is limited to the range of the grip, and its rate
-        to ``control.rotate_speed``.
+        Pass the ``force`` [N] per tip, the object ``angle`` [rad], or both. If the hand is not
+        gripping yet, it grasps first. The angle is limited to the grip's range, and the angular
+        rate to ``control.rotate_speed``.
         """
         return self._carry_out("hold", force=force, angle=angle)
 
@@ -273,13 +273,13 @@ class HandClient(Generic[_Done]):
         return self._carry_out("release")
 
     def set(self, **numbers: float) -> _Done:
-        """Set a property of the grip: ``compliance`` [rad/(N·m)]."""
+        """Set a grip property: ``compliance`` [rad/(N·m)]."""
         return self._carry_out("set", **numbers)
 
     def stop(self) -> _Done:
-        """Switch torque off immediately, in any mode."""
+        """Switch the torque off immediately, in any mode."""
         return self._carry_out("stop")
 
     def clear(self) -> _Done:
-        """Clear a latched fault, once its cause is gone."""
+        """Clear a latched fault whose cause is gone."""
         return self._carry_out("clear")

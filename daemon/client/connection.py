@@ -1,4 +1,4 @@
-"""Addresses of the daemon, subscriber sockets and timeouts, shared by all clients."""
+"""Provide daemon addresses, subscriber sockets and timeouts for all clients."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import zmq
 from softfinger.daemon.errors import SettingsError, WrongThread
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
-REPLY_TIMEOUT = 5.0  # s, default timeout of a reply or a first message
-SILENCE_TIME = 1.0  # s of waiting, after which a warning is logged
+REPLY_TIMEOUT = 5.0  # s, default timeout for a reply or a first message
+SILENCE_TIME = 1.0  # s, waiting time before a warning is logged
 
-_QUEUE_LENGTH = 100_000  # messages queued for a slow program
-_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid is 131 kB
+_QUEUE_LENGTH = 100_000  # maximum number of messages queued for a slow program
+_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid has 131 kB
 
 
 def default_addresses() -> tuple[str, str]:
-    """Return the stream and command address from SOFTFINGER_ADDRESS, or those of this machine.
+    """Return the stream and command addresses from SOFTFINGER_ADDRESS, by default this machine's.
 
     Raises SettingsError like :func:`both_addresses`.
     """
@@ -33,10 +33,10 @@ def default_addresses() -> tuple[str, str]:
 
 
 def both_addresses(named: str, where: str) -> tuple[str, str]:
-    """Return the stream and command address that a text specifies.
+    """Parse a string into the stream and command addresses.
 
-    The text is ``tcp://HOST``, which implies the default ports, or both addresses separated by a
-    comma. Otherwise the function raises SettingsError, whose message begins with ``where``.
+    The string is ``tcp://HOST``, which implies the default ports, or both addresses separated by a
+    comma. Raises SettingsError for other strings; the message begins with ``where``.
     """
     addresses = [part.strip() for part in named.split(",")]
     if is_host(named):
@@ -103,7 +103,7 @@ class OneThread:
 def subscribe(
     context: zmq.Context[Any], address: str, *topics: bytes, queue: int = _QUEUE_LENGTH
 ) -> zmq.Socket[Any]:
-    """Return a socket that is subscribed to topics and queues up to ``queue`` messages.
+    """Create a socket that subscribes to the topics and queues up to ``queue`` messages.
 
     Raises zmq.ZMQError if the address is malformed.
     """
@@ -123,7 +123,7 @@ def subscribe(
 
 
 def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
-    """Yield the queued messages of a socket, at most ``limit``, without waiting."""
+    """Yield up to ``limit`` queued messages from a socket, without waiting."""
     for _ in range(limit):
         try:
             yield socket.recv_multipart(zmq.NOBLOCK)
@@ -132,7 +132,7 @@ def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
 
 
 def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
-    """Return topic and map of a message. Raises ValueError if it is not a stream message."""
+    """Return a message's topic and map. Raises ValueError if it is not a stream message."""
     try:
         topic, packed = frames
         message = msgpack.unpackb(packed)
@@ -144,5 +144,5 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
 
 
 def still_waiting(what: str, timeout: float) -> str:
-    """Return the warning that something has not arrived yet."""
+    """Return the warning text for data that has not arrived yet."""
     return f"no {what} yet, waiting up to {round(timeout, 2):g} s"

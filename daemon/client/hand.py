@@ -1,4 +1,4 @@
-"""`Hand`: blocking client for a program or notebook."""
+"""Provide `Hand`, a blocking client for programs and notebooks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Subscription(Subscriber[_Record]):
     """Iterator over the records of one topic, in order of arrival.
 
     The subscription begins when the object is created. The iterator raises NoStream if no record
-    arrives within ``timeout`` [s]; with None it waits without limit.
+    arrives within ``timeout`` [s]. If ``timeout`` is None, it waits indefinitely.
     """
 
     def __iter__(self) -> Iterator[_Record]:
@@ -29,9 +29,9 @@ class Subscription(Subscriber[_Record]):
         return self.next(self._timeout)
 
     def next(self, timeout: float | None) -> _Record:
-        """Return the next record. Raises NoStream if none arrives within ``timeout`` s.
+        """Return the next record. Raises NoStream if no record arrives within ``timeout`` s.
 
-        With a timeout, a warning is logged after a wait of 1 s.
+        If there is a timeout, a warning is logged after 1 s of waiting.
         """
         for milliseconds in self._waits(timeout):
             if self._socket.poll(milliseconds):
@@ -41,7 +41,7 @@ class Subscription(Subscriber[_Record]):
         raise no_stream(self._address, self._topic, timeout or 0.0)
 
     def skip(self) -> None:
-        """Drop queued messages, so that the next record is a new one."""
+        """Drop queued messages, so that `next` returns a new record."""
         self._require_open()
         while self._socket.poll(0):
             self._take(self._socket.recv_multipart())
@@ -68,11 +68,11 @@ class Hand(HandClient[None]):
         ``STREAM,COMMANDS``. The default is the environment variable SOFTFINGER_ADDRESS, or else
         this machine.
     client
-        Name that owns the command lease.
+        Client name for the command lease.
     timeout
         Time limit for a reply or a first state [s]; 5 s by default.
     keys
-        Folder with the keys of this client, if the daemon requires keys.
+        Folder with this client's keys, if the daemon requires keys.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class Hand(HandClient[None]):
         self.close()
 
     def state(self, timeout: float | None = None) -> HandState:
-        """Wait for a new state and return it; queued states are dropped. Raises NoStream."""
+        """Drop queued states, then wait for a new state and return it. Raises NoStream."""
         if self._states is None:
             self._states = self.stream()
         else:
@@ -107,7 +107,7 @@ class Hand(HandClient[None]):
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> Subscription[Event]:
-        """Subscribe to the daemon's events: modes, faults, warnings."""
+        """Subscribe to the daemon's events, such as mode changes, faults and warnings."""
         return self._subscription(EVENT, timeout)
 
     def _subscription(self, topic: bytes, timeout: float | None) -> Subscription[Any]:
@@ -115,7 +115,7 @@ class Hand(HandClient[None]):
         return Subscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     def collect(self, seconds: float) -> list[HandState]:
-        """Return all states of the next ``seconds`` s of the daemon's clock. Raises NoStream."""
+        """Collect all states for ``seconds`` s of the daemon's clock. Raises NoStream."""
         with self.stream(self.timeout) as states:
             collected = [next(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)
@@ -128,16 +128,16 @@ class Hand(HandClient[None]):
     def wait_for(
         self, condition: Callable[[HandState], object], timeout: float = 10.0
     ) -> HandState:
-        """Return the first new state for which ``condition`` holds.
+        """Wait for a new state that satisfies ``condition``, and return it.
 
         Raises
         ------
         NotInTime
-            If the condition does not hold within ``timeout`` [s].
+            If no state satisfies the condition within ``timeout`` [s].
         HandFault
-            If the hand has a fault in a state for which the condition does not hold.
+            If the hand is in a fault and its state does not satisfy the condition.
         NoStream
-            If no state arrives at all.
+            If no state arrives.
         """
         wait = Wait(condition, timeout)
         with self.stream() as states:
@@ -150,14 +150,14 @@ class Hand(HandClient[None]):
                     return state
 
     def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
-        """Send one command, without arguments that are None, and return the reply.
+        """Send one command and return the reply. Arguments that are None are omitted.
 
         Raises
         ------
         Refused
-            If the daemon refuses the command; the message gives the reason.
+            If the daemon refuses the command. The message gives the reason.
         NoAnswer
-            If no reply arrives in time.
+            If the reply does not arrive in time.
         """
         request = self._request(name, numbers)
         return accepted(send(self.command_address, request, self.timeout, self._keys))
@@ -170,5 +170,5 @@ class Hand(HandClient[None]):
                 raise
 
     def status(self) -> dict[str, Any]:
-        """Return the daemon's mode, fault, torque, and counters of servos and sensors."""
+        """Return the daemon's mode, fault, torque state, and servo and sensor counters."""
         return self.command("status")

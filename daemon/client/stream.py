@@ -1,7 +1,8 @@
-"""Reading the stream: decode messages to records, count lost messages, and wait for a state.
+"""Read the stream: decode messages into records, count lost messages, and wait for a state.
 
-Messages are untrusted input. A field that is missing or has another type becomes NaN, 0, False or
-empty. Unknown fields are ignored, so that a program also works with a daemon whose schema is newer.
+Messages are untrusted input. Fields that are missing or have the wrong type become NaN, 0, False or
+empty. Unknown fields are ignored, so that a program also works with a daemon that has a newer
+schema.
 """
 
 from __future__ import annotations
@@ -35,15 +36,15 @@ __all__ = ["read", "to_columns"]
 
 _Record = TypeVar("_Record")
 
-_STORED_MESSAGE_COUNT = 1000  # messages that are remembered to recognise repetitions
+_STORED_MESSAGE_COUNT = 1000  # message numbers stored to detect repetitions
 
 _log = logging.getLogger(__name__)
 
 
 def read(record: type[_Record], message: object) -> _Record:
-    """Return the record of `wire.schema` for a topic's map.
+    """Convert a topic's map to its `wire.schema` record.
 
-    Raises ValueError for a tactile frame whose data does not fit its grid.
+    Raises ValueError if the data size of a tactile frame does not match its grid.
     """
     given = message if isinstance(message, dict) else {}
     plan = _converters(record)  # type: ignore[arg-type]  # a class is hashable
@@ -71,9 +72,9 @@ _CONVERTERS: dict[Any, Callable[[object], Any]] = {
 
 
 def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
-    """Return states as one array per field; names of nested fields contain a dot (``left.force``).
+    """Convert states to one array per field, with nested names such as ``left.force``.
 
-    The result can be passed to ``pandas.DataFrame``. Records of other topics work too.
+    The result can be passed to ``pandas.DataFrame``. Records of other topics are also accepted.
     """
     rows = list(states)
     names = [field.name for field in fields_of(type(rows[0]) if rows else HandState)]
@@ -81,11 +82,12 @@ def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
 
 
 class Gaps:
-    """Counter of the lost messages of one topic.
+    """Counter for lost messages of one topic.
 
-    Messages are identified by ``number`` if they have one, otherwise by ``seq``, of which one in
-    ``seq_step`` is sent. A number that decreases is not a loss: the daemon was restarted, or there
-    is a second one. A repeated message (``again``) that was not received before fills a gap.
+    Messages are identified by their ``number`` or, if they have none, by ``seq`` divided by
+    ``seq_step``. A decreasing number does not count as a loss, because the daemon was restarted or
+    a second daemon is running. A repeated message (``again``) that was not received before fills a
+    gap.
     """
 
     def __init__(self) -> None:
@@ -94,7 +96,7 @@ class Gaps:
         self._received: deque[int] = deque(maxlen=_STORED_MESSAGE_COUNT)
 
     def take(self, message: dict[str, Any]) -> bool:
-        """Count one more message; return False if it was received before."""
+        """Count one message; return False if it is a repetition."""
         place = message.get("number")
         if not isinstance(place, int):
             seq, step = message.get("seq"), message.get("seq_step", 1)
@@ -112,7 +114,7 @@ class Gaps:
             return True
         if again is not None:
             if last is not None and place <= last:
-                self._received.clear()  # these were from another daemon
+                self._received.clear()  # The old numbers belong to another daemon.
             self._received.append(place)
         if last is not None and place > last:
             self.lost += place - last - 1
@@ -121,16 +123,16 @@ class Gaps:
 
 
 def no_stream(address: str, topic: bytes, timeout: float) -> NoStream:
-    """Return the exception for a topic without any message."""
+    """Return the exception to raise if a topic has no messages."""
     return NoStream(
         f"no {topic.decode()} from {address} within {timeout:g} s; is softfinger running?"
     )
 
 
 class Subscriber(Generic[_Record]):
-    """Base of `Subscription` and `AsyncSubscription`, with the socket and records of a topic.
+    """Base class of `Subscription` and `AsyncSubscription`, with a topic's socket and decoder.
 
-    ``unreadable`` counts the messages that were skipped because they could not be read.
+    ``unreadable`` is the number of messages that were skipped because they could not be decoded.
     """
 
     def __init__(
@@ -158,7 +160,7 @@ class Subscriber(Generic[_Record]):
 
     @property
     def lost(self) -> int:
-        """Number of lost messages, from the gaps in their sequence numbers."""
+        """Number of lost messages, computed from gaps in the sequence numbers."""
         return self._gaps.lost
 
     def close(self) -> None:
@@ -172,7 +174,7 @@ class Subscriber(Generic[_Record]):
             raise HandClosed("this subscription is closed: make another")
 
     def _take(self, frames: list[bytes]) -> _Record | None:
-        """Return the record of one message, or None if it is unreadable or a repetition."""
+        """Decode a message; return None if it is unreadable or a repetition."""
         try:
             _, message = unpack(frames)
             record = read(self._record, message)
@@ -192,9 +194,9 @@ class Subscriber(Generic[_Record]):
         return record
 
     def _waits(self, timeout: float | None) -> Iterator[int | None]:
-        """Yield durations [ms] to wait for the next message, until ``timeout`` s have passed.
+        """Yield the durations [ms] of successive waits, until ``timeout`` s have passed.
 
-        With a timeout, log a warning after a wait of 1 s.
+        If there is a timeout, log a warning after 1 s of waiting.
         """
         if timeout is None:
             while True:
@@ -214,7 +216,7 @@ class Subscriber(Generic[_Record]):
 
 
 class Wait:
-    """Wait of at most ``timeout`` s for a state for which ``condition`` holds."""
+    """Wait of up to ``timeout`` s for a state that satisfies ``condition``."""
 
     def __init__(self, condition: Callable[[HandState], object], timeout: float) -> None:
         self._condition = condition
@@ -223,14 +225,14 @@ class Wait:
         self._last: HandState | None = None
 
     def left(self) -> float:
-        """Return the remaining time [s]. Raises NotInTime if it is over and states arrived."""
+        """Return the remaining time [s]. Raises NotInTime if it is over and a state has arrived."""
         left = self._end - time.monotonic()
         if left <= 0.0 and self._last is not None:
             raise self.over("")
         return max(left, 0.0)
 
     def ends_with(self, state: HandState) -> bool:
-        """Return True if the condition holds. Raises HandFault for a hand in fault."""
+        """Return True if the condition is met. If not, raises HandFault if the hand is in fault."""
         self._last = state
         if self._condition(state):
             return True
@@ -239,7 +241,7 @@ class Wait:
         return False
 
     def over(self, address: str) -> NotInTime | NoStream:
-        """Return the exception for a wait that has timed out."""
+        """Return the exception to raise after a timeout."""
         if self._last is None:
             return no_stream(address, STATE, self._timeout)
         return NotInTime(

@@ -1,5 +1,5 @@
-"""Checks of `softfinger doctor`: one module per area, with functions that return findings.
+"""Implement the checks of `softfinger doctor`; each module covers one area and returns findings.
 
-Only the `repair` functions, which `--fix` calls, change anything. No function stiffens or moves the
-hand.
+Only the `repair` functions, which `--fix` calls, change hardware or system settings. The hand is
+never stiffened or moved.
 """

@@ -1,8 +1,8 @@
-"""Check the hand's devices: the servos of the scene and the frames of each tactile board.
+"""Check the hand's devices: the scene's servos and the frames of each tactile board.
 
-The checks change nothing. `softfinger doctor --fix` calls the functions named `repair`, which
-configure adapters and servos. The hand goes limp if a servo's EEPROM must be written; it is never
-stiffened or moved.
+The checks do not change settings. `softfinger doctor --fix` calls the functions named `repair`,
+which configure adapters and servos. If a servo's EEPROM must be written, the hand goes limp; it is
+never stiffened or moved.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ from softfinger.daemon.servos.torque import goal_address
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS, Frame
 
-_LISTEN_TIME = 0.5  # s, time to receive a board's frames
-_REST_NOISE_RATIO = 3.0  # times a cell's noise, limit of a tared board's median cell at rest
-_RATE_TOLERANCE = 0.1  # allowed relative error of a board's rate
-_POISSON_TOLERANCE = 0.02  # tolerance of ν, limited by the accuracy of the presses
+_LISTEN_TIME = 0.5  # s, duration of frame reception
+_REST_NOISE_RATIO = 3.0  # median pressure limit at rest, as a multiple of the cell noise
+_RATE_TOLERANCE = 0.1  # tolerated relative frame rate error
+_POISSON_TOLERANCE = 0.02  # tolerance for ν, limited by the accuracy of the calibration
 
 
 def check_servos(settings: Settings) -> list[Finding]:
-    """Check each servo of the scene; if one does not answer, search for it at every rate."""
+    """Check each servo in the scene; if a servo does not reply, search at every baud rate."""
     servos = settings.servos
     model = by_name(servos.model)
     try:
-        # Low-latency mode is not requested, because it would change the adapter.
+        # Low-latency mode is not requested, because this would change the adapter's settings.
         with open_line(servos.port, servos.baud, low_latency=False) as line:
             _wait_for(line, settings)
             found = examine(line, settings, model)
@@ -78,7 +78,7 @@ def check_servos(settings: Settings) -> list[Finding]:
 
 
 def _wait_for(line: ServoLine, settings: Settings) -> None:
-    """Wait up to ``servos.open_timeout`` for servos that do not answer yet, as `run` does."""
+    """Wait up to ``servos.open_timeout`` for servos that have not replied yet, as `run` does."""
     end = time.monotonic() + settings.servos.open_timeout
     missing = [settings.servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
     while missing:
@@ -90,10 +90,11 @@ def _wait_for(line: ServoLine, settings: Settings) -> None:
 def _try_exchange(
     line: ServoLine, settings: Settings, model: ServoModel, found: list[Examined]
 ) -> list[Finding]:
-    """Time the reads and writes of a tick if all servos are usable, without changing registers.
+    """Measure the duration of a tick's reads and writes if all servos are usable.
 
-    The writes have the length and address of a tick's writes and repeat the present values. They
-    are omitted if a servo has torque or could switch it on when a goal is written.
+    The writes have the same length and address as those of a tick, but write the present values, so
+    the registers do not change. If a servo has torque on, or might switch it on when a goal is
+    written, only the reads are measured.
     """
     if not all(each.table and not each.errors for each in found):
         return []
@@ -148,7 +149,7 @@ def _described(servo: Examined, model: ServoModel) -> str:
 
 
 def _search(settings: Settings, model: ServoModel) -> list[Finding]:
-    """Search the port at every rate of the model, and explain how to use the servos found."""
+    """Search the port at all baud rates of the model; explain how to use the servos found."""
     servos = settings.servos
     found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
     if found.old:
@@ -170,7 +171,7 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
 
 
 def _blame_power(examined: list[Examined]) -> list[Finding]:
-    """Report the most likely cause of missing servos if no other servos answer."""
+    """Report the most likely cause of missing servos if no further servos reply."""
     at = reg.PRESENT_INPUT_VOLTAGE
     volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
     problem = "no other servo answers at any rate"
@@ -181,7 +182,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
 
 
 def check_law(settings: Settings, finger: int) -> Finding:
-    """Compare a tip's contact law with the result of `calibrate law`."""
+    """Compare a tip's contact law with the law that `calibrate law` identified."""
     name, tip = f"tip {FINGERS[finger]}", settings.tip
     try:
         calibration = calibration_for(settings, finger)
@@ -202,7 +203,7 @@ def check_law(settings: Settings, finger: int) -> Finding:
 
 
 def check_board(settings: Settings, finger: int) -> Finding:
-    """Check that a board sends frames with the grid and rate of the settings."""
+    """Check that a board sends frames with the grid size and rate given in the settings."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
     sensor = make_sensor(settings, RealClock(), None, finger)
@@ -217,7 +218,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
     try:
         before, start = sensor.counters(), time.monotonic()
         time.sleep(_LISTEN_TIME)
-        frame = sensor.latest()  # a plugin may read its board only in this call
+        frame = sensor.latest()  # Some plugins read the board only in this call.
         after, spent = sensor.counters(), time.monotonic() - start
     finally:
         sensor.close()
@@ -233,7 +234,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
         text = f"{found}, but half of them read {rest / 1e3:.1f} kPa or more, expected 0 at rest"
         fix = "`softfinger calibrate tare`, or `softfinger send tare` at each start"
         return Finding("warn", name, text, fix)
-    # The measuring time may contain one frame more or less.
+    # The frame count is uncertain by ±1, depending on the timing.
     if abs(frames - tactile.rate * spent) > max(_RATE_TOLERANCE * tactile.rate * spent, 1.5):
         text = f"{found}, not {tactile.rate:g}"
         fix = f"set tactile.rate = {rate:.0f}, unless this machine is busy"
@@ -242,7 +243,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
 
 
 def _rest(settings: Settings, finger: int, frame: Frame) -> float:
-    """Return the median pressure of the cells [Pa]; a contact loads fewer than half of them."""
+    """Return the median cell pressure [Pa]. A contact loads fewer than half of the cells."""
     calibration = calibration_for(settings, finger)
     scale = settings.tactile.pascal_per_count
     if calibration is None:
@@ -252,7 +253,7 @@ def _rest(settings: Settings, finger: int, frame: Frame) -> float:
 
 
 def repair_latency_timer(path: str, *sysfs: Path) -> Finding | None:
-    """Set the adapter's latency timer to 1 ms; return None if that is unnecessary."""
+    """Set the adapter's latency timer to 1 ms; return None if no change is necessary."""
     place = latency_file(path, *sysfs)
     found = check_latency_timer(path, 1.0, *sysfs)
     if place is None or found is None or found.status == "pass":
@@ -267,7 +268,7 @@ def repair_latency_timer(path: str, *sysfs: Path) -> Finding | None:
 
 
 def repair_servos(settings: Settings) -> list[Finding]:
-    """Configure the scene's servos for the daemon; return one finding for each change."""
+    """Configure the scene's servos for the daemon; return one finding per change."""
     try:
         found = provision(settings)
     except ServoError as error:

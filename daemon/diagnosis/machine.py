@@ -1,7 +1,7 @@
-"""Check that this machine can keep a steady tick: scheduling, memory, idle states, clock.
+"""Check that this machine can run regular ticks: scheduling, memory, idle states, clock.
 
-Problems found here only degrade the tick, so no check fails. Limits are those of this process,
-which a daemon started from the same shell shares.
+Problems of this kind only degrade the timing, so they are reported as warnings. The checks read the
+limits of this process. A daemon that is started from the same shell has the same limits.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_folder
 
-_MEMORY = 1 << 30  # bytes, more than the daemon maps
+_MEMORY = 1 << 30  # bytes, upper bound of the daemon's mapped memory
 _WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
-_CLOCK_MIN = 1_700_000_000.0  # Unix time [s], an earlier clock was never set
+_CLOCK_MIN = 1_700_000_000.0  # Unix time [s]; an earlier time means that the clock was never set
 
 
 def check_machine() -> list[Finding]:
-    """Run every check of this module."""
+    """Run all checks in this module."""
     return [
         check_scheduling(),
         check_memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]),
@@ -35,7 +35,7 @@ def check_machine() -> list[Finding]:
 
 
 def check_scheduling() -> Finding:
-    """Check that SCHED_FIFO is allowed by setting it briefly for this thread."""
+    """Check that SCHED_FIFO is allowed, by briefly using it for this thread."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
@@ -61,7 +61,7 @@ def check_memory_lock(limit: int) -> Finding:
 
 
 def check_idle_states(path: Path) -> Finding:
-    """Check that the processors can be kept out of deep idle states, which take long to leave."""
+    """Check that the daemon can disable deep processor idle states, which wake up slowly."""
     name = str(path)
     if not path.exists():
         return Finding("warn", name, "this kernel has none: wake-ups take what idle states take")
@@ -72,7 +72,7 @@ def check_idle_states(path: Path) -> Finding:
 
 
 def check_wall_clock(now: float) -> Finding:
-    """Check that Unix time ``now`` [s], which is in every published message, is plausible."""
+    """Check that the Unix time ``now`` [s], which all published messages contain, is plausible."""
     if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
@@ -81,7 +81,7 @@ def check_wall_clock(now: float) -> Finding:
 
 
 def wake_ups() -> list[float]:
-    """Measure the lateness [s] of sleeps until a deadline, like those of the daemon's ticks."""
+    """Measure wake-up delays [s] of sleeps until a deadline, like those between ticks."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UP_COUNT):
@@ -92,7 +92,7 @@ def wake_ups() -> list[float]:
 
 
 def check_wake_ups(late: list[float]) -> Finding:
-    """Check the lateness of wake-ups [s]; a median above a quarter of the period is a warning."""
+    """Check wake-up delays [s]. A median above a quarter of the period is a warning."""
     worst = max(late)
     middle = sorted(late)[len(late) // 2]
     text = f"late by {middle * 1e6:.0f} µs, at most {worst * 1e6:.0f} µs in {len(late)} ticks"
@@ -103,7 +103,7 @@ def check_wake_ups(late: list[float]) -> Finding:
 
 
 def check_kernels(settings: Settings) -> list[Finding]:
-    """Check that compiled kernels can be stored and that those of this scene are present."""
+    """Check that compiled kernels can be stored and that this scene's kernels are compiled."""
     try:
         with find_kernel_folder() as folder:
             place, spoilt = folder.path, len(damaged(folder))

@@ -25,12 +25,12 @@ _PROC = Path("/proc")
 
 
 def serial_ports() -> list[tuple[str, str]]:
-    """Return (path, description) of every serial port of this machine, sorted by path."""
+    """Return (path, description) for each of this machine's serial ports, sorted by path."""
     return sorted((port.device, port.description) for port in list_ports.comports())
 
 
 def note_ports() -> Finding:
-    """Report the existing ports in one line."""
+    """List the existing ports in one finding."""
     found = [
         f"{path} ({text})" if text not in ("", "n/a") else path for path, text in serial_ports()
     ]
@@ -38,7 +38,7 @@ def note_ports() -> Finding:
 
 
 def check_runtime_folder() -> Finding:
-    """Check that only this user can write to the folder of emulated ports and the local stop."""
+    """Check the folder of emulated ports and the local stop: only this user may write to it."""
     what, _, fix = runtime_fault().partition(": chmod ")
     if what:
         return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
@@ -52,8 +52,8 @@ def check_runtime_folder() -> Finding:
 def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     """Check that a port exists, can be opened, and is not used by another process.
 
-    The port is closed again. ``key`` is the setting that names it. ``mode_of_daemon`` is the mode
-    of the daemon that answers commands here, which may use the port, or empty.
+    The port is closed afterwards. ``key`` is the setting that names the port. ``mode_of_daemon`` is
+    the mode of the running daemon, which may be using the port, or empty if no daemon runs.
     """
     try:
         mode = Path(path).stat()
@@ -111,7 +111,7 @@ def _is_daemon(process: int) -> bool:
 
 
 def users(path: str) -> list[tuple[int, str]]:
-    """Return (process, name) of all processes that have the port open, as far as visible.
+    """Return (process, name) for each visible process that has the port open.
 
     The process that owns the other end of a pseudo-terminal is not included.
     """
@@ -134,7 +134,7 @@ def users(path: str) -> list[tuple[int, str]]:
 
 
 def _uses(folder: Path, device: int) -> bool:
-    """Return True if the process has the device open and is not its pseudo-terminal's owner."""
+    """Return True if the process has the device open and does not own its pseudo-terminal."""
     opened = False
     for link in (folder / "fd").iterdir():
         try:
@@ -151,18 +151,18 @@ def _uses(folder: Path, device: int) -> bool:
 
 
 def _pseudo_terminal(folder: Path, link: Path) -> int:
-    """Return the number of the pseudo-terminal whose master this descriptor is, otherwise -1."""
+    """Return the terminal number of a pseudo-terminal master, or -1 for another descriptor."""
     if not str(link.readlink()).endswith("ptmx"):
         return -1
     match = re.search(r"^tty-index:\s*(\d+)", (folder / "fdinfo" / link.name).read_text(), re.M)
     return int(match[1]) if match else -1
 
 
-_TIMEOUT = 0.5  # s for a daemon to answer
+_TIMEOUT = 0.5  # s, timeout for a daemon's reply
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
-    """Check that all addresses can be bound, and name the holder of those in use."""
+    """Check that all addresses can be bound; if not, report whether a daemon uses them."""
     found = [
         _check(settings, "stream.address", settings.stream.address),
         _check(settings, "commands.address", settings.commands.address),
@@ -186,9 +186,9 @@ def _check(settings: Settings, key: str, address: str) -> Finding:
 
 
 def daemon_mode(address: str, keys: str = "") -> str:
-    """Return the mode of the daemon that answers commands at ``address``, or an empty text.
+    """Return the mode of the daemon at ``address``, or an empty string if there is no reply.
 
-    ``keys`` is the folder of `softfinger keys` if the daemon requires keys.
+    If the daemon requires keys, ``keys`` is the folder created by `softfinger keys`.
     """
     try:
         own = load_client(Path(keys)) if keys else None
@@ -199,7 +199,7 @@ def daemon_mode(address: str, keys: str = "") -> str:
 
 
 def why_not_free(address: str) -> str:
-    """Try to bind ``address``; return the error, or an empty text if it succeeds."""
+    """Try to bind ``address``; return the error, or an empty string on success."""
     with zmq.Context() as context, context.socket(zmq.REP) as trial:
         try:
             path = bind(trial, address, 0o600)

@@ -1,7 +1,7 @@
-"""Save the registers of the scene's servos to a file before a change, and restore them.
+"""Save the registers of the scene's servos to a file before changes, and restore them.
 
-JSON: ``{"servos": [{"id": 1, "model": "XM430-W350", "firmware": 48, "registers": {NAME: value}}]}``
-with the names and values of `servos.register_table.REGISTERS`.
+The file is JSON, with the register names and values of `servos.register_table.REGISTERS`:
+``{"servos": [{"id": 1, "model": "XM430-W350", "firmware": 48, "registers": {NAME: value}}]}``.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
 from softfinger.daemon.types import FINGERS
 
-_FILE_SIZE_MAX = 1 << 20  # bytes, largest file that is read
-_PASS_COUNT = 2  # a lower limit may be rejected until the upper one is written
+_FILE_SIZE_MAX = 1 << 20  # bytes, limit for reading a file
+_PASS_COUNT = 2  # A lower limit may be rejected until the upper limit has been written.
 
 
 class StoredServo(Section):
@@ -53,7 +53,7 @@ class StoredServos(Section):
 
 
 def save_registers(settings: Settings, path: Path) -> list[Finding]:
-    """Save all registers of each servo that answers, except ID and baud rate."""
+    """Save all registers, except ID and baud rate, of each servo that replies."""
     servos: list[StoredServo] = []
     found = []
     with open_line(settings.servos.port, settings.servos.baud) as line:
@@ -80,9 +80,9 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
 
 
 def restore_registers(settings: Settings, path: Path) -> list[Finding]:
-    """Write registers stored by :func:`save_registers` to servos of the same ID and model.
+    """Write the registers saved by :func:`save_registers` to servos with the same ID and model.
 
-    Raises ServoError for a file with other content.
+    Raises ServoError if the file has other content.
     """
     stored = _stored(path)
     result: list[Finding] = []
@@ -137,7 +137,7 @@ def _restore(
 
 
 def _stored(path: Path) -> dict[int, StoredServo]:
-    """Return the servos of a file by ID. Raises ServoError for a file of another kind."""
+    """Return a file's servos by ID. Raises ServoError if the file has other content."""
     try:
         stored = StoredServos.model_validate_json(read_file(path, _FILE_SIZE_MAX))
     except OSError as error:

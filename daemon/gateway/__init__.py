@@ -1,4 +1,5 @@
-"""Gateway process: it holds the sockets of all clients and enforces the limits of `bounds`.
+"""Serve all clients from a separate gateway process, which enforces the limits in `bounds`.
 
-Over `wire.loop_link` the loop sends it the stream and receives a few requests at a time.
+The loop sends the stream to the gateway over `wire.loop_link` and receives requests from it, a few
+at a time.
 """

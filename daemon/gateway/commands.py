@@ -1,15 +1,16 @@
-"""Command endpoint: passes requests to the loop within the limits, and replies back to clients.
+"""Forward requests to the loop, within limits, and forward replies to clients.
 
-Requests are not unpacked here. A request that looks like a stop is urgent: it goes to the loop at
-once, one per client at a time. Of all other requests, only a few are with the loop at any time. The
-remaining ones wait in queues, and the clients take turns. A client that exceeds its rate is refused
-until it pauses.
+The gateway does not unpack requests. A request that looks like a stop is urgent: it bypasses the
+queues, one at a time per client. Only a few other requests are forwarded to the loop at a time. The
+remaining ones wait in queues, and the clients take turns. If a client exceeds its rate, its
+requests are refused until it pauses.
 
-Each request is stamped with its arrival time and the number of stops that preceded it. The thread
-of libzmq reads ahead, so the arrival order of a request and a stop can only be inferred from time.
-After a stop or a gap between polls, requests are therefore stamped as if they had arrived before
-it, until the socket was empty for a moment and few requests arrived. Until then answers are held
-back for a limited time, so that requests which clients send in response are not refused.
+Each request is stamped with its arrival time and the number of stops that preceded it. The libzmq
+thread reads ahead, so the gateway can't observe the order in which a request and a stop arrived.
+After a stop or a poll gap, it therefore stamps requests as if they had arrived earlier. This
+continues until the socket has been empty and few requests have arrived. In the meantime, replies
+are held back for a limited time, because clients may respond to them with new requests, which would
+be refused.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from softfinger.daemon.gateway.endpoints import NO_WAIT, Admission, Endpoint
 from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask
 
-_PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't occur within a text
+_PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't occur within a string
 _MALFORMED_REFUSAL = refusal(
     "envelope: expected the command in one frame, alone or behind an empty frame that ends an "
     f"envelope of at most {bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes",
@@ -38,19 +39,19 @@ _QUEUE_FULL_REFUSAL = refusal("too many commands wait already", Reason.BUSY)
 
 
 class Client:
-    """Connection with its queued requests and a token bucket for one second of requests."""
+    """One connection, with its queued requests and a token bucket of one second's requests."""
 
     __slots__ = ("_behind", "_left", "_then", "urgent", "waiting")
 
     def __init__(self, per_second: float, now: float) -> None:
         self.waiting: deque[Ask] = deque()
-        self.urgent = False  # an urgent request has not been answered yet
-        self._behind = False  # above its rate, without a pause since
+        self.urgent = False  # True while an urgent request awaits its reply
+        self._behind = False  # True from exceeding the rate until the next pause
         self._left = per_second
         self._then = now
 
     def floods(self, per_second: float, now: float) -> bool:
-        """Count one more request; return True if the client is above its rate, until it pauses."""
+        """Count one request; return True from exceeding the rate until the client pauses."""
         passed = now - self._then
         left = min(self._left + passed * per_second, per_second) - 1.0
         self._left = max(left, 0.0)
@@ -60,7 +61,7 @@ class Client:
 
 
 class CommandEndpoint(Endpoint):
-    """Socket that receives requests and sends answers."""
+    """Socket that receives requests and sends replies."""
 
     def __init__(
         self,
@@ -76,33 +77,35 @@ class CommandEndpoint(Endpoint):
         self._too_many = refusal(text, Reason.BUSY)
         self._send_to_loop = send_to_loop
         self._clock = clock
-        self.refused = 0  # requests refused because of their number
-        self.stops = 0  # stops known to have preceded the requests that are read now
-        self._fence = 0  # stops so far
-        self._last_poll = clock()  # time of the last poll
-        self._dated: float | None = None  # last poll before a gap, while its requests may remain
-        self._left = 0  # requests that may remain from before the gap
-        self._since = 0.0  # time of a stop, of a gap, or of the last check of `_arrived`
+        self.refused = 0  # requests refused by rate and queue limits
+        self.stops = 0  # stop count stamped on new requests
+        self._fence = 0  # current stop count
+        self._last_poll = clock()
+        # Last poll before a gap, until all requests that arrived during the gap have been read.
+        self._dated: float | None = None
+        self._left = 0  # maximum number of unread requests from the gap
+        self._since = 0.0  # time of the last stop, gap or `_arrived` check
         self._arrived = 0  # requests since then, except status
-        self._held: list[list[bytes]] = []  # answers
-        self._held_for = 0.0  # s; each step counts for at most PURGE, so that stalls don't count
+        self._held: list[list[bytes]] = []  # replies held back
+        # s, holding time. A step adds at most REFUSAL_TIME, so stalls hardly count.
+        self._held_for = 0.0
         self._clients: OrderedDict[bytes, Client] = OrderedDict()
-        self._active: set[bytes] = set()  # clients that sent a request in this second
+        self._active: set[bytes] = set()  # clients that sent a request in the current second
         self._active_until = 0.0
         self._turns: deque[Client] = deque()  # clients with queued requests
         self._urgent: deque[Ask] = deque()
-        self.count = 0  # queued requests, without urgent ones
-        self._under_way = [0, 0]  # requests with the loop: normal, urgent
+        self.count = 0  # queued requests, not counting urgent ones
+        self._under_way = [0, 0]  # requests that await the loop's reply: normal, urgent
         limit = bounds.PART_SIZE_RATIO * config.max_bytes
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
     def fence(self, stops: int) -> None:
-        """Stamp requests as older than the last stop until all earlier requests have been read."""
+        """Stamp new requests as older than the last stop until all older ones have been read."""
         self._fence = stops
         self._since, self._arrived = self._clock(), 0
 
     def read(self) -> None:
-        """Read requests for up to `bounds.TURN_TIME`, and pass on as many as the loop may have."""
+        """Read requests for up to `bounds.TURN_TIME`, and forward them within the loop's limits."""
         began = self._clock()
         if began - self._last_poll > bounds.POLL_GAP_MAX:
             if self._dated is None:
@@ -131,10 +134,10 @@ class CommandEndpoint(Endpoint):
                 self._turns.append(client)
 
     def _note_empty(self, now: float) -> None:
-        """Handle an empty socket: all requests from before a stop or a gap may have been read.
+        """Check whether all requests from before a stop or a gap have been read.
 
-        The thread of libzmq may still deliver one. They count as read only after `PURGE` seconds in
-        which few requests arrived.
+        The socket is empty, but the libzmq thread may still deliver older requests. They count as
+        read only after `bounds.REFUSAL_TIME` with few new requests.
         """
         if now - self._since > bounds.REFUSAL_TIME:
             if self._arrived <= bounds.TOTAL_RATE * bounds.REFUSAL_TIME:
@@ -142,8 +145,8 @@ class CommandEndpoint(Endpoint):
             self._since, self._arrived = now, 0
 
     def _take(self, parts: list[bytes], name: str, now: float) -> None:
-        """Queue one message of a client, or refuse it."""
-        # As with a REP socket, the frames up to the first empty one are returned with the reply.
+        """Queue or refuse one client message."""
+        # As with a REP socket, the frames up to the first empty frame are returned with the reply.
         ends = parts.index(b"", 1) + 1 if b"" in parts[1:-1] else 1
         route, payload = parts[:ends], parts[-1]
         if sum(map(len, route)) > bounds.ENVELOPE_SIZE_MAX or len(parts) > bounds.PART_COUNT_MAX:
@@ -151,7 +154,7 @@ class CommandEndpoint(Endpoint):
         client = self._client(parts[0], now)
         self._arrived += b"status" not in payload
         self._left -= 1
-        if self._left < 0:  # more requests than the queues can have held
+        if self._left < 0:  # More requests were read than the socket queues can hold.
             self._dated = None
         is_urgent = (
             _PACKED_STOP in payload and len(payload) <= bounds.URGENT_SIZE_MAX and not client.urgent
@@ -193,7 +196,7 @@ class CommandEndpoint(Endpoint):
         return client
 
     def _client_rate(self, identity: bytes, now: float) -> float:
-        """Return the request rate [1/s] allowed for each client; it is lower if many send."""
+        """Return the allowed request rate per client [1/s], which is lower with many clients."""
         if now > self._active_until:
             self._active_until = now + 1.0
             self._active.clear()
@@ -206,14 +209,14 @@ class CommandEndpoint(Endpoint):
         self._send_to_loop(ASK, *ask)
 
     def reply(self, urgent: bool, route: list[bytes], reply: bytes) -> None:
-        """Forward the loop's answer to a request."""
+        """Forward the loop's reply to the client."""
         self._under_way[urgent] -= 1
         if urgent and route[0] in self._clients:
             self._clients[route[0]].urgent = False
         self._answer(route, reply)
 
     def _answer(self, route: list[bytes], reply: bytes) -> None:
-        """Send a reply, or hold it back until all requests from before a stop have been read."""
+        """Send a reply, or hold it back until all requests that precede a stop have been read."""
         if self.stops == self._fence:
             self._send([*route, reply])
             return
@@ -222,5 +225,5 @@ class CommandEndpoint(Endpoint):
         self._held.append([*route, reply])
 
     def _send(self, message: list[bytes]) -> None:
-        with contextlib.suppress(zmq.ZMQError):  # the client has disconnected
+        with contextlib.suppress(zmq.ZMQError):  # The client may have disconnected.
             self.socket.send_multipart(message, NO_WAIT)

@@ -1,7 +1,8 @@
-"""Sockets for clients, and their authentication.
+"""Provide the client sockets and authenticate the clients.
 
-Without keys all clients are accepted, but libzmq disconnects peers without a ZMTP 3 greeting. That
-includes web pages, whose POST requests older versions of the protocol accept as messages.
+Without keys all clients are accepted, but libzmq disconnects peers that do not send a ZMTP 3
+greeting. This excludes web pages, whose POST requests are valid messages in older protocol
+versions.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ _DOMAIN = "softfinger"
 
 
 class RestartNeeded(SoftfingerError):
-    """All connections must end, and clients must reconnect. The message gives the reason."""
+    """All clients must be disconnected and reconnect. The message gives the reason."""
 
 
 class Admission(ThreadAuthenticator):
-    """Authenticate clients for libzmq with the keys that the folder contains at present."""
+    """Authenticate clients for libzmq with the keys that are currently in the folder."""
 
     def __init__(self, context: zmq.Context[Any], folder: Path | None) -> None:
-        """Load the keys of ``folder`` (see `softfinger keys`); None accepts all clients.
+        """Load the keys in ``folder`` (see `softfinger keys`). With None, all clients are accepted.
 
         Raises
         ------
@@ -53,29 +54,29 @@ class Admission(ThreadAuthenticator):
             self.configure_curve_callback(_DOMAIN, self)
 
     def guard(self, socket: zmq.Socket[Any]) -> None:
-        """Restrict a socket to authenticated clients. Call this before bind."""
+        """Restrict a socket to authenticated clients. Call this method before bind."""
         if self._keys is not None:
             self._keys.guard(socket)
-        # If the authenticator fails, libzmq then rejects all clients instead of accepting them.
+        # With these options, libzmq rejects all clients if the authenticator fails.
         socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN.encode())
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
         socket.setsockopt(zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE_TIMEOUT))
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Return True if the client with this key is accepted. The authenticator calls this."""
+        """Return True if the client with this key is accepted. Called by the authenticator."""
         return self._keys is not None and domain == _DOMAIN and key in self._keys.clients
 
     def curve_user_id(self, client_public_key: bytes) -> str:
-        """Return the name of the client with this key."""
+        """Return the name of the client that has this key."""
         assert self._keys is not None
         return self._keys.clients.get(zmq.utils.z85.encode(client_public_key), "")
 
     def name(self, part: zmq.Frame) -> str:
-        """Return the name of the sender by its key; empty without keys."""
+        """Return the sender's name according to its key, or an empty string without keys."""
         return "" if self._keys is None else str(part.get("User-Id"))
 
     def look(self, now: float) -> None:
-        """Check the key folder, and accept new clients.
+        """Check the key folder and accept newly added clients.
 
         Raises
         ------
@@ -92,7 +93,7 @@ class Admission(ThreadAuthenticator):
         try:
             try:
                 found = load_server(self._folder)
-            except NoDescriptor:  # connections use them all, so new keys can't be read
+            except NoDescriptor:  # Connections use all descriptors, so new keys can't be read.
                 found = self._keys.left(self._folder)
         except KeyFileError as error:
             raise RestartNeeded(str(error)) from None
@@ -103,12 +104,12 @@ class Admission(ThreadAuthenticator):
 
 
 def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
-    """Bind a socket; return the path of its file, empty for TCP. Raises AddressError."""
+    """Bind a socket and return its file path, or an empty string for TCP. Raises AddressError."""
     path = address.removeprefix("ipc://") if address.startswith("ipc://") else ""
     if path and (trouble := _taken(path)):
         raise AddressError(f"{address} {trouble}")
     bound.setsockopt(zmq.IPV6, int("[" in address))
-    before = os.umask(0o777 & ~ipc_mode)  # the file must never have wider permissions
+    before = os.umask(0o777 & ~ipc_mode)  # The file must never have wider permissions.
     try:
         # libzmq binds only to numeric addresses.
         bound.bind(address.replace("tcp://localhost:", "tcp://127.0.0.1:"))
@@ -124,7 +125,7 @@ def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
 
 
 def _taken(path: str) -> str:
-    """Return the reason why a socket can't replace ``path``; empty if it can."""
+    """Return the reason why a socket can't replace ``path``, or an empty string if it can."""
     if not Path(path).exists():
         return ""
     if not Path(path).is_socket():
@@ -133,20 +134,20 @@ def _taken(path: str) -> str:
         trial.setblocking(False)
         try:
             trial.connect(path)
-        except (FileNotFoundError, ConnectionRefusedError):  # left over from a killed process
+        except (FileNotFoundError, ConnectionRefusedError):  # A killed process left the file.
             return ""
-        except OSError:  # its queue is full, or we lack permission
+        except OSError:  # The queue is full, or this user lacks permission.
             pass
     return IN_USE
 
 
 class Endpoint:
-    """A bound socket."""
+    """Bound socket with the gateway's limits."""
 
     def __init__(
         self, admission: Admission, kind: int, address: str, key: str, config: Config, limit: int
     ) -> None:
-        """Bind a socket; ``key`` is the setting of its address, ``limit`` is per message part.
+        """Bind a socket; ``key`` names its address setting, ``limit`` is the size per message part.
 
         Raises
         ------
@@ -154,7 +155,7 @@ class Endpoint:
             If the address can't be bound.
         """
         self.socket: zmq.Socket[Any] = admission.context.socket(kind)
-        # The options affect only connections made after they were set, so set them before bind.
+        # Options apply only to later connections, so they must be set before bind.
         self.socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LINGER_TIME))
         self.socket.setsockopt(zmq.MAXMSGSIZE, limit)
         self.socket.setsockopt(
@@ -169,7 +170,7 @@ class Endpoint:
             raise AddressError(f"{key}: {error}") from None
 
     def _parts(self) -> list[zmq.Frame]:
-        """Return the parts of the next message, at most one more than allowed; empty if none."""
+        """Return the next message's parts, at most one more than allowed. Empty without message."""
         found: list[zmq.Frame] = []
         with contextlib.suppress(zmq.Again):
             while not found or found[-1].more:
@@ -190,10 +191,10 @@ class StreamEndpoint(Endpoint):
         """Bind the socket. Raises AddressError."""
         self._topics = [name.encode() for name in config.topics]
         self._prefixes: set[bytes] = set()
-        self._kept: dict[int, deque[bytes]] = {}  # last messages for late subscribers, by topic
-        self._came_late = 0  # topics to repeat for late subscribers, as bits
+        self._kept: dict[int, deque[bytes]] = {}  # by topic, last messages for late subscribers
+        self._came_late = 0  # bit mask of topics to be repeated to late subscribers
         self._tell_at = 0.0  # earliest time of the next repetition
-        self.wanted = 0  # topics with subscribers, as bits
+        self.wanted = 0  # bit mask of topics with subscribers
         super().__init__(
             *(
                 admission,
@@ -204,10 +205,10 @@ class StreamEndpoint(Endpoint):
                 bounds.SUBSCRIPTION_SIZE_MAX,
             )
         )
-        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # reports each subscriber of a topic
+        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # report every subscription to a topic
 
     def read(self, now: float) -> None:
-        """Read subscriptions, and repeat stored messages for new subscribers."""
+        """Read subscriptions, and repeat stored messages to new subscribers."""
         for _ in range(bounds.SUBSCRIPTIONS_PER_TURN):
             parts = self._parts()
             if not parts:
@@ -228,15 +229,15 @@ class StreamEndpoint(Endpoint):
             self._tell_at = now + bounds.REPEAT_INTERVAL
 
     def _matching(self, *prefixes: bytes) -> int:
-        """Return the topics that begin with any of the prefixes, as bits."""
+        """Return the bit mask of topics that begin with any of the prefixes."""
         return sum(1 << k for k, name in enumerate(self._topics) if name.startswith(prefixes))
 
     def publish(self, topic: int, keep: int, message: bytes) -> None:
-        """Send a message, and store the last ``keep`` messages for late subscribers."""
+        """Send a message; store the topic's last ``keep`` messages for late subscribers."""
         if keep:
             self._kept.setdefault(topic, deque(maxlen=keep)).append(repeated(message))
         self._send(topic, message)
 
     def _send(self, topic: int, message: bytes) -> None:
-        """Send one message to all subscribers of its topic; slow subscribers lose it."""
+        """Send one message to all subscribers of its topic. Slow subscribers miss it."""
         self.socket.send_multipart((self._topics[topic], message), NO_WAIT)

@@ -1,7 +1,8 @@
-"""Main module of the gateway process: one thread serves the loop and the clients.
+"""Run the gateway process, in which one thread serves the loop and the clients.
 
-Run as ``python -m softfinger.daemon.gateway.server FD CONFIG`` with the file descriptor of the link
-and a `Config` as JSON. The process first binds its sockets. It ends when the loop disconnects.
+It is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's file
+descriptor and a `Config` as JSON. The process first binds its sockets. It exits when the loop
+disconnects.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from softfinger.daemon.gateway.endpoints import (
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel
 
-_TIMER_INTERVAL = 0.5  # s between two restarts of the timers that end a stalled process
-_LATEST_TOPIC = 0  # index of the topic that is also published in one frame
-# s that the authenticator thread waits for the interpreter during a flood.
+_TIMER_INTERVAL = 0.5  # s, restart interval of the timers that end a stalled process
+_LATEST_TOPIC = 0  # index of the topic that is also published in single frames
+# s, longest time that the authenticator thread waits for the interpreter during a flood.
 _AUTHENTICATOR_WAIT = 5e-4
 
 
@@ -48,7 +49,7 @@ class Server:
         config: Config,
         clock: Callable[[], float] = loop_link.machine_time,
     ) -> None:
-        """Bind the addresses of ``config``; ``channel`` is this end of the link.
+        """Bind the addresses in ``config``; ``channel`` is the gateway's end of the link.
 
         Raises
         ------
@@ -84,7 +85,7 @@ class Server:
             raise
 
     def step(self, seconds: float = bounds.STEP_WAIT_MAX) -> None:
-        """Wait up to ``seconds`` for messages of the loop or of clients, and handle them."""
+        """Wait up to ``seconds`` for messages from the loop or clients, and handle them."""
         self._poller.poll(int(1e3 * seconds))
         now = self._clock()
         self._admission.look(now)
@@ -110,7 +111,7 @@ class Server:
         self.channel.flush()
 
     def close(self) -> None:
-        """Send queued messages for up to `bounds.LINGER_TIME`, and disconnect all clients."""
+        """Send queued messages for up to `bounds.LINGER_TIME`, then disconnect all clients."""
         for endpoint in (self.stream, self._latest, self.commands):
             if endpoint is not None:
                 endpoint.close()
@@ -124,11 +125,11 @@ def main(words: list[str]) -> int:
     Returns
     -------
     int
-        0 when the loop has ended, 1 if the sockets could not be bound, `loop_link.RESTART_STATUS`
-        if all clients must reconnect.
+        0 if the loop has ended, 1 if the sockets could not be bound, `loop_link.RESTART_STATUS` if
+        all clients must reconnect.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # it must still send the last messages of the loop
+        signal.signal(number, signal.SIG_IGN)  # The loop's last messages must still be sent.
     channel = Channel(socket.socket(fileno=int(words[0])))
     try:
         _be_bounded()
@@ -145,7 +146,7 @@ def main(words: list[str]) -> int:
             now = time.monotonic()
             if now - lived > _TIMER_INTERVAL:
                 lived = now
-                # SIGPROF and SIGALRM have no handlers, so each of them ends the process.
+                # SIGPROF and SIGALRM end the process, because they have no handlers.
                 signal.setitimer(signal.ITIMER_PROF, bounds.STEP_CPU_TIME_MAX)
                 signal.setitimer(signal.ITIMER_REAL, bounds.STEP_TIME_MAX)
     except RestartNeeded as reason:
@@ -156,7 +157,7 @@ def main(words: list[str]) -> int:
 
 
 def _be_bounded() -> None:
-    """Limit memory, prefer this process when memory runs out, and drop real-time scheduling."""
+    """Limit memory and descriptors, raise the out-of-memory score, leave real-time scheduling."""
     resource.setrlimit(resource.RLIMIT_DATA, (bounds.MEMORY_MAX, bounds.MEMORY_MAX))
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT
@@ -167,7 +168,7 @@ def _be_bounded() -> None:
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     except OSError:
-        pass  # these two are optional
+        pass  # Both measures are optional.
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Supervisor that starts the gateway process and restarts it when it has died."""
+"""Start the gateway process and restart it if it dies."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel, Link
 
-_ROOT = Path(__file__).parents[3]  # folder that contains the package
-_BIND_TIMEOUT = 60.0  # s, timeout for binding the sockets, unless the process ends before
-_STABLE_TIME = 10.0  # s of running after which the restart delay is reset
-# s between checks; a process found stopped this many times is killed.
+_ROOT = Path(__file__).parents[3]  # parent folder of the package
+_BIND_TIMEOUT = 60.0  # s, timeout for binding the sockets
+_STABLE_TIME = 10.0  # s, running time after which the restart delay is reset
+# s between checks, and the number of successive stopped states after which a process is killed.
 _CHECK_INTERVAL, _STOPPED_COUNT_MAX = 1.0, 2
-_RESTART_DELAYS = 0.1, 2.0  # s from an exit to the next start: first delay, longest delay
+_RESTART_DELAYS = 0.1, 2.0  # s, first and longest delay between an exit and the next start
 
 
 class Gateway:
-    """Gateway process that runs until it is closed. The loop uses `link` to reach it."""
+    """Gateway process, restarted until `close` is called. The loop communicates through `link`."""
 
     def __init__(self, config: Config) -> None:
-        """Start the process in the background; call `wait` before use."""
+        """Start the process in the background. Call `wait` before use."""
         self.link = Link()
         self._config = config
         self._closing = threading.Event()
@@ -57,7 +57,8 @@ class Gateway:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # In its own session, Ctrl-C does not end it before the daemon's last messages.
+                # In a separate session, Ctrl-C does not end the process before it has sent the
+                # daemon's last messages.
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )
@@ -98,11 +99,11 @@ class Gateway:
                         self.link.notices.append(f"clients can't be served: {error}")
                 else:
                     break
-            if self._closing.is_set():  # closed during the start
+            if self._closing.is_set():  # `close` was called during the restart.
                 self._channel.close()
 
     def _wait(self) -> int:
-        """Wait for the process to end, and kill it if it is stopped, since its timers don't run."""
+        """Wait for the process to end. Kill a stopped process, because its timers don't run."""
         process, stopped = self._process, 0
         while True:
             try:
@@ -119,7 +120,7 @@ class Gateway:
         self._process.wait()
 
     def close(self) -> None:
-        """Disconnect, and wait until the gateway has sent all messages and ended."""
+        """Disconnect, and wait until the gateway has sent all messages and exited."""
         self._closing.set()
         self.link.close()
         self._channel.close()
@@ -134,6 +135,6 @@ class Gateway:
 def _is_stopped(process: int) -> bool:
     try:
         state = Path(f"/proc/{process}/stat").read_text(encoding="latin-1").rpartition(")")[2]
-    except OSError:  # the process has ended
+    except OSError:  # The process has ended.
         return False
     return state.split()[0] in "Tt"

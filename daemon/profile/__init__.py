@@ -1,4 +1,4 @@
-"""Profiles: validated settings from TOML files, and the models that the settings describe.
+"""Load profiles: validated settings from TOML files, and the models that the settings describe.
 
-This package does not act on the hand.
+This package never communicates with the hand.
 """

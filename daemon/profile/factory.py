@@ -1,4 +1,4 @@
-"""Create the objects that settings describe: tip, material, contact table, sensor grid."""
+"""Create the objects that the settings describe: tip, material, contact table, sensor grid."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 
 def make_tip(settings: Settings) -> Fingertip:
-    """Create the fingertip model. Raises SettingsError for a measured tip, which has no model."""
+    """Create the fingertip model. Raises SettingsError for a measured tip, which has none."""
     tip = settings.tip
     if tip.physics == "measured":
         raise SettingsError(
@@ -26,7 +26,7 @@ def make_tip(settings: Settings) -> Fingertip:
 
 
 def law_problem(material: Material, limit: float) -> str:
-    """Describe a fit error of the law above ``limit`` (relative to F); empty if it is smaller."""
+    """Describe a material law fit error above ``limit`` (relative to F); empty if it is smaller."""
     found = material.worst_force_error
     if found <= limit:
         return ""
@@ -37,7 +37,7 @@ def law_problem(material: Material, limit: float) -> str:
 
 
 def make_material(law: MaterialSettings) -> Material:
-    """Create the stress-strain law. Raises SettingsError if its points give no usable law."""
+    """Create the stress-strain law. Raises SettingsError if its points are unusable."""
     if law.law == "constant":
         return Material.constant(law.modulus)
     if law.law == "table_i":
@@ -51,13 +51,13 @@ def make_material(law: MaterialSettings) -> Material:
 def make_table(
     settings: Settings, material: Material, tip: Fingertip | None = None
 ) -> ContactTable:
-    """Create the contact table for ``tip``, by default the tip of the settings.
+    """Create the contact table for ``tip``, by default the tip in the settings.
 
-    Raises SettingsError if no table of this material reaches the tolerance.
+    Raises SettingsError if the tolerance cannot be reached with this material.
     """
     tip = tip or make_tip(settings)
     try:
-        if tip.physics != "springs":  # fast, so it is not cached
+        if tip.physics != "springs":  # These tables are built fast, so they are not cached.
             return ContactTable.build(tip, material)
         return _built(tip, material, settings.table.tolerance)
     except TableError as error:
@@ -66,7 +66,7 @@ def make_table(
 
 @lru_cache(maxsize=8)
 def _built(tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
-    """Build a table, which takes 0.16 s and is shared by the hands of one process."""
+    """Build a table in 0.16 s. All hands in a process share it."""
     return ContactTable.build(tip, material, tolerance)
 
 
@@ -76,9 +76,9 @@ def make_grid(
     centre: tuple[float, float] | None = None,
     rotation: float | None = None,
 ) -> SensorGrid:
-    """Create the sensor grid of one finger.
+    """Create the sensor grid for one finger.
 
-    ``centre`` [m] and ``rotation`` [rad] are measured values that replace those of the settings.
+    ``centre`` [m] and ``rotation`` [rad] are measured values that replace those in the settings.
     """
     tactile = settings.tactile
     return SensorGrid(

@@ -1,4 +1,4 @@
-"""Define the number types of settings with their bounds, and the base class of sections."""
+"""Define the number types for settings, with their bounds, and the base class for sections."""
 
 from __future__ import annotations
 
@@ -36,20 +36,21 @@ Processor = Annotated[int, Field(ge=0, le=1023)]
 
 
 def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
-    """Declare a key of a section.
+    """Declare a key in a section.
 
-    The profile reference, documentation and JSON schema are generated from these declarations.
+    The profile reference, the documentation and the JSON schema are generated from these
+    declarations.
 
     Parameters
     ----------
     default
-        Value of the built-in simulated hand.
+        Value for the built-in simulated hand.
     unit
-        SI unit of the value or of each of its elements; empty if it has none.
+        SI unit of the value or of each element, empty for a dimensionless value.
     description
         Meaning of the value, in one or two sentences.
     **options
-        Bounds and examples, as in :func:`pydantic.Field`.
+        Bounds and examples, passed to :func:`pydantic.Field`.
     """
     if unit:
         options["json_schema_extra"] = {"unit": unit}
@@ -57,16 +58,16 @@ def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
 
 
 class Section(BaseModel):
-    """Base class of all sections: immutable and strict.
+    """Base class of all sections, which are immutable and strict.
 
-    Unknown keys are errors. An integer is accepted for a float, but strings are never converted.
+    Unknown keys are errors. Integers are accepted as floats, but strings are never converted.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 def names_backend(kind: Kind) -> AfterValidator:
-    """Return a validator of backend names whose errors are worded like those of a Literal."""
+    """Return a backend name validator whose error messages are worded like those of a Literal."""
 
     def check(name: str) -> str:
         try:

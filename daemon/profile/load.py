@@ -1,7 +1,7 @@
 """Load a profile from TOML into validated `Settings`, or report all of its errors at once.
 
-`profile.settings` defines the values that each key allows, and `profile.validation` the
-combinations of keys.
+`profile.settings` defines the allowed values of each key. `profile.validation` checks combinations
+of keys.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from softfinger.daemon.profile.validation import plausibility_warnings, problems
 __all__ = ["load"]
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-_FILE_SIZE_MAX = 256 << 10  # bytes; the reference, which contains every key, has 21 kB
+_FILE_SIZE_MAX = 256 << 10  # bytes; the reference with every key has 21 kB
 _DEPTH_MAX = 8  # nesting depth of tables and arrays
-_ERROR_COUNT_MAX = 20  # largest number of reported errors
-# A dotted key of 16 parts or more. tomllib needs minutes for a key of thousands of parts.
+_ERROR_COUNT_MAX = 20  # reported errors per load
+# Matches dotted keys with 16 or more parts, because tomllib needs minutes for thousands of parts.
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
 _WORD = re.compile(r"\w+")
 _MESSAGE_START = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
@@ -69,7 +69,7 @@ def load(
     Parameters
     ----------
     path : file, or one of `names`; None for the built-in simulated hand
-    directory : replaces ``{dir}`` in the ports
+    directory : replacement for ``{dir}`` in the ports
     changes : settings such as ``loop.rate=1000``, which override the file
 
     Raises
@@ -149,14 +149,14 @@ def _without(data: dict[str, Any], wrong: Sequence[ErrorDetails]) -> dict[str, A
 
 
 def names() -> list[str]:
-    """Return the names of the profiles in the package."""
+    """Return the names of the packaged profiles."""
     return sorted(path.stem for path in _PROFILES.glob("*.toml"))
 
 
 def find(path: Path) -> Path:
-    """Return the file of a profile: a bare name is one of the package, other paths are unchanged.
+    """Return a profile's file; a bare name may refer to a packaged profile.
 
-    Raises SettingsError for a bare name that is neither one of `names` nor an existing file.
+    Raises SettingsError for a bare name that is neither in `names` nor an existing file.
     """
     if path.suffix or path.parent != Path() or (path.exists() and not path.is_dir()):
         return path
@@ -172,7 +172,7 @@ def find(path: Path) -> Path:
 def profile_text(path: Path) -> str:
     """Return a profile's text.
 
-    Raises OSError as `read_file`, UnicodeDecodeError, and RecursionError for keys with too many
+    Raises OSError like `read_file`, UnicodeDecodeError, and RecursionError if a key has too many
     parts.
     """
     text = read_file(path, _FILE_SIZE_MAX).decode("utf-8-sig")
@@ -182,7 +182,7 @@ def profile_text(path: Path) -> str:
 
 
 def without_files(settings: Settings) -> Settings:
-    """Remove the paths of files from settings that were loaded from another user's file."""
+    """Remove all file paths from settings that were loaded from another user's file."""
     changes = {
         "tactile": {"calibration": ("", ""), "recording": ("", "")},
         "control": {"envelope": ""},
@@ -206,12 +206,12 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
     except RecursionError:
         raise SettingsError(f"{name}: nested too deeply") from None
-    except ValueError as error:  # TOMLDecodeError, or a number of 5000 digits
+    except ValueError as error:  # TOMLDecodeError, or a number with 5000 digits
         raise SettingsError(f"{name}: not TOML: {error}") from None
 
 
 def _change(data: dict[str, Any], change: str) -> str:
-    """Apply one ``section.key=value`` to ``data`` and return its key. Raises SettingsError."""
+    """Apply one ``section.key=value`` change and return its key. Raises SettingsError."""
     key, equals, text = change.partition("=")
     *sections, inner = key.strip().split(".")
     if not (equals and sections and all(sections) and inner):
@@ -219,7 +219,7 @@ def _change(data: dict[str, Any], change: str) -> str:
     try:
         value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
-        value = text.strip()  # text without quotes, which the shell has removed
+        value = text.strip()  # a string whose quotes the shell has removed
     held = data
     for section in sections:
         held = held.setdefault(section, {})
@@ -231,10 +231,10 @@ def _change(data: dict[str, Any], change: str) -> str:
 
 
 def _tuples(value: Any, depth: int = 0) -> Any:
-    """Convert lists to tuples and keep tables.
+    """Convert lists to tuples in nested tables and lists.
 
-    Raises RecursionError beyond the depth of any profile, and ValueError for integers beyond TOML's
-    range.
+    Raises RecursionError if the nesting is deeper than `_DEPTH_MAX`, and ValueError for integers
+    outside TOML's range.
     """
     if depth > _DEPTH_MAX:
         raise RecursionError
@@ -242,13 +242,14 @@ def _tuples(value: Any, depth: int = 0) -> Any:
         return {key: _tuples(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list):
         return tuple(_tuples(item, depth + 1) for item in value)
-    if isinstance(value, int) and value.bit_length() > 63:  # one of 5000 digits cannot be printed
+    # Large integers are rejected here, because one with 5000 digits could not be printed later.
+    if isinstance(value, int) and value.bit_length() > 63:
         raise ValueError("an integer beyond 64 bits")
     return value
 
 
 def _plugin_problems(settings: Settings) -> Iterator[str]:
-    """Yield the errors in the tables of plugins."""
+    """Yield the errors in plugin tables."""
     tables = settings.plugins.tables
     for each in (
         backend("servos", settings.servos.backend),
@@ -270,7 +271,7 @@ def _plugin_problems(settings: Settings) -> Iterator[str]:
 def _line(
     details: ErrorDetails, above: Sequence[str] = (), model: type[BaseModel] | None = Settings
 ) -> str:
-    """Format one error; ``above`` is the location of ``model``'s table in the profile."""
+    """Format one error; ``above`` is the path of ``model``'s table in the profile."""
     inside = [str(part) for part in details["loc"]]
     location = [*above, *inside]
     key = shown(".".join(location))[1:-1]
@@ -292,7 +293,7 @@ def _is_length(location: list[str]) -> bool:
 
 
 def _model(location: list[str], model: Any = Settings) -> Any:
-    """Return the section at this location within ``model``."""
+    """Return the section at this path within ``model``."""
     for part in location:
         model = model.model_fields[part].annotation
         assert issubclass(model, BaseModel)

@@ -1,7 +1,8 @@
-"""Generate the reference of all settings from their declarations.
+"""Generate the settings reference from the declarations.
 
 ``python -m softfinger.daemon.profile.reference`` writes ``config/sim.toml``, which describes every
-key of the built-in simulated hand, and ``config/schema.json``, the JSON schema for editors.
+key with its value for the built-in simulated hand, and ``config/schema.json``, the JSON schema for
+editors.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ import softfinger
 from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 
-_WIDTH = 100  # maximum line length of sim.toml
-_NO_BOUND = 1e9  # bounds of this size only catch typing errors and are not shown
+_WIDTH = 100  # maximum line length in sim.toml
+_NO_BOUND = 1e9  # Bounds of this size only catch typing errors, so they are not shown.
 _HEAD = """\
 #:schema ./schema.json
 # The built-in simulated hand, with every setting at its default. `softfinger run` without a profile
@@ -30,7 +31,7 @@ _HEAD = """\
 
 
 class Key(NamedTuple):
-    """One setting as shown in the reference."""
+    """One setting in the reference."""
 
     section: str
     name: str
@@ -40,21 +41,21 @@ class Key(NamedTuple):
     meaning: str
 
     def lines(self, prefix: str = "") -> Iterator[str]:
-        """Yield the TOML lines: the meaning in a comment, then the key with its default."""
+        """Yield the TOML lines: a comment with the meaning, then the key with its default."""
         yield from _comment(self.meaning)
         limits = ", ".join(filter(None, (self.unit, self.allowed)))
         yield f"{prefix}{self.name} = {self.default}{f' # {limits}' * bool(limits)}"
 
 
 class _WithoutTitles(GenerateJsonSchema):
-    """A schema without titles, which would repeat the names of the keys."""
+    """Schema generator without titles, which would only repeat the key names."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
 
 
 def schema_text() -> str:
-    """Return the JSON schema of a profile in a single line, because only programs read it."""
+    """Return the JSON schema for profiles in a single line, because only programs read it."""
     schema = {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "softfinger profile",
@@ -69,17 +70,17 @@ def schema_text() -> str:
 
 
 def sections() -> dict[str, type[Section]]:
-    """Return the sections of a profile by name."""
+    """Return the section classes of a profile by name."""
     return {name: type(section) for name, section in Settings()}
 
 
 def about(section: type[Section]) -> str:
-    """Return the purpose of a section in Markdown."""
+    """Return a section's purpose as Markdown."""
     return inspect.cleandoc(section.__doc__ or "").replace("``", "`")
 
 
 def every_key() -> list[Key]:
-    """Return every setting, in the order of the profile."""
+    """Return all settings in profile order."""
     return [
         Key(
             name,
@@ -100,7 +101,7 @@ def profile() -> str:
 
 
 def section_text(name: str) -> str:
-    """Return the TOML text of a section. Raises KeyError."""
+    """Return a section's TOML text. Raises KeyError."""
     lines = [f"[{name}]", *_comment(about(sections()[name]))]
     for key in every_key():
         if key.section == name:
@@ -116,7 +117,7 @@ def _comment(text: str) -> Iterator[str]:
 
 
 def _allowed(declared: dict[str, Any]) -> str:
-    """Return the values that a key, or each of its elements, may have."""
+    """Describe the values that are allowed for a key or each of its elements."""
     if "prefixItems" in declared:
         return _allowed(declared["prefixItems"][0])
     if "items" in declared:
@@ -137,7 +138,7 @@ def _bounds(declared: dict[str, Any]) -> str:
     low: float = declared.get("minimum", -_NO_BOUND)
     high: float = declared.get("maximum", _NO_BOUND)
     above: float | None = declared.get("exclusiveMinimum")
-    if 0.0 < low <= 1.0 / _NO_BOUND:  # the quantity is positive
+    if 0.0 < low <= 1.0 / _NO_BOUND:  # a positive quantity
         above = 0
     upper = high < _NO_BOUND
     if above is not None:

@@ -1,8 +1,8 @@
-"""Define the sections of a profile, with defaults, bounds, units and meanings.
+"""Define the profile sections, with defaults, bounds, units and meanings.
 
 The defaults describe the built-in simulated hand. `profile.load` reads and validates a file.
-`profile.reference` generates ``config/sim.toml`` and the JSON schema from these declarations. Pairs
-are (left, right).
+`profile.reference` generates ``config/sim.toml`` and the JSON schema from these declarations. All
+pairs are in the order (left, right).
 """
 
 from __future__ import annotations
@@ -441,8 +441,8 @@ class ControlSettings(Section):
     def driving(self) -> float:
         """Ratio of motor torque to tip torque while the joint closes, (1 + μ)/(1 − μ).
 
-        Gears transmit both torques, and a fraction μ of each is lost to friction. The ratio is
-        inverted while the joint opens.
+        The gears lose a fraction μ of each torque to friction. While the joint opens, the ratio is
+        inverted.
         """
         return (1.0 + self.joint_load_friction) / (1.0 - self.joint_load_friction)
 
@@ -554,12 +554,12 @@ class PluginSettings(Section):
 
     @property
     def tables(self) -> dict[str, Any]:
-        """Plugin tables by name, as in the profile."""
+        """The profile's plugin tables by name."""
         return self.model_extra or {}
 
 
 class Settings(Section):
-    """A profile of softfinger. The defaults are the built-in simulated hand."""
+    """A softfinger profile. The defaults describe the built-in simulated hand."""
 
     scene: SceneSettings = SceneSettings()
     hand: GeometrySettings = GeometrySettings()
@@ -583,6 +583,6 @@ class Settings(Section):
 
     @property
     def simulated(self) -> bool:
-        """True if neither servos nor sensors are real hardware."""
+        """True if the servos and sensors are not real hardware."""
         servos, tactile = self.servos.backend, self.tactile.backend
         return not (backend("servos", servos).metal or backend("tactile", tactile).metal)

@@ -1,4 +1,4 @@
-"""Settings of the simulated hand: object, tips, sensors, joints and servos."""
+"""Define the simulated hand's settings: object, tips, sensors, joints and servos."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Check a profile for keys that contradict each other.
 
-Each check is one function that yields lines with key, found and expected.
+Each check is a function that yields one line per problem, with the key, the value found and the
+value expected.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})
 
 
 def problems(settings: Settings) -> list[str]:
-    """Return the contradictions between settings."""
+    """Return all contradictions between settings, one per line."""
     return [problem for check in _CHECKS for problem in check(settings)]
 
 
@@ -154,7 +155,7 @@ def _size(settings: Settings) -> str:
 
 
 def shown(value: Any) -> str:
-    """Format a value as in TOML, short enough for a line and without control characters."""
+    """Format a value in TOML syntax, shortened to fit a line and without control characters."""
     if isinstance(value, tuple):
         text = "[" + ", ".join(shown(item) for item in value[:20]) + "]"
     elif isinstance(value, dict):
@@ -203,7 +204,7 @@ def _servos(settings: Settings) -> Iterator[str]:
 
 
 def _ports(settings: Settings) -> Iterator[str]:
-    """Check that no two devices share a port. Ports of plugins are not checked."""
+    """Check that each device has its own port. Plugin ports are not checked."""
     ports = []
     servos = backend("servos", settings.servos.backend)
     tactile = backend("tactile", settings.tactile.backend)
@@ -247,7 +248,7 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
 
 
 def _missing(settings: Settings, key: str, expected: str) -> Iterator[str]:
-    """Check a text in the tactile settings that each finger of the scene needs."""
+    """Check a string in the tactile settings that must be set for each finger in the scene."""
     for name in settings.scene.fingers:
         if not getattr(settings.tactile, key)[FINGERS.index(name)]:
             yield f'tactile.{key}: found "" for {name}, expected {expected}'
@@ -282,7 +283,7 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
 
 
 def _cells_under(settings: Settings) -> Iterator[str]:
-    """Check the number of cells under a solid tip, whose whole base shows the contact."""
+    """Check that a solid tip's base, which transmits the contact pressure, covers enough cells."""
     from softfinger.daemon.profile.factory import make_grid, make_tip
     from softfinger.kinematics.estimation.error_budget import Uncertainty
     from softfinger.kinematics.estimation.estimator import CELLS_MIN, cells_within_rim
@@ -394,10 +395,10 @@ def _forces(settings: Settings) -> Iterator[str]:
 
 
 def address_problem(address: str, lacking: str) -> str:
-    """Explain why a socket must not be bound to ``address``; empty if it may.
+    """Return the reason why ``address`` must not be bound, or an empty string if it is allowed.
 
-    Without keys only this machine's addresses are allowed. ``lacking`` is the setting that would
-    name the keys, or empty if keys are set.
+    Without keys, only this machine's addresses are allowed. ``lacking`` is the name of the missing
+    key setting, or empty if keys are configured.
     """
     here = _TCP if lacking else _ANY_TCP
     tcp = here.fullmatch(address)

@@ -1,4 +1,4 @@
-"""Wire format and transport of the stream and the commands: schema, packing, sockets, keys.
+"""Define the wire format and transport of stream and commands: schema, packing, sockets, keys.
 
-The process that holds the clients' connections is in `gateway`.
+The `gateway` package contains the process that serves the client connections.
 """

@@ -1,13 +1,14 @@
-"""Command server of the loop: unpacks the requests from the gateway and answers them.
+"""Unpack the requests that the gateway forwards to the loop, and reply to them.
 
-It runs in the loop's thread, once per tick, without a lock. A ``stop`` takes precedence. Requests
-that arrived before a stop, whose stamp counts fewer stops, are refused, except ``status``. A
-``hold`` replaces the ``hold`` that waits just before it on the same connection.
+The command server runs in the loop's thread, once per tick, without a lock. A ``stop`` takes
+precedence. Each request carries the number of stops that preceded it. If that number is lower than
+the current one, the request is refused, unless it is ``status``. A ``hold`` replaces the queued
+``hold`` directly before it on the same connection.
 
-A client may give a request a unique ``key`` and send the same map again if it was refused as late.
-The daemon then carries out the command at most once, and only if it has carried out no other
-command since that refusal: the newest command prevails. Commands that can only make the hand safer
-(`NO_LEASE_COMMANDS`) are carried out every time.
+A client may add a unique ``key`` to a request and send the same map again if it was refused as
+late. The daemon then carries out the command at most once. If another command has been carried out
+since that refusal, the repetition is refused, because the newest command prevails. Commands that
+can only make the hand safer (`NO_LEASE_COMMANDS`) are carried out every time.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
 if TYPE_CHECKING:  # the gateway process does not need this module
     from softfinger.daemon.wire.local_stop import LocalStop
 
-Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # request, its age [s]
+Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: request and its age [s]
 
-_ANSWER_TIMEOUT = 0.4  # s that the answer to a local stop waits for the gateway
-_COMMANDS_PER_TICK = 2  # commands carried out per tick, without stops
-_UNPACKED_SIZE_MAX = 4096  # bytes after which no more requests are unpacked in a tick
-_OUTCOME_COUNT_MAX = 256  # requests whose outcome is stored
+_ANSWER_TIMEOUT = 0.4  # s, maximum wait for the gateway before a local stop is confirmed
+_COMMANDS_PER_TICK = 2  # maximum, not counting stops
+_UNPACKED_SIZE_MAX = 4096  # bytes; once reached, unpacking continues on the next tick
+_OUTCOME_COUNT_MAX = 256  # stored outcomes of keyed requests
 _KEY_LENGTH_MAX = 64
 _VALUE_TYPES = (str, int, float)  # bool is a subclass of int
 
@@ -39,13 +40,13 @@ _VALUE_TYPES = (str, int, float)  # bool is a subclass of int
 class _Outcome(NamedTuple):
     """Reply to a request that has a key."""
 
-    stops: int  # number of stops when the request was first refused or carried out
-    changes: int  # number of other commands carried out by then
-    reply: bytes  # empty if the request was late and may be sent again
+    stops: int  # stop count when the request was first refused or carried out
+    changes: int  # count of other commands carried out by that time
+    reply: bytes  # empty if the request was late and may be repeated
 
 
 class CommandServer:
-    """Answer requests from the link to the gateway, and stops from the local socket."""
+    """Reply to requests from the gateway link and to stops from the local socket."""
 
     def __init__(
         self,
@@ -53,29 +54,29 @@ class CommandServer:
         local: LocalStop | None = None,
         clock: Callable[[], float] = machine_time,
     ) -> None:
-        """Create a server; ``clock`` is the clock with which the gateway stamps requests."""
+        """Create a server; ``clock`` must be the clock that the gateway uses for time stamps."""
         self._link = link
-        self.notices = link.notices  # warnings of the gateway, to be published as events
+        self.notices = link.notices  # gateway warnings, to be published as events
         self._local = local
         self._clock = clock
         self._stops = 0
-        self._changes = 0  # commands carried out that may change the hand, without stops
-        # Key: name of the client by its access key, and the request. Oldest first.
+        self._changes = 0  # executed commands other than status and stop
+        # Maps (client name from its access key, request) to an outcome, oldest first.
         self._outcomes: OrderedDict[tuple[str, bytes], _Outcome] = OrderedDict()
-        self._stopped: bytes | None = None  # answer to a local stop, until the gateway confirms it
+        self._stopped: bytes | None = None  # reply to a local stop, pending gateway confirmation
         self._answer_by = 0.0
         if local is not None:
             link.watch(local.fileno())
 
     @property
     def refused_by_pace(self) -> int:
-        """Number of requests refused because of their rate."""
+        """Number of requests that were refused by rate limits."""
         return self._link.refused
 
     def serve(self, handler: Handler) -> None:
-        """Pass the requests of this tick to ``handler`` and answer them.
+        """Pass this tick's requests to ``handler`` and send its replies.
 
-        The handler raises Refused, with the reason, for a command that it does not carry out.
+        The handler raises Refused to reject a command.
         """
         self._link.look()
         if self._local is not None and (self._link.called or self._stopped is not None):
@@ -88,12 +89,12 @@ class CommandServer:
             self._link.reply(ask, self._answer(ask, request, handler))
 
     def raise_fence(self) -> None:
-        """Refuse all commands that arrived before now, except stop and status, after a stop."""
+        """After a stop, refuse all commands that arrived earlier, except stop and status."""
         self._stops += 1
         self._link.fence(self._stops)
 
     def _unpack(self, handler: Handler) -> None:
-        """Unpack the requests that arrived; carry out a stop at once, several as one."""
+        """Unpack the arrived requests. Carry out a stop immediately, and only once per call."""
         stopped, waiting = b"", self._link.unpacked
         size = 0  # bytes
         while self._link.asked and size < _UNPACKED_SIZE_MAX:
@@ -101,7 +102,7 @@ class CommandServer:
             size += len(ask.payload)
             try:
                 request = decode(ask.payload)
-                if ask.urgent and request["command"] != "stop":  # the map has two commands
+                if ask.urgent and request["command"] != "stop":  # two keys are named "command"
                     raise _malformed('expected one text under "command"')
             except Refused as refused:
                 self._link.reply(ask, refusal(str(refused), refused.reason))
@@ -111,7 +112,7 @@ class CommandServer:
             if request["command"] == "stop":
                 if not stopped:
                     stopped = accepted(handler({"command": "stop", "client": ask.name}, 0.0))
-                    self.raise_fence()  # before the answer, since its client may then continue
+                    self.raise_fence()  # before the reply, after which the client may continue
                 self._link.reply(ask, stopped)
                 continue
             mine = [other for other in waiting if other[0].route[0] == ask.route[0]]
@@ -122,7 +123,7 @@ class CommandServer:
             waiting.append((ask, request))
 
     def _answer(self, ask: Ask, request: dict[str, Any], handler: Handler) -> bytes:
-        """Return the reply to a request; a request with a key is carried out at most once."""
+        """Carry out a request, at most once if it has a key, and return the reply."""
         name, place = request["command"], (ask.name, ask.payload)
         keyed = request.pop("key", None) is not None and name not in NO_LEASE_COMMANDS
         present = _Outcome(self._stops, self._changes, b"")
@@ -160,37 +161,37 @@ class CommandServer:
 
 
 def _replaces(request: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Return True if a hold sets all values that the earlier hold sets."""
+    """Return True if both are holds and ``request`` sets every value that ``other`` sets."""
     is_hold = request["command"] == other["command"] == "hold"
     return is_hold and other.keys() - {"key"} <= request.keys()
 
 
 def accepted(reply: dict[str, Any]) -> bytes:
-    """Return the packed reply to a command that is carried out."""
+    """Return the packed reply to a command that was carried out."""
     packed: bytes = msgpack.packb({"ok": True, **reply})
     return packed
 
 
 def refusal(error: str, reason: str) -> bytes:
-    """Return the packed reply to a command that is not carried out."""
+    """Return the packed reply to a command that was refused."""
     packed: bytes = msgpack.packb({"ok": False, "error": error, "reason": str(reason)})
     return packed
 
 
 def decode(payload: bytes) -> dict[str, Any]:
-    """Unpack a command: a map of plain numbers and texts, with a text under ``command``.
+    """Unpack a command: a flat map of numbers and strings, with a string under ``command``.
 
-    Raises Refused for other data, but accepts a stop with any additional content.
+    Raises Refused for other data. Additional content of a stop is ignored.
     """
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
-    except Exception as error:  # msgpack raises its own exceptions, ValueError and others
+    except Exception as error:  # msgpack has no common base class for its exceptions
         raise _malformed(f"not msgpack: {error}") from None
     if not isinstance(request, dict):
         raise _malformed(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):
         raise _malformed('expected a text under "command"')
-    # Nested values are rejected, since requests are published unchanged.
+    # Requests are published unchanged, so nested values are rejected.
     plain = {
         key: value
         for key, value in request.items()

@@ -1,7 +1,7 @@
-"""Table of all kinds of events with their levels, causes and remedies.
+"""List all event kinds with their levels, causes and remedies.
 
-The documentation page of events is generated from this table. Kinds with a dot are rows of
-`safety.limits`, which defines the checks.
+The documentation's event page is generated from this table. Kinds with a dot in their name belong
+to checks that are defined in `safety.limits`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 
 class EventKind(NamedTuple):
-    """One kind of ``hand/event`` or of a line in the daemon's log."""
+    """One kind of ``hand/event`` message or daemon log line."""
 
-    levels: str  # info, warning, error; a fault is an error that turns torque off
+    levels: str  # info, warning or error; a fault is an error that turns torque off
     cause: str
     remedy: str = ""  # empty if no action is needed
 
@@ -259,7 +259,7 @@ KINDS: dict[str, EventKind] = {
         "After the warning, check the board's gain and `tactile.full_count`. A large change at "
         "every start is worth a new `softfinger calibrate tare`.",
     ),
-    # The hand's parts compared with each other
+    # Consistency checks between the hand's parts
     "hand.angle": EventKind(
         "warning, error",
         "The two fingers measure different angles of the object.",

@@ -1,4 +1,4 @@
-"""Declaration of the stream's topics, records and fields; `wire.schema` uses it."""
+"""Provide declarations of stream topics, records and fields for `wire.schema`."""
 
 import dataclasses
 import inspect
@@ -16,9 +16,9 @@ Getter = Callable[[Any], Any]
 
 
 class Field(NamedTuple):
-    """One number or text of a topic's map. Names of fields of a nested map contain a dot.
+    """One value in a topic's map. The name of a field in a nested map contains a dot.
 
-    ``kind`` is int, float, bool, str or bin; ``unit`` is empty for a field without a unit.
+    ``kind`` is int, float, bool, str or bin. ``unit`` is empty for a dimensionless field.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Field(NamedTuple):
 
 
 class Topic(NamedTuple):
-    """One topic: the record of its messages, and the class of the source of a message."""
+    """One topic with its record class and the source class from which messages are built."""
 
     record: type[Any]
     summary: str
@@ -40,7 +40,7 @@ TOPICS: dict[bytes, Topic] = {}
 
 
 class FieldSource(Generic[_From]):
-    """Source of declared fields: a ``_From`` object, which ``get`` returns from ``outer``."""
+    """Source object of declared fields, obtained by calling ``get`` on the outer source."""
 
     def __init__(
         self, outer: "FieldSource[Any] | None" = None, get: Getter = lambda it: it
@@ -49,38 +49,38 @@ class FieldSource(Generic[_From]):
         self.get = get
 
     def of(self, get: Callable[[_From], _Within]) -> "FieldSource[_Within]":
-        """Declare a source that ``get`` returns from this one."""
+        """Declare a source that is obtained by calling ``get`` on this one."""
         return FieldSource(self, get)
 
     def __call__(
         self, unit: str, meaning: str, get: Callable[[_From], _Value] | None = None
     ) -> _Value:
-        """Declare a field; without ``get`` it is the attribute of the same name."""
+        """Declare a field. Without ``get``, its value is the attribute of the same name."""
         about = {"unit": unit, "meaning": meaning, "source": self, "get": get}
         return cast(_Value, dataclasses.field(metadata=about))
 
     def part(self, prefix: str, get: Callable[[_From], object]) -> Any:
-        """Declare a nested map, whose fields come from the object that ``get`` returns.
+        """Declare a nested map whose fields are read from the object that ``get`` returns.
 
-        ``prefix`` is put before the meanings of its fields.
+        ``prefix`` is prepended to the field descriptions.
         """
         about = {"unit": "", "meaning": prefix, "source": self, "get": get}
         return dataclasses.field(metadata=about)
 
 
 class Member(NamedTuple):
-    """Declared field or part of a record."""
+    """Field of a record, or nested map in it."""
 
     name: str
     type: Any
     unit: str
-    meaning: str  # of a part: prefix of the meanings of its fields
+    meaning: str  # for a nested map: prefix of its field descriptions
     source: FieldSource[Any]
     get: Getter
 
 
 def members(cls: type[Any]) -> Iterator[Member]:
-    """Yield the fields and parts of a record in order."""
+    """Yield the fields and nested maps of a record in order."""
     for each in dataclasses.fields(cls):
         get = each.metadata["get"] or attrgetter(each.name)
         yield Member(each.name, each.type, **{**each.metadata, "get": get})
@@ -102,7 +102,7 @@ def record(cls: type[_Record]) -> type[_Record]:
 def topic(
     name: bytes, summary: str, source: Callable[..., Any]
 ) -> Callable[[type[_Record]], type[_Record]]:
-    """Declare the record of a topic, whose messages are each made from a ``source``."""
+    """Declare a topic's record; each message is built from an instance of ``source``."""
 
     def declare(cls: type[_Record]) -> type[_Record]:
         TOPICS[name] = Topic(cls, summary, source, tuple(fields_of(cls)))
@@ -112,7 +112,7 @@ def topic(
 
 
 def fields_of(cls: type[Any], outer: str = "", prefix: str = "") -> Iterator[Field]:
-    """Yield all fields of a record in order; names of nested fields contain a dot."""
+    """Yield all fields of a record in order, with dots in the names of nested fields."""
     for each in members(cls):
         if each.type in KINDS:
             yield Field(outer + each.name, KINDS[each.type], each.unit, prefix + each.meaning)

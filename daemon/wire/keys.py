@@ -1,18 +1,19 @@
-"""CurveZMQ keys of the daemon and its clients: key files and socket options.
+"""Manage CurveZMQ keys for the daemon and its clients: key files and socket options.
 
-Each side has a key pair. A client has the public key of the server, and the server has the public
-keys of its clients. It rejects all others. `make_keys` creates a folder with these files:
+The server and every client have their own key pairs. A client needs the server's public key. The
+server needs the public keys of its clients and rejects all others. `make_keys` creates a folder
+with these files:
 
 ``server/server.key_secret``, ``server/server.key``
-    the key pair of the daemon, and its public key
+    the daemon's key pair, and its public key alone
 ``server/clients/NAME.key``
-    public key of an accepted client; removing the file disconnects the client at once
+    an accepted client's public key; removing the file disconnects that client
 ``NAME/server.key``, ``NAME/client.key_secret``
-    the folder to copy to the machine of that client; ``local`` is for this machine
+    the folder to copy to the client's machine; ``local`` is for this machine
 
-The files are ZeroMQ certificates, which other ZeroMQ programs can read too. Files and folders that
-another user owns or may write are refused, and so are files below such a folder, since that user
-could add a key.
+The files are ZeroMQ certificates, which other ZeroMQ programs can also read. Files and folders are
+refused if another user owns them or may write to them or to any folder above them, because that
+user could add a key.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _LENGTH = 32  # bytes of a key
 
 @dataclass(frozen=True, slots=True)
 class ServerKeys:
-    """Key pair of the daemon and public keys of its clients, in Z85."""
+    """The daemon's key pair and the public keys of its clients, in Z85."""
 
     public: bytes
     secret: bytes
@@ -51,7 +52,7 @@ class ServerKeys:
     def left(self, folder: Path) -> ServerKeys:
         """Return the keys without clients whose files were removed. Raises KeyFileError.
 
-        This opens no file, so it works without a free file descriptor.
+        This method does not open files, so it works even without a free file descriptor.
         """
         clients = _place(folder) / "clients"
         _check_above(clients / "any")
@@ -61,7 +62,7 @@ class ServerKeys:
         return ServerKeys(self.public, self.secret, kept)
 
     def guard(self, socket: zmq.Socket[Any]) -> None:
-        """Make a socket accept only clients with keys. Call this before bind."""
+        """Make a socket accept only clients with known keys. Call this method before bind."""
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
@@ -69,14 +70,14 @@ class ServerKeys:
 
 @dataclass(frozen=True, slots=True)
 class ClientKeys:
-    """Key pair of a client and public key of the server, in Z85."""
+    """A client's key pair and the server's public key, in Z85."""
 
     server: bytes
     public: bytes
     secret: bytes
 
     def guard(self, socket: zmq.Socket[Any] | zmq.Context[Any]) -> None:
-        """Make a socket (before connect), or all future sockets of a context, use these keys."""
+        """Use these keys in a socket that is not yet connected, or in a context's new sockets."""
         socket.setsockopt(zmq.CURVE_SERVERKEY, self.server)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
@@ -92,7 +93,7 @@ def check_curve() -> None:
 
 
 def make_keys(folder: Path, names: list[str]) -> list[Path]:
-    """Create the server's key pair, unless it exists, and a pair for each client.
+    """Create a key pair for each client, and one for the server if it has none.
 
     Returns
     -------
@@ -102,7 +103,8 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     Raises
     ------
     KeyFileError
-        If a client exists already (then nothing is written), or a file can't be written.
+        If a file can't be written, or if a client already exists. In the latter case nothing is
+        written.
     """
     check_curve()
     server = folder / "server"
@@ -136,7 +138,7 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
             client.mkdir()
             zmq.auth.create_certificates(client, "client")
             shutil.copyfile(server / "server.key", client / "server.key")
-            # This comes last, so that a client without written keys is not accepted.
+            # This step is last, so that the server accepts only clients with complete keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     finally:
         os.umask(before)
@@ -144,7 +146,7 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
 
 
 def load_server(folder: Path) -> ServerKeys:
-    """Return the daemon's keys from a folder of `make_keys` or its ``server``.
+    """Load the daemon's keys from a `make_keys` folder or its ``server`` subfolder.
 
     Raises KeyFileError.
     """
@@ -163,7 +165,7 @@ def load_server(folder: Path) -> ServerKeys:
 
 
 def load_client(folder: Path) -> ClientKeys:
-    """Return a client's keys from its own folder or a folder of `make_keys`.
+    """Load a client's keys from its own folder, or the local client's from a `make_keys` folder.
 
     Raises KeyFileError.
     """
@@ -174,7 +176,7 @@ def load_client(folder: Path) -> ClientKeys:
 
 
 def _place(folder: Path) -> Path:
-    """Return the server's folder, which is ``folder`` itself or a subfolder."""
+    """Return the server's folder: ``folder`` itself or its ``server`` subfolder."""
     return folder if (folder / "server.key_secret").exists() else folder / "server"
 
 
@@ -200,13 +202,13 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
                 raise ValueError("a key of another length")
     except OSError as error:
         raise _unreadable(path, error) from None
-    except (ValueError, LookupError, struct.error):  # struct.error: key outside the range of Z85
+    except (ValueError, LookupError, struct.error):  # struct.error: value exceeds the Z85 range
         raise KeyFileError(f"{path}: no key file") from None
     return keys
 
 
 def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
-    """Raise KeyFileError if another user owns or may write the file, or may read a secret."""
+    """Raise KeyFileError if another user owns or may write a file, or may read a secret key."""
     mode = stat.S_IMODE(status.st_mode)
     if secret and mode & 0o077:
         raise KeyFileError(f"{path}: may be read by others ({mode:04o}): chmod 600 {path}")

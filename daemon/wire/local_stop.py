@@ -1,7 +1,7 @@
-"""Local socket for ``stop``, which other clients can't block.
+"""Provide a local socket for ``stop`` that other clients can't block.
 
-It is a Unix datagram socket, so there are no connections that could be exhausted. It lies in a
-folder that only the daemon's user may enter; `client.command_client` uses it if it exists.
+It is a Unix datagram socket, so connections can't run out. Only the daemon's user has access to its
+folder. `client.command_client` uses the socket if it exists.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from softfinger.daemon.errors import AddressError
 from softfinger.daemon.own_files import home_folder, shared_folder
 from softfinger.kinematics.compiled.own_folder import require_own
 
-_LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # also addresses of this machine
+_LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # equivalent to 127.0.0.1 on this machine
 _DATAGRAM_SIZE_MAX = 4096  # bytes
-_SENDER_COUNT_MAX = 16  # senders that wait for the answer
-_DATAGRAMS_PER_TICK = 4  # datagrams read per tick; the system queues only a few more
+_SENDER_COUNT_MAX = 16  # senders awaiting a reply
+_DATAGRAMS_PER_TICK = 4  # reads per tick; the system's queue holds only a few more
 
 
 class LocalStop:
-    """Daemon's end of the socket, named after ``address``, the address for commands.
+    """The daemon's end of the socket, which is named after the command address.
 
-    ``notice`` gives the location of the socket if it is not the preferred one.
+    If the socket is not in the preferred folder, ``notice`` gives the reason and the location.
     """
 
     def __init__(self, address: str) -> None:
@@ -56,7 +56,7 @@ class LocalStop:
         self._senders: deque[Any] = deque(maxlen=_SENDER_COUNT_MAX)
 
     def take(self) -> bool:
-        """Read queued datagrams; return True if a stop arrived."""
+        """Read queued datagrams, and return True if a stop arrived."""
         came = False
         for _ in range(_DATAGRAMS_PER_TICK):
             try:
@@ -69,11 +69,11 @@ class LocalStop:
         return came
 
     def fileno(self) -> int:
-        """Return the file descriptor of the socket."""
+        """Return the socket's file descriptor."""
         return self._socket.fileno()
 
     def answer(self, reply: bytes) -> None:
-        """Send the reply to all senders of a stop."""
+        """Send the reply to all clients that sent a stop."""
         while self._senders:
             with contextlib.suppress(OSError):  # the sender has ended
                 self._socket.sendto(reply, self._senders.popleft())
@@ -86,9 +86,9 @@ class LocalStop:
 
 
 def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
-    """Stop this user's daemon with the command address ``address``, and return its reply.
+    """Stop this user's daemon at the command address ``address``, and return its reply.
 
-    Returns None if there is no such daemon on this machine or it does not answer.
+    Returns None if this machine has no such daemon or the daemon does not respond.
     """
     try:
         name = _name(address)
@@ -102,7 +102,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
             asking.settimeout(seconds)
             try:
-                asking.bind("")  # the system chooses a name, for the answer
+                asking.bind("")  # The system assigns a name, to which the daemon replies.
                 asking.connect(str(folder / name))
                 asking.send(b"stop")
                 reply = msgpack.unpackb(asking.recv(_DATAGRAM_SIZE_MAX))
@@ -114,7 +114,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
 
 def _name(address: str) -> str:
-    """Return the name of the socket. Raises ValueError for an address of another machine."""
+    """Return the socket's name. Raises ValueError if the address is not on this machine."""
     kind, _, place = address.partition("://")
     if kind == "ipc":
         return f"stop-{hashlib.sha256(os.path.realpath(place).encode()).hexdigest()[:16]}"
@@ -126,7 +126,7 @@ def _name(address: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Yield possible folders: of a system service, of the login session, of neither."""
+    """Yield candidate folders: for a system service, for a login session, and fallbacks."""
     for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"):
         if place := os.environ.get(name):
             yield Path(place.split(":")[0]) / "softfinger"
@@ -143,7 +143,7 @@ def _folders() -> Iterator[Path]:
 def _own_folder() -> tuple[Path, str]:
     """Return the first usable folder, created if necessary, and a notice about unusable ones.
 
-    Raises OSError if there is none.
+    Raises OSError if all candidates are unusable.
     """
     refused: OSError | None = None
     notice = ""
@@ -163,7 +163,7 @@ def _own_folder() -> tuple[Path, str]:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Return True if this user owns the folder, it is no link, and others have no access."""
+    """Return True if the folder is not a link and only this user owns and can access it."""
     try:
         require_own(folder)
     except OSError:
@@ -173,7 +173,7 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _remove_dead(path: Path, address: str) -> None:
-    """Remove the socket of a daemon that was killed. Raises AddressError if it still runs."""
+    """Remove the socket file of a killed daemon. Raises AddressError if the daemon is running."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as trial:
         try:
             trial.connect(str(path))

@@ -1,8 +1,8 @@
-"""Socket pair between the loop and the gateway: the messages, and the loop's end.
+"""Connect the loop and the gateway by a socket pair: messages, and the loop's end.
 
-Each message is a msgpack list that begins with its kind. Sending never blocks: if the socket buffer
-is full, the remaining bytes are sent later. Until then messages of the stream are dropped, but
-replies and stops are not. The gateway limits the number of its unanswered requests.
+Each message is a msgpack list whose first element is the message kind. Sending never blocks. If the
+socket buffer is full, the remaining bytes are sent later. Until then, stream messages are dropped,
+but replies and stops are queued. The gateway limits the number of pending requests.
 """
 
 from __future__ import annotations
@@ -18,32 +18,33 @@ from typing import Any, NamedTuple
 import msgpack
 
 # From the loop
-PUBLISH = "publish"  # index of the topic, number of messages to repeat later, message
-REPLY = "reply"  # `Ask.urgent` and `Ask.route` of the request, reply
-FENCE = "fence"  # number of stops so far
+PUBLISH = "publish"  # topic index, number of messages to repeat later, message
+REPLY = "reply"  # the request's `Ask.urgent` and `Ask.route`, reply
+FENCE = "fence"  # stop count so far
 
 # From the gateway
 READY = "ready"  # the sockets are bound
-FAILED = "failed"  # reason why the sockets could not be bound
-ASK = "ask"  # the fields of `Ask`
+FAILED = "failed"  # bind error
+ASK = "ask"  # the `Ask` fields
 REPORT = "report"  # `Link.wanted`, `Link.refused`, `Link.stops`
-NOTICE = "notice"  # a warning
+NOTICE = "notice"  # warning text
 
-RESTART_STATUS = 3  # exit status of a gateway that must be restarted and has sent the reason
+RESTART_STATUS = 3  # exit status of a gateway that needs a restart and has sent the reason
 
-_BUFFER_SIZE = 1 << 20  # bytes of the socket buffer; the kernel may allow less
-_CHUNK = 1 << 16  # bytes received at a time
-_MESSAGE_SIZE_MAX = 64 << 20  # bytes of a message
+_BUFFER_SIZE = 1 << 20  # bytes, requested socket buffer size; the kernel may allow less
+_CHUNK = 1 << 16  # bytes per receive call
+_MESSAGE_SIZE_MAX = 64 << 20  # bytes per message
 _NOTICE_COUNT_MAX = 20
 _FIRST, _AGAIN = (msgpack.packb("again") + msgpack.packb(again) for again in (False, True))
 
 
 class Ask(NamedTuple):
-    """A client's request that is within all limits but not unpacked yet.
+    """A client's request that is within all limits but has not been unpacked yet.
 
-    ``came`` is the arrival time by `machine_time`, and ``stops`` the number of stops that are known
-    to have preceded it. An ``urgent`` request looks like a stop. ``name`` is the name of the client
-    by its key. ``route`` is the route of the reply; its first part identifies the connection.
+    ``came`` is the arrival time according to `machine_time`. ``stops`` is the number of stops that
+    certainly arrived before the request. An ``urgent`` request looks like a stop. ``name`` is the
+    client name that belongs to the client's key. ``route`` is the return route for the reply. Its
+    first part identifies the connection.
     """
 
     came: float
@@ -55,12 +56,12 @@ class Ask(NamedTuple):
 
 
 def machine_time() -> float:
-    """Return monotonic time [s], including the time that the machine is suspended."""
+    """Return the monotonic time [s], including time spent in suspend."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def pair() -> tuple[socket.socket, socket.socket]:
-    """Return both ends of a new socket pair: the loop's and the gateway's."""
+    """Create a socket pair and return both ends: the loop's and the gateway's."""
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
     for end in ends:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_SIZE)
@@ -80,20 +81,20 @@ class Channel:
         self._end = end
         self._unsent = bytearray()
         self._unpacker = msgpack.Unpacker(max_buffer_size=_MESSAGE_SIZE_MAX)
-        self.over = False  # the other end has disconnected
+        self.over = False  # True once the other end has disconnected
 
     def fileno(self) -> int:
         return self._end.fileno()
 
     def send(self, *message: object, droppable: bool = False) -> None:
-        """Send a message, later if the buffer is full; a ``droppable`` message is then dropped."""
+        """Send a message. If the buffer is full, queue the message, or drop it if ``droppable``."""
         if self._unsent and not self.flush() and droppable:
             return
         self._unsent += msgpack.packb(message)
         self.flush()
 
     def flush(self) -> bool:
-        """Send unsent bytes; return True if all are sent."""
+        """Send queued bytes; return True if the queue is then empty."""
         try:
             while self._unsent:
                 del self._unsent[: self._end.send(self._unsent)]
@@ -105,7 +106,7 @@ class Channel:
         return True
 
     def receive(self) -> Iterator[list[Any]]:
-        """Yield the messages that arrived, from at most `_CHUNK` bytes per call."""
+        """Yield received messages; read at most `_CHUNK` bytes per call."""
         try:
             chunk = self._end.recv(_CHUNK)
             self.over = self.over or not chunk
@@ -121,35 +122,36 @@ class Channel:
 
 
 class Link:
-    """The loop's end. Only the loop's thread may call it, except `offer`."""
+    """The loop's end. Only the loop's thread may call its methods, except for `offer`."""
 
     def __init__(self) -> None:
-        self.wanted = 0  # topics with subscribers, as bits
-        self.refused = 0  # requests that the gateway refused because of their number
-        self.stops = 0  # stops known to have preceded the requests that arrive now
-        self.asked: deque[Ask] = deque()  # urgent requests first
-        self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # requests that wait for a tick
-        self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # warnings of the gateway
-        self.called = False  # the descriptor of `watch` is readable
-        self._other = -1  # descriptor of `watch`
+        self.wanted = 0  # bit mask of topics with subscribers
+        self.refused = 0  # requests refused by the gateway's rate and queue limits
+        self.stops = 0  # stop count with which the gateway stamps new requests
+        self.asked: deque[Ask] = deque()  # received requests, urgent ones first
+        self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # queued for a later tick
+        self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # gateway warnings
+        self.called = False  # True if the `watch` descriptor is readable
+        self._other = -1  # the `watch` descriptor
         self._fence = 0
-        self._kept: dict[int, deque[bytes]] = {}  # for a restarted gateway, by topic
+        self._kept: dict[int, deque[bytes]] = {}  # by topic, repeated to a restarted gateway
         self._channel: Channel | None = None
         self._offered: Channel | None = None
         self._poll = select.poll()
 
     def offer(self, channel: Channel) -> None:
-        """Use this channel from the next `look` on. Any thread may call this."""
+        """Switch to this channel at the next `look`. Any thread may call this method."""
         self._offered = channel
 
     def watch(self, descriptor: int) -> None:
-        """Also poll another descriptor; `called` is set when it is readable."""
+        """Poll an additional descriptor; `look` then sets `called` if it is readable."""
         self._other = descriptor
         self._poll.register(descriptor, select.POLLIN)
 
     def look(self) -> None:
-        """Read the messages of the gateway. It takes less than a microsecond if there are none."""
-        has_more = self._offered is not None  # more messages may follow the first, read elsewhere
+        """Read the gateway's messages; this takes less than a microsecond if none have arrived."""
+        # The supervisor read the first message, and its receive call may have buffered others.
+        has_more = self._offered is not None
         if self._offered is not None:
             self._adopt(self._offered)
         ready = [descriptor for descriptor, _ in self._poll.poll(0)]
@@ -170,16 +172,16 @@ class Link:
             self._disconnect()
 
     def wait(self, seconds: float) -> None:
-        """Call `look` when the gateway sends something, or after ``seconds``. Not for a tick."""
+        """Wait up to ``seconds`` for a message, then call `look`. Not for use within a tick."""
         self.look()
         channels = [] if self._channel is None else [self._channel]
         select.select(channels, [], [], seconds)
         self.look()
 
     def wait_for_room(self, seconds: float) -> None:
-        """Wait until all bytes are sent. Not for a tick.
+        """Wait until all bytes have been sent. Not for use within a tick.
 
-        Give up if the gateway does not read for ``seconds``.
+        Give up if the gateway reads nothing for ``seconds``.
         """
         self.look()
         if (channel := self._channel) is not None:
@@ -187,7 +189,7 @@ class Link:
                 pass
 
     def _adopt(self, channel: Channel) -> None:
-        """Use the channel of a new gateway; send it the last fence and the stored messages."""
+        """Switch to a new gateway's channel; send the last fence and the stored messages."""
         self._disconnect()
         self._offered, self._channel = None, channel
         self._poll.register(channel, select.POLLIN)
@@ -206,7 +208,7 @@ class Link:
         self.unpacked.clear()
 
     def fence(self, stops: int) -> None:
-        """Tell the gateway the number of ``stops``, with which it stamps requests."""
+        """Send the gateway the stop count with which it must stamp requests."""
         self._fence = stops
         if self._channel is not None and stops:
             self._channel.send(FENCE, stops)
@@ -216,14 +218,14 @@ class Link:
             self._channel.send(REPLY, ask.urgent, ask.route, reply)
 
     def publish(self, topic: int, message: bytes, keep: int = 0) -> None:
-        """Publish a message; late subscribers also get the last ``keep`` messages of its topic."""
+        """Publish a message; repeat the topic's last ``keep`` messages to late subscribers."""
         if keep:
             self._kept.setdefault(topic, deque(maxlen=keep)).append(message)
         if self._channel is not None:
             self._channel.send(PUBLISH, topic, keep, message, droppable=True)
 
     def close(self) -> None:
-        """Disconnect; the gateway sends its queued messages and ends."""
+        """Disconnect. The gateway then sends its queued messages and exits."""
         self._disconnect()
         offered, self._offered = self._offered, None
         if offered is not None:

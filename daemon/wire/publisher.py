@@ -1,11 +1,11 @@
-"""Publisher: packs stream messages according to the schema and sends them to the gateway.
+"""Pack stream messages according to the schema and send them to the gateway.
 
-Integers are packed in msgpack's smallest form, so that JavaScript clients get numbers wherever
+Integers use the smallest msgpack form, so that JavaScript clients receive numbers wherever
 possible. Floats always take 64 bits.
 
-The gateway serves the subscribers, so slow or dead subscribers do not affect the loop. For late
-subscribers it repeats the settings and the last events, with ``again`` set. Topics without
-subscribers are not packed.
+The gateway serves the subscribers, so slow or dead subscribers do not affect the loop. The gateway
+repeats the settings and the last events to late subscribers, with ``again`` set. Messages of topics
+without subscribers are not packed.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ _PACK: dict[type, Pack] = {int: pack, float: _float, bool: _bool, str: pack, byt
 
 
 def packer(topic: bytes) -> Callable[..., bytes]:
-    """Return a function that packs a topic's messages from the arguments of its source."""
+    """Return a function that takes the arguments of a topic's source and packs a message."""
     source = TOPICS[topic].source
     pack_map = _packer(TOPICS[topic].record)
     return lambda *arguments: pack_map(source(*arguments))
 
 
 def _packer(record: type[Any]) -> Pack:
-    """Return a function that packs the map of a record from its source."""
-    # Each source after the first comes from an earlier one, and each value from one source.
+    """Return a function that packs a record's map from its source."""
+    # Each source after the first is derived from an earlier one. Each value has a single source.
     sources: list[tuple[int, Getter]] = []
     found: dict[FieldSource[Any], int] = {}
 
@@ -76,11 +76,11 @@ def _packer(record: type[Any]) -> Pack:
 
 _INDEX = {topic: index for index, topic in enumerate(TOPICS)}
 GATEWAY_TOPICS = [topic.decode() for topic in TOPICS]
-REPEATED_COUNTS = {SETTINGS: 1, EVENT: 50}  # messages that are repeated for late subscribers
+REPEATED_COUNTS = {SETTINGS: 1, EVENT: 50}  # number of messages repeated to late subscribers
 
 
 def bit(topic: bytes) -> int:
-    """Return the bit of a topic in `Publisher.wanted`."""
+    """Return a topic's bit in `Publisher.wanted`."""
     return 1 << _INDEX[topic]
 
 
@@ -88,7 +88,7 @@ _COMMANDS = bit(COMMAND)
 
 
 class Publisher:
-    """Publish state, tactile frames and events. Only the loop's thread may call it."""
+    """Publish states, tactile frames and events. Only the loop's thread may call its methods."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -97,15 +97,15 @@ class Publisher:
 
     @property
     def wanted(self) -> int:
-        """Topics with subscribers, as bits; see `bit`."""
+        """Bit mask of topics with subscribers; see `bit`."""
         return self._link.wanted
 
     def look(self) -> None:
-        """Read the gateway's messages; the loop does this when it reads commands."""
+        """Read the gateway's messages, as the loop does when it reads commands."""
         self._link.look()
 
     def send(self, topic: bytes, *arguments: object) -> None:
-        """Publish a message made from the topic's arguments, as `wire.schema` declares them."""
+        """Publish a message built from the topic's source arguments, declared in `wire.schema`."""
         self._link.publish(_INDEX[topic], self._pack[topic](*arguments))
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
@@ -116,7 +116,7 @@ class Publisher:
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
     ) -> None:
-        """Publish ``hand/command``; ``error`` is the reason for a refusal, or empty."""
+        """Publish ``hand/command``; ``error`` is the refusal text, or empty."""
         if self._link.wanted & _COMMANDS:
             self.send(COMMAND, self._count(COMMAND), wall, t, tick, request, error)
 

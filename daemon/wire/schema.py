@@ -1,11 +1,12 @@
-"""Schema of the stream: the only declaration of all topics and fields.
+"""Define the stream schema: the single declaration of all topics and fields.
 
-A topic is a record. Each of its fields has a unit, a meaning and a source. Its value is computed by
-a function of the source, or is the attribute of the same name. The packers (`wire.publisher`), the
-records that clients read (`client.stream`), the page ``STREAM.md`` and the JSON schemas of
-recordings (`wire.schema_docs`) are derived from these declarations.
+Each topic is a record. Each field has a unit, a meaning and a source. Its value is a function of
+the source or the source's attribute of the same name. The packers (`wire.publisher`), the records
+that clients read (`client.stream`), the ``STREAM.md`` page and the JSON Schemas of recordings
+(`wire.schema_docs`) are derived from these declarations.
 
-New versions may add fields, but never remove any. A float is always sent as a float. SI units.
+New versions may add fields but never remove any. A float is always sent as a float. Values are in
+SI units.
 """
 
 import json
@@ -88,7 +89,7 @@ def _ns(t: float) -> int:
     return int(t * 1e9)
 
 
-# Fields that several sources have in common are declared for one of them.
+# Fields shared by several sources are declared for only one of them.
 _tick = FieldSource["StateSource"]()
 _state = _tick.of(lambda m: m.state)
 _timing = _state.of(lambda s: s.timing)
@@ -97,7 +98,7 @@ _news = FieldSource["EventSource"]()
 
 @record
 class _TickMessage:
-    """Message that is sent every n-th tick."""
+    """Message sent every n-th tick."""
 
     schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _state(*_SEQ)
@@ -108,7 +109,7 @@ class _TickMessage:
 
 @record
 class _Announcement:
-    """Message that is sent when an event occurs."""
+    """Message sent when an event occurs."""
 
     schema: int = _news(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _news(*_SEQ)
@@ -122,7 +123,7 @@ class _Announcement:
 
 
 class StateSource(NamedTuple):
-    """Source of a ``hand/state``."""
+    """Source of a ``hand/state`` message."""
 
     state: State
     scene: SceneParts
@@ -238,7 +239,7 @@ class FingerState:
 
 @record
 class ObjectState:
-    """The object in ``hand/state``, from the two contacts."""
+    """The object in ``hand/state``, estimated from both contacts."""
 
     valid: bool = _pose("", "both contacts are valid and determine the pose")
     angle: float = _pose(
@@ -263,7 +264,7 @@ class ObjectState:
 )
 @record
 class HandState(_TickMessage):
-    """One ``hand/state``."""
+    """One ``hand/state`` message."""
 
     mode: str = _state("", "disarmed, armed, moving, grasping, holding, rotating, releasing, fault")
     fault: str = _state("", "text of the latched fault, or empty")
@@ -295,17 +296,17 @@ class HandState(_TickMessage):
         return record_text.state_html(self)
 
     def finger(self, name: str) -> FingerState:
-        """Return ``left`` or ``right`` by its name. Raises ValueError for other names."""
+        """Return the finger named ``left`` or ``right``. Raises ValueError for other names."""
         if name not in FINGERS:
             raise ValueError(f"found finger {name!r}, expected one of {', '.join(FINGERS)}")
         return self.left if name == FINGERS[0] else self.right
 
 
 class TactileSource(NamedTuple):
-    """Source of a ``hand/tactile``."""
+    """Source of a ``hand/tactile`` message."""
 
     frame: Frame
-    data: NDArray[np.uint16]  # as published [rows, cols]
+    data: NDArray[np.uint16]  # published counts [rows, cols]
     finger: int
     info: SensorInfo
     wall: float
@@ -325,7 +326,7 @@ _info = _tactile.of(lambda m: m.info)
 )
 @record
 class TactileFrame:
-    """One ``hand/tactile``. Raises ValueError if its data is not a grid of rows × cols."""
+    """One ``hand/tactile`` message. Raises ValueError if its data is not a rows × cols grid."""
 
     schema: int = _tactile(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _frame(*_SEQ)
@@ -381,7 +382,7 @@ class TactileFrame:
 
 
 class EventSource(NamedTuple):
-    """Source of a ``hand/event``."""
+    """Source of a ``hand/event`` message."""
 
     seq: int
     wall: float
@@ -401,7 +402,7 @@ _event = FieldSource[EventSource]()
 )
 @record
 class Event(_Announcement):
-    """One ``hand/event``."""
+    """One ``hand/event`` message."""
 
     level: str = _event("", "info, warning or error")
     kind: str = _event("", "kind of the event: mode, fault, servos, …")
@@ -417,7 +418,7 @@ _rates = FieldSource["Rates"]()
 
 @record
 class Spread:
-    """One of the loop's times in ``hand/stats``."""
+    """Statistics of one loop duration in ``hand/stats``."""
 
     p50: float = _times("s", "median")
     p99: float = _times("s", "99 % quantile")
@@ -437,7 +438,7 @@ class Rates:
 
 
 class StatsSource(NamedTuple):
-    """Source of a ``hand/stats``."""
+    """Source of a ``hand/stats`` message."""
 
     state: State
     period: float
@@ -453,7 +454,7 @@ _stats = FieldSource[StatsSource]()
 @topic(STATS, "Timing of the loop, once a second.", StatsSource)
 @record
 class LoopStatistics(_TickMessage):
-    """One ``hand/stats``."""
+    """One ``hand/stats`` message."""
 
     ticks: int = _stats(
         "", "number of ticks since startup; all fields except the rates refer to these ticks"
@@ -468,7 +469,7 @@ class LoopStatistics(_TickMessage):
 
 
 class SettingsSource(NamedTuple):
-    """Source of a ``hand/settings``."""
+    """Source of a ``hand/settings`` message."""
 
     seq: int
     wall: float
@@ -486,7 +487,7 @@ _hand_info = FieldSource[SettingsSource]().of(lambda m: m.info)
 )
 @record
 class HandSettings(_Announcement):
-    """One ``hand/settings``."""
+    """One ``hand/settings`` message."""
 
     version: str = _hand_info("", "version of softfinger")
     settings: str = _hand_info("", "all settings as JSON")
@@ -499,7 +500,7 @@ class HandSettings(_Announcement):
 
 
 class CommandSource(NamedTuple):
-    """Source of a ``hand/command``."""
+    """Source of a ``hand/command`` message."""
 
     seq: int
     wall: float
@@ -515,7 +516,7 @@ _command = FieldSource[CommandSource]()
 @topic(COMMAND, "Each command that was answered, from any client, except `status`.", CommandSource)
 @record
 class AnsweredCommand(_Announcement):
-    """One ``hand/command``."""
+    """One ``hand/command`` message."""
 
     tick: int = _command("", "seq of the tick that answered the command")
     command: str = _command("", "name of the command", lambda m: str(m.request.get("command", "")))
@@ -530,7 +531,7 @@ class AnsweredCommand(_Announcement):
 
 
 class InputSource(NamedTuple):
-    """Source of a ``hand/input``."""
+    """Source of a ``hand/input`` message."""
 
     state: State
     frames: Sequence[Frame | None]
@@ -555,7 +556,7 @@ def _input_finger(m: InputSource, i: int) -> _InputFinger:
 
 @record
 class InputReading:
-    """The servos' reading in ``hand/input``."""
+    """Servo readings in ``hand/input``."""
 
     seq: int = _reading("", "sequence number of the servo reading")
     t: float = _reading("s", "time of the last valid reading, −∞ before the first")
@@ -595,7 +596,7 @@ class InputFinger:
 )
 @record
 class TickInput:
-    """One ``hand/input``."""
+    """One ``hand/input`` message."""
 
     schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _state(*_SEQ)
@@ -612,7 +613,7 @@ class TickInput:
 
 
 class TruthSource(NamedTuple):
-    """Source of a ``hand/truth``."""
+    """Source of a ``hand/truth`` message."""
 
     state: State
     truth: Truth
@@ -658,7 +659,10 @@ class TrueObject:
 @topic(TRUTH, "True state of a simulated hand, sent with each `hand/state`.", TruthSource)
 @record
 class TrueState(_TickMessage):
-    """One ``hand/truth``; its names differ from ``hand/state``, for plots of all topics."""
+    """One ``hand/truth`` message.
+
+    The field names differ from those of ``hand/state``, so that all topics can share one plot.
+    """
 
     true_left: TrueFinger = _truth.part("left finger: ", lambda m: _TruthOf(m.truth, 0))
     true_right: TrueFinger = _truth.part("right finger: ", lambda m: _TruthOf(m.truth, 1))

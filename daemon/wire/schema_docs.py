@@ -1,4 +1,4 @@
-"""Generate documentation of the stream: the page ``STREAM.md``, and JSON Schemas for recordings.
+"""Generate the stream's documentation page ``STREAM.md`` and the JSON Schemas of recordings.
 
 ``python -m softfinger.daemon.wire.schema_docs`` writes the page.
 """
@@ -88,7 +88,7 @@ commands automatically.
 
 
 def json_schema(topic: bytes) -> dict[str, Any]:
-    """Return the JSON Schema of a topic's map; bytes are base64, and NaN and infinity are null."""
+    """Return the JSON Schema of a topic's map, with bytes as base64, NaN and infinity as null."""
     schema: dict[str, Any] = {
         "title": topic.decode(),
         "description": TOPICS[topic].summary,
@@ -106,7 +106,7 @@ def json_schema(topic: bytes) -> dict[str, Any]:
 
 
 def page() -> str:
-    """Return the page ``STREAM.md`` in Markdown."""
+    """Return the Markdown text of the ``STREAM.md`` page."""
     reasons = "".join(f"| `{reason}` | {reason.meaning} |\n" for reason in Reason)
     parts = [_INTRODUCTION, _COMMANDS + reasons + _KEYS]
     for name, topic in TOPICS.items():

@@ -1,4 +1,4 @@
-"""Conversion of hand states and tactile frames to LeRobot features, independent of LeRobot."""
+"""Convert hand states and tactile frames to LeRobot features, without importing LeRobot."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from softfinger.daemon.wire.schema import HandState, TactileFrame
 
 _PLAIN = {"pos": "q", "vel": "dq", "current": "current", "contact": "contact"}
 _FELT = ("d", "theta", "force")  # 0 without a contact
-_OBJECT = ("angle", "width")  # 0 while the object's pose is unknown
+_OBJECT = ("angle", "width")  # 0 while the object pose is unknown
 STATE = tuple(
     [f"{name}.{each}" for name in FINGERS for each in (*_PLAIN, *_FELT, "touch_age")]
     + [f"object.{each}" for each in _OBJECT]
 )
 JOINTS = tuple(f"{name}.pos" for name in FINGERS)
 IMAGES = {name: f"{name}_touch" for name in FINGERS}
-FULL_SCALE = 127.5e3  # Pa, 500 Pa per step of an 8-bit image
+FULL_SCALE = 127.5e3  # Pa, 500 Pa per step in an 8-bit image
 
 
 def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[str, float]:
     """Return the values of the `STATE` features in SI units.
 
-    ``frames`` are the latest frames by finger. ``touch_age`` [s] is the time from the sampling of a
-    finger's frame to the state.
+    ``frames`` contains each finger's latest frame. ``touch_age`` [s] is the state's time minus the
+    frame's sampling time.
     """
     values: list[float] = []
     for name in FINGERS:

@@ -1,4 +1,4 @@
-"""LeRobot `Robot` that controls a running ``softfinger``."""
+"""Provide a LeRobot `Robot` that controls a running ``softfinger`` daemon."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from softfinger.daemon.wire.schema import TactileFrame
 
 
 class Softfinger(Robot):
-    """Softfinger hand as a LeRobot robot.
+    """LeRobot `Robot` implementation for the softfinger hand.
 
-    Connecting does not switch on the torque or move the hand; the first action arms it. If the hand
-    is disarmed or in a fault state after that, it stays so, and the next action raises Refused.
+    Connecting does not switch on the torque or move the hand. The first action arms the hand. If
+    the hand is disarmed or enters a fault state later, the next action does not arm it again and
+    raises Refused.
     """
 
     config_class = SoftfingerConfig
@@ -28,7 +29,8 @@ class Softfinger(Robot):
     def __init__(self, config: SoftfingerConfig) -> None:
         super().__init__(config)
         self.config = config
-        self.cameras: dict[str, Any] = {}  # required by lerobot-record; the grids are not cameras
+        # lerobot-record requires this attribute. The tactile grids are not cameras.
+        self.cameras: dict[str, Any] = {}
         self._hand: Hand | None = None
 
     @property
@@ -49,13 +51,13 @@ class Softfinger(Robot):
     def connect(self, calibrate: bool = True) -> None:
         """Connect to the daemon.
 
-        Raises NoStream or NoAnswer if there is no daemon, and ValueError if the size of the grids
+        Raises NoStream or NoAnswer if the daemon is not running, and ValueError if the grid size
         differs from the settings.
         """
         config = self.config
         hand = Hand(config.address, client="lerobot", timeout=config.timeout, keys=config.keys)
         try:
-            hand.state(config.start_timeout)  # logs while waiting, since a first start compiles
+            hand.state(config.start_timeout)  # The first start is slow because of compilation.
             hand.status()
             self._waiting = hand.frames()
             self._frames: dict[str, TactileFrame] = {}
@@ -78,20 +80,20 @@ class Softfinger(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """Always True; the daemon holds the calibration made by ``softfinger calibrate``."""
+        """Always True, because the daemon manages the calibration (``softfinger calibrate``)."""
         return True
 
     @check_if_not_connected
     def calibrate(self) -> None:
-        """Tare the tactile grids. Raises Refused if something touches a tip."""
+        """Tare the tactile grids. Raises Refused if a tip is in contact."""
         self._hand.tare()
 
     def configure(self) -> None:
-        """Do nothing; the daemon has its own settings."""
+        """Do nothing, because the daemon has its own settings."""
 
     @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:
-        """Return the next state and the latest frame of each finger."""
+        """Wait for the next state and return it with each finger's latest frame."""
         state = self._hand.state()
         with contextlib.suppress(NoStream):
             while True:
@@ -106,7 +108,7 @@ class Softfinger(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         """Command joint goals [rad], or the grip force [N] and object angle [rad].
 
-        Returns the commanded values. Raises Refused for values outside the hand's limits.
+        Returns the commanded values. Raises Refused if a value is outside the hand's limits.
         """
         numbers = {name: float(np.asarray(action[name]).item()) for name in self.action_features}
         if not self._armed:

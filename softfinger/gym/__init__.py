@@ -1,8 +1,8 @@
-"""Gymnasium environments of the simulated hand.
+"""Provide Gymnasium environments with the simulated hand.
 
 Importing this package registers ``SoftFinger-Grasp-v0``, ``SoftFinger-Rotate-v0`` and
-``SoftFinger-Push-v0``. Create one with ``gymnasium.make("softfinger.gym:SoftFinger-Grasp-v0")``;
-the simulated hand is loaded only then.
+``SoftFinger-Push-v0``. The simulated hand is loaded when an environment is created, for example
+with ``gymnasium.make("softfinger.gym:SoftFinger-Grasp-v0")``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gymnasium.envs.registration import register  # noqa: E402 - require() expla
 __all__ = ["SECONDS", "STEP", "TASKS"]
 
 TASKS = ("grasp", "rotate", "push")
-SECONDS = 4.0  # s, longest episode
+SECONDS = 4.0  # s, maximum episode duration
 STEP = 0.02  # s, simulated time per step
 
 for _task in TASKS:

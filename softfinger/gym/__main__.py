@@ -1,7 +1,7 @@
-"""Measure the returns of a random agent and of the built-in grip law in each task.
+"""Measure the returns of a random agent and of the built-in grip control law in each task.
 
-Usage: ``python -m softfinger.gym [EPISODES [PROFILE]]``. Episodes run in parallel; choose the
-workers with ``--processes`` or ``--scheduler``.
+Usage: ``python -m softfinger.gym [EPISODES [PROFILE]]``. Episodes run in parallel on the workers
+selected by ``--processes`` or ``--scheduler``.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from softfinger.gym import SECONDS, STEP, TASKS
 from softfinger.gym.environment import ANGLE, FORCE, FORCES, Observation
 from softfinger.tools.sweep import Sweep, add_sweep
 
-AGENTS = {"random": "joints", "law": "law"}  # agent: its ``control`` argument
+AGENTS = {"random": "joints", "law": "law"}  # maps each agent to its ``control`` argument
 Policy = Callable[[Observation], NDArray[np.float32]]
 
 
 def main(
     episodes: int, profile: str, processes: int | None = None, scheduler: str | None = None
 ) -> None:
-    """Print the mean return of each task and agent over the seeds 0 to ``episodes`` - 1."""
+    """Print the mean return for each task and agent over the seeds 0 to ``episodes`` - 1."""
     print(f"{'task':8}{'agent':8}return of {SECONDS / STEP:.0f} steps      x real time")
     rows = list(itertools.product(TASKS, AGENTS))
     cases = [(task, agent, seed) for task, agent in rows for seed in range(episodes)]
@@ -41,7 +41,7 @@ def main(
 
 
 def _tried(profile: str, case: tuple[str, str, int]) -> tuple[float, float]:
-    """Run one episode; return its return and its run time [s]."""
+    """Run one episode; return the sum of its rewards and its run time [s]."""
     task, agent, seed = case
     name = f"SoftFinger-{task.capitalize()}-v0"
     env = gymnasium.make(name, control=AGENTS[agent], profile=profile)
@@ -71,15 +71,15 @@ def at_random(env: gymnasium.Env[Any, Any]) -> Policy:
 
 
 def by_law(observation: Observation) -> NDArray[np.float32]:
-    """Return the action that sets the grip law to the target force and, in ``rotate``, the goal."""
+    """Return the action that commands the target force and, in ``rotate``, the goal angle."""
     least, most = FORCES
     goal = float(observation["goal"][0])
-    angle = goal / ANGLE if abs(goal) < ANGLE else 0.0  # other tasks have a goal in N
+    angle = goal / ANGLE if abs(goal) < ANGLE else 0.0  # A larger goal is a force in N.
     return np.array([2.0 * (FORCE - least) / (most - least) - 1.0, angle], np.float32)
 
 
 if __name__ == "__main__":
-    # Import by name: worker processes cannot unpickle functions defined in ``__main__``.
+    # Worker processes cannot unpickle functions from ``__main__``, so import this module by name.
     from softfinger.gym.__main__ import main
 
     parser = argparse.ArgumentParser(description="Returns of a random agent and of the law.")

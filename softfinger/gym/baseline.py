@@ -1,11 +1,12 @@
-"""Learning baseline: the cross-entropy method on ``SoftFinger-Grasp-v0`` with shaped rewards.
+"""Train a baseline policy on ``SoftFinger-Grasp-v0`` with the cross-entropy method.
 
-``python -m softfinger.gym.baseline [GENERATIONS]`` prints the return without shaping after each
-generation and runs for several minutes. ``--plot`` draws the returns. Choose the workers with
-``--processes`` or ``--scheduler``.
+``python -m softfinger.gym.baseline [GENERATIONS]`` trains with shaped rewards for several minutes
+and prints the unshaped return after each generation. ``--plot`` draws the returns. Episodes run on
+the workers selected by ``--processes`` or ``--scheduler``.
 
-The policy is one weight vector shared by both fingers, applied to the features of each finger. Each
-generation samples weight vectors from a normal distribution fitted to the best of the previous one.
+The policy has a single weight vector, which is applied to each finger's features. Each generation
+samples weight vectors from a normal distribution that is fitted to the previous generation's best
+samples.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ from softfinger.tools.sweep import Sweep, add_sweep
 SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, episodes per sample
 STEPS = 200
 FEATURES = 5
-_WEIGHT_SCALE = 0.2  # scales the weights, since an action of 1 is a fast 1 rad/s
-_ADDED_STD = 0.2  # added to the standard deviation against premature convergence
+_WEIGHT_SCALE = 0.2  # factor for the weights, because an action of 1 is fast (1 rad/s)
+_ADDED_STD = 0.2  # added to the standard deviation to avoid premature convergence
 
 Weights = NDArray[np.float64]
 
 
 def policy(weights: Weights) -> Policy:
-    """Return the policy with the given ``weights`` [FEATURES]."""
+    """Create the policy with the given ``weights`` [FEATURES]."""
 
     def act(observation: Observation) -> NDArray[np.float32]:
         contacts, joints = observation["contacts"].reshape(2, 3), observation["joints"]
@@ -50,7 +51,7 @@ def policy(weights: Weights) -> Policy:
 
 
 def returns(seed: int, shaped: bool, weights: Weights) -> float:
-    """Return the mean return of EPISODES episodes with consecutive seeds from ``seed``."""
+    """Compute the mean return over EPISODES episodes with consecutive seeds from ``seed``."""
     env = SoftFingerEnv("grasp", shaped=shaped)
     limited = gymnasium.wrappers.TimeLimit(env, STEPS)
     try:
@@ -65,7 +66,7 @@ def learn(
 ) -> list[float]:
     """Train the policy and return the unshaped return of each generation.
 
-    Prints one line per generation and the final mean weights.
+    The function prints one line per generation and the final mean weights.
     """
     rng, curve = np.random.default_rng(0), []
     mean, std = np.zeros(FEATURES), np.ones(FEATURES)
@@ -84,7 +85,7 @@ def learn(
 
 
 def draw(curve: list[float], path: Path) -> None:
-    """Plot the returns over the generations to ``path``.
+    """Plot the returns versus the generations to ``path``.
 
     Raises MissingExtra if matplotlib is not installed, and OSError if the file cannot be written.
     """

@@ -1,7 +1,7 @@
-"""Gymnasium environment of the simulated hand: the daemon's control loop on virtual time.
+"""Provide a Gymnasium environment that runs the daemon's control loop in virtual time.
 
-Each action is sent as a client command, so an agent has the same abilities and limits as a client.
-Episodes are reproducible bit for bit from their seed.
+Each action is sent as a client command, so an agent has the same capabilities and limits as a
+client. Episodes with the same seed are bit-for-bit identical.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ __all__ = ["Images", "SoftFingerEnv"]
 Observation = dict[str, NDArray[Any]]
 
 FORCE = 6.0  # N, target grip force
-REACH = 0.02  # rad, largest change of a joint goal per step
-FORCES = 1.0, 12.0  # N, grip force for an action of -1 and of 1
-ANGLE = 0.25  # rad, object angle for an action of 1
-WHITE = 50e3  # Pa, pressure shown as white (255) in an image
+REACH = 0.02  # rad, maximum joint goal change per step
+FORCES = 1.0, 12.0  # N, grip forces for the actions -1 and 1
+ANGLE = 0.25  # rad, object angle for the action 1
+WHITE = 50e3  # Pa, pressure shown as white (255) in images
 LOST = 0.03  # m, displacement at which the object counts as lost
-_START_D = 0.004  # m, tip displacement when an episode starts with a grip by the joints alone
-_GRIP_TIMEOUT = 3.0  # s, longest wait for that grip
-_OBSERVATION_MAX = 200.0  # bound of every float observation, in SI units
+_START_D = 0.004  # m, tip displacement of the initial grip with joint goals
+_GRIP_TIMEOUT = 3.0  # s, timeout for the initial grip
+_OBSERVATION_MAX = 200.0  # bound on every float observation, in SI units
 
 
 class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -51,21 +51,22 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     Parameters
     ----------
     task
-        - ``grasp``: The hand starts open; hold the object with 6 N. The reward of a step is
-          exp(−e/1 N) for the larger force error e of the two tips.
-        - ``rotate``: The hand starts holding the object; turn it to ``goal`` [rad]. The reward is
-          exp(−e/0.05 rad) for the angle error e.
-        - ``push``: The hand starts holding the object, and a force of up to 3 N pushes the object
-          along its faces for a while. The reward is exp(−s/2 mm) for the slip s.
+        - ``grasp``: The hand starts open and must hold the object with 6 N. The reward for each
+          step is exp(−e/1 N), where e is the larger of the two tip force errors.
+        - ``rotate``: The hand starts with the object in its grip and must rotate it to ``goal``
+          [rad]. The reward is exp(−e/0.05 rad), where e is the angle error.
+        - ``push``: The hand starts with the object in its grip. A force of up to 3 N then pushes
+          the object along its faces for a limited time. The reward is exp(−s/2 mm), where s is the
+          slip.
     control
-        - ``joints``: An action [2] in −1 to 1 moves the goals of the left and the right joint by
-          up to 0.02 rad; positive values close the fingers.
-        - ``law``: The action sets the built-in grip law's force (1 to 12 N) and object angle
-          (−0.25 to 0.25 rad).
+        - ``joints``: An action [2] between −1 and 1 moves the left and right joint goals by up to
+          0.02 rad. Positive values close the fingers.
+        - ``law``: The action sets the force (1 to 12 N) and object angle (−0.25 to 0.25 rad) for
+          the built-in grip control law.
     profile
-        Profile of the simulated hand; the default settings if None.
+        Profile of the simulated hand, or None for the default settings.
     changes
-        Settings to change, in the form of ``--set``.
+        Changes to settings, in the same form as for ``--set``.
     shaped
         Add potential-based shaping to the reward of ``grasp``: up to 10 for closing the fingers
         and up to 10 for both forces. It rewards progress before the first touch and leaves the
@@ -76,7 +77,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Notes
     -----
-    Observations are float32 in SI units unless noted, the left finger first:
+    Observations are float32 in SI units unless noted. The left finger comes first:
 
     - ``joints`` [6]: angles, velocities and currents,
     - ``contacts`` [6]: displacement d, tilt θ and force of each tip,
@@ -170,7 +171,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observation(), self._info()
 
     def _drawn(self) -> Settings:
-        """Return the settings with a randomly drawn object."""
+        """Return settings with random object properties."""
         draw = self.np_random.uniform
         simulation = self._settings.simulation
         drawn = {
@@ -184,7 +185,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._settings.model_copy(update={"simulation": simulation.model_copy(update=drawn)})
 
     def _take_hold(self) -> None:
-        """Grip the object, with the grip law or with joint goals alone."""
+        """Grip the object with the grip control law or with joint goals."""
         state = self._loop.state
         if self._by_law:
             self._command("grasp", force=FORCE)
@@ -256,7 +257,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return math.exp(-off)
 
     def _closed(self) -> float:
-        """Return the shaping potential: progress in closing both fingers and in both forces."""
+        """Return the shaping potential: the progress of both joint angles and both tip forces."""
         q, most = self._loop.state.reading.q, self._settings.hand.q_max
         force = sum(min(float(each) / FORCE, 1.0) for each in self._hand.force)
         return 5.0 * (q[0] / most[0] + q[1] / most[1] + force)
@@ -322,7 +323,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 class Images(gymnasium.ObservationWrapper[Observation, NDArray[np.float32], Observation]):
     """Convert ``pressure`` to images for Stable-Baselines3.
 
-    Images are uint8 [2, rows, cols]; 50 kPa and more is 255.
+    The images are uint8 [2, rows, cols]. Pressures of 50 kPa or more become 255.
     """
 
     def __init__(self, env: gymnasium.Env[Observation, NDArray[np.float32]]) -> None:
@@ -334,6 +335,6 @@ class Images(gymnasium.ObservationWrapper[Observation, NDArray[np.float32], Obse
         self.observation_space: Any = spaces.Dict({**known.spaces, "pressure": image})
 
     def observation(self, observation: Observation) -> Observation:
-        """Return the observation with ``pressure`` as 8-bit images."""
+        """Replace ``pressure`` in the observation with 8-bit images."""
         grey = np.minimum(observation["pressure"] * (255.0 / self._full), 255.0)
         return observation | {"pressure": grey.astype(np.uint8)}

@@ -1,1 +1,1 @@
-"""Processes of a hand: `run`, `emulate` and `compile`, their child processes and their log."""
+"""Implement `run`, `emulate` and `compile`, their child processes and the event log."""

@@ -1,7 +1,7 @@
 """Run the monitor and the recorder as child processes of the daemon.
 
-Each child holds one end of a pipe, and only the daemon holds the other end. However the daemon
-ends, the pipe closes; the child notices this and ends too.
+Each child holds one end of a pipe, and only the daemon holds the other end. If the daemon ends for
+any reason, the pipe closes, and the child then ends too.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from typing import Any
 
 from softfinger.daemon.errors import SoftfingerError
 
-# Restores the terminal if the monitor was killed.
+# This sequence restores the terminal if the monitor was killed.
 RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
-_RECORDER_TIMEOUT = 20.0  # s for a recorder to subscribe, or to close its file
+_RECORDER_TIMEOUT = 20.0  # s, timeout for a recorder to subscribe or to close its file
 
 
 class RecorderError(SoftfingerError):
-    """The recorder did not start; the message is the recorder's."""
+    """The recorder did not start. The error text is the recorder's message."""
 
 
 class _Lifeline:
-    """Pipe whose closing ends a child process."""
+    """Pipe that ends a child process when it is closed."""
 
     def start(self, words: list[str], keys: str, **options: Any) -> subprocess.Popen[Any]:
-        """Start ``softfinger`` with the arguments ``words``, and ``--keys`` if there are any."""
+        """Start ``softfinger`` with the arguments ``words``, and ``--keys`` if keys are set."""
         reads, self._ours = os.pipe()
-        # -P: do not import from a folder named tools in the working directory.
+        # -P keeps a folder named tools in the working directory from being imported.
         command = [sys.executable, "-P", "-m", "softfinger", *words, "--lifeline", str(reads)]
         try:
             return subprocess.Popen(
@@ -54,17 +54,17 @@ class _Lifeline:
 
 
 class MonitorProcess:
-    """Run the monitor on this process's terminal until `close`.
+    """Run the monitor on this process's terminal until `close` is called.
 
-    ``on_end`` is called once, from a signal handler in the main thread, when the monitor has ended.
-    With ``on_end=loop.end`` the monitor's q key ends the daemon.
+    When the monitor has ended, ``on_end`` is called once, from a signal handler in the main thread.
+    With ``on_end=loop.end``, the monitor's q key ends the daemon.
     """
 
     def __init__(
         self, stream: str, commands: str, on_end: Callable[[], None], keys: str = ""
     ) -> None:
         self._attributes: list[Any] | None = None
-        # Standard output may be closed, or may be an object without a file descriptor.
+        # Standard output may be closed or may have no file descriptor.
         with contextlib.suppress(termios.error, AttributeError, OSError, ValueError):
             self._terminal = sys.stdout.fileno()
             self._attributes = termios.tcgetattr(self._terminal)
@@ -73,19 +73,19 @@ class MonitorProcess:
         self.process = self._lifeline.start(words, keys)
         called = False
 
-        def child_changed(*_: Any) -> None:  # called for stopped and continued children too
+        def child_changed(*_: Any) -> None:  # also called for stopped and continued children
             nonlocal called
             if not called and self.process.poll() is not None:
                 called = True
                 on_end()
 
         signal.signal(signal.SIGCHLD, child_changed)
-        child_changed()  # the monitor may have ended before the handler was set
+        child_changed()  # The monitor may have ended before the handler was set.
 
     def close(self, patience: float = 2.0) -> None:
-        """End the monitor if it still runs, and wait until it has restored the terminal.
+        """End the monitor if it is running, and wait until it has restored the terminal.
 
-        Never raises.
+        This method never raises an exception.
         """
         self._lifeline.close()
         for end in (self.process.terminate, self.process.kill):
@@ -94,7 +94,7 @@ class MonitorProcess:
                 break
             except subprocess.TimeoutExpired:
                 end()
-        # Killed: the page is still on the screen.
+        # If the monitor was killed, its page is still on the screen.
         if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
@@ -108,7 +108,7 @@ class MonitorProcess:
 
 
 class RecorderProcess:
-    """Run ``record`` with the arguments ``words``; the first one is the file.
+    """Run ``record`` with the arguments ``words``, of which the first is the file.
 
     ``failed`` is set once the recording is known to be incomplete.
     """
@@ -120,9 +120,10 @@ class RecorderProcess:
         on_end: Callable[[str], None],
         keys: str = "",
     ) -> None:
-        """Start the recorder and wait until ``subscribed()``; raise RecorderError if that fails.
+        """Start the recorder and wait until ``subscribed()`` is True. Raises RecorderError.
 
-        ``on_end`` is called from a thread, with the reason, if the recorder ends before `close`.
+        If the recorder ends before `close` is called, ``on_end`` is called from a thread with the
+        reason.
         """
         self.failed = False
         self._path = words[0]
@@ -130,8 +131,8 @@ class RecorderProcess:
         self._closing = False
         self._said = ""
         self._lifeline = _Lifeline()
-        # In a session of its own, the recorder does not receive Ctrl-C and records the daemon's
-        # last messages.
+        # In a separate session, the recorder does not receive Ctrl-C, so it can record the
+        # daemon's last messages.
         self._process = self._lifeline.start(
             ["record", *words],
             keys,
@@ -151,7 +152,7 @@ class RecorderProcess:
         self._watch.start()
 
     def _wait(self) -> None:
-        """Wait until the recorder has ended, and report an end that `close` did not request."""
+        """Wait until the recorder has ended, and report an unexpected end."""
         self._said = "".join(self._process.communicate()).strip()
         self.failed = not self._closing or self._process.returncode != 0
         if self._closing:
@@ -163,7 +164,7 @@ class RecorderProcess:
         self._on_end(f"the recorder has ended, nothing is recorded any more: {why[0]}")
 
     def close(self) -> str:
-        """Let the recorder close its file; return the recorder's summary."""
+        """End the recording and return the recorder's summary."""
         self._closing = True
         if self._watch.is_alive():
             self._process.send_signal(signal.SIGTERM)

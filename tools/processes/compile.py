@@ -1,7 +1,7 @@
-"""Compile the kernels of a scene on all cores, for ``softfinger compile`` and first starts.
+"""Compile a scene's kernels on all cores, for ``softfinger compile`` and first starts.
 
-The daemon then only loads the kernels, which keeps its memory use small. Each process takes one
-part of the pipeline after another (`loop.warm_up`); parts that need the contact table wait for it.
+The daemon then only loads the kernels, which keeps its memory use small. Each process compiles one
+pipeline part (`loop.warm_up`) after another. Parts that need the contact table wait for it.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from softfinger.tools.sweep import Progress, processors
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
-_MEMORY_MAX = 400e6  # bytes, upper bound for one process
-_CHECK_INTERVAL = 0.2  # s between two checks
+_MEMORY_MAX = 400e6  # bytes, upper bound per process
+_CHECK_INTERVAL = 0.2  # s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compile the missing kernels; return 1 if one could not be compiled.
+    """Compile the missing kernels. Return 1 if a kernel could not be compiled.
 
     Raises
     ------
@@ -65,25 +65,25 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Built(NamedTuple):
-    """Result of a build: the number of missing parts, and whether one of them failed."""
+    """Result of a build: the number of missing parts, and a flag for failures."""
 
     parts: int
     failed: bool
 
 
 def print_event(_level: str, _kind: str, text: str) -> None:
-    """Print an event on standard error, for tools that have no log."""
+    """Print an event to standard error, for tools without a log."""
     print(text, file=sys.stderr, flush=True)
 
 
 def build_kernels(
     settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, bar: bool = True
 ) -> Built:
-    """Build the missing parts of ``wanted``, by default of the whole scene.
+    """Build the parts in ``wanted`` that are missing, by default for the whole scene.
 
-    Returns quickly and prints no message if all parts exist. Progress is shown as a bar if standard
-    error is a terminal and ``bar`` is set, otherwise by a call of ``tell(level, kind, text)`` for
-    each part. Failures are also passed to ``tell``. An interruption ends all processes.
+    If all parts exist, the function returns quickly without a message. If standard error is a
+    terminal and ``bar`` is set, a bar shows the progress. Otherwise ``tell(level, kind, text)`` is
+    called for each part. Failures are also passed to ``tell``. An interruption ends all processes.
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
@@ -112,7 +112,7 @@ def _kernels(missing: list[Part]) -> int:
 
 
 def _available() -> float:
-    """Return the memory available without swapping [bytes]; infinite if it is unknown."""
+    """Return the memory available without swapping [bytes], or infinity if unknown."""
     try:
         _, _, rest = Path("/proc/meminfo").read_text().partition("MemAvailable:")
     except OSError:
@@ -121,12 +121,12 @@ def _available() -> float:
 
 
 class _Build:
-    """Build parts in several processes, each fed by its own thread."""
+    """Build parts in several processes, each of which has its own thread."""
 
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
         self._head = f"{settings.model_dump_json()}\n"
         self._missing = missing
-        self._at: dict[str, str] = {}  # for each part being built, the kernel being compiled
+        self._at: dict[str, str] = {}  # kernel being compiled, by part
         self._total, self._begun = _kernels(missing), 0
         self._started = time.monotonic()
         self._bar, self._tell = bar, tell
@@ -135,7 +135,7 @@ class _Build:
         self.failed = self._over = False
 
     def run(self) -> None:
-        """Build all parts; end all processes if interrupted."""
+        """Build all parts. If interrupted, end all processes."""
         built: dict[str, Future[str]] = {}
         jobs = max(1, min(processors(), len(self._missing), int(_available() / _MEMORY_MAX)))
         pool = ThreadPoolExecutor(jobs)
@@ -155,7 +155,7 @@ class _Build:
             for process in self._processes:
                 with process:
                     pass
-        # Reported once each: wrong settings make every part fail for the same reason.
+        # Report each reason only once, because wrong settings make all parts fail in the same way.
         reasons: set[str] = set()
         for name, future in built.items():
             if (reason := future.result()) and reason not in reasons:
@@ -170,7 +170,7 @@ class _Build:
         )
 
     def _build(self, part: Part, after: Future[str] | None) -> str:
-        """Build a part in this thread's process after ``after``; return the reason of a failure."""
+        """Wait for ``after``, build a part in this thread's process; return the failure reason."""
         if after is not None:
             wait([after])
         head, process = "", getattr(self._own, "process", None)
@@ -201,7 +201,7 @@ class _Build:
 
 def _start() -> subprocess.Popen[str]:
     """Start a process that runs `main`."""
-    # -P: do not import from a folder named tools in the working directory.
+    # -P keeps a folder named tools in the working directory from being imported.
     command = [sys.executable, "-P", "-m", "softfinger.tools.processes.compile"]
     path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(
@@ -210,21 +210,21 @@ def _start() -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
         text=True,
-        process_group=0,  # this process handles Ctrl-C and ends the children
+        process_group=0,  # Only the parent receives Ctrl-C, and it ends the children.
     )
 
 
 def main() -> None:
     """Compile kernels, one part of a scene at a time, until standard input ends.
 
-    Standard input holds the settings in JSON, then the name of one part per line. Standard output
-    has lines of three forms: ``kernel NAME`` when a kernel is started, ``done`` when a part is
-    built, and ``failed REASON`` when a part could not be built.
+    Standard input contains the settings as JSON, followed by one part name per line. Standard
+    output has three kinds of lines: ``kernel NAME`` when a kernel is started, ``done`` when a part
+    has been built, and ``failed REASON`` when a part could not be built.
     """
-    # The compiler allocates many long-lived objects; frequent collections cost 10 %.
+    # The compiler allocates many long-lived objects, so frequent collections cost 10 % of the time.
     gc.set_threshold(100_000)
     out = sys.stdout
-    sys.stdout = sys.stderr  # other prints must not disturb the protocol
+    sys.stdout = sys.stderr  # Other output must not disturb the protocol.
 
     def tell(line: str) -> None:
         print(line, file=out, flush=True)

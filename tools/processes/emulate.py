@@ -1,4 +1,4 @@
-"""Run ``softfinger emulate``, the process of an emulated hand: arguments, signals, exit status."""
+"""Run ``softfinger emulate``, an emulated hand's process: arguments, signals, exit status."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from softfinger.tools.stop_condition import Interrupted, Signals
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
-_QUERY_INTERVAL = 0.1  # s between two queries about the motion of a plate or joint
+_QUERY_INTERVAL = 0.1  # s, time between queries about a plate's or joint's motion
 _FAULTS = """\
 faults, each KIND[=VALUE][@START], any number of them:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
@@ -130,7 +130,7 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT, SIGTERM or SIGHUP; return 1 with a message if the set-up fails."""
+    """Emulate until SIGINT, SIGTERM or SIGHUP. Return 1, with a message, if the set-up fails."""
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder by --dir")
@@ -147,10 +147,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) -> int:
-    # The following imports load numpy and numba; report wrong settings before this delay.
+    # The following imports are slow (numpy, numba), so settings errors are reported earlier.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # garbage collections during imports take a tenth of the start-up time
+    gc.disable()  # Garbage collections during imports take a tenth of the start-up time.
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
         EmulatedServos,
@@ -183,11 +183,11 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 
 
 def _unhurried(settings: Settings, paced: bool) -> Settings:
-    """Return the settings with the real-time measures that suit a pseudo-terminal.
+    """Return the settings with real-time measures that suit a pseudo-terminal.
 
     SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Idle
-    states are disabled only if the servos reproduce wire timing, because they then sleep for times
-    as short as on a wire.
+    states are disabled only if the servos reproduce the wire timing, which requires very short
+    sleeps.
     """
     changes = {"priority": 0, "cpus": (), "spin": 0.0, "lock_memory": False}
     held = paced and settings.realtime.hold_latency
@@ -201,8 +201,8 @@ def _send(folder: Path, words: str) -> int:
 
     try:
         reply = send_words(folder, words)
-        # The motion is timed by the emulated hand's clock, which stops while the emulator is
-        # suspended, so ask again for the remaining time.
+        # The motion follows the emulated hand's clock, which stops while the emulator is suspended.
+        # Therefore query the remaining time repeatedly.
         kind = words.partition(" ")[0]
         while kind in ("press", "turn") and reply.startswith("{"):
             left = json.loads(reply)["wait"]

@@ -1,12 +1,12 @@
 """Log the daemon's events as lines on standard error or in a file, from a separate thread.
 
-A stopped terminal (Ctrl-S), a full pipe or a full disk blocks the writer. Therefore the tick never
-writes, and lines that cannot be written are dropped.
+A stopped terminal (Ctrl-S), a full pipe or a full disk blocks writes. Therefore ticks never write,
+and lines that cannot be written are dropped.
 
-Plain lines are for people. With ``form="json"`` each line is an object with the fields
+Plain lines are intended for people. With ``form="json"``, each line is an object with the fields
 ``timestamp`` (Unix time [s] at which the line was queued), ``level`` (``info``, ``warning``,
-``error``), ``kind`` and ``text``, as in ``hand/event``, and numbers in separate fields. In
-systemd's journal each line has its priority.
+``error``), ``kind`` and ``text``, as in ``hand/event``. Numbers are in additional fields. In
+systemd's journal, each line has a priority.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from typing import Any, TextIO
 
 from softfinger.daemon.own_files import write_text
 
-_LINE_COUNT_MAX = 1000  # lines kept for a slow reader; older lines are dropped
+_LINE_COUNT_MAX = 1000  # lines queued for a slow reader; the oldest are dropped
 _PRIORITIES = {"error": "<3>", "warning": "<4>", "": "<6>", "info": "<6>"}  # see sd-daemon(3)
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
 
 
 class EventLog:
-    """Log for people or programs; ``line`` never blocks and never fails.
+    """Log for people or programs, whose ``line`` method never blocks or fails.
 
-    An existing ``file`` is appended to. Raises OSError if it cannot be opened.
+    Lines are appended to an existing ``file``. Raises OSError if the file cannot be opened.
     """
 
     def __init__(self, form: str = "plain", file: Path | None = None) -> None:
-        self.quiet = False  # set while a full-screen page uses the terminal
+        self.quiet = False  # True while a full-screen page uses the terminal
         self._json = form == "json"
         self._file: TextIO | None = None
         if file is not None:
@@ -50,27 +50,27 @@ class EventLog:
         self._thread.start()
 
     def line(self, level: str, kind: str, text: str, **fields: Any) -> None:
-        """Queue one line; ``fields`` appear only in JSON."""
+        """Queue one line. The ``fields`` appear only in JSON."""
         if not self.quiet or self._file is not None:
             self._lines.append((time.time(), level, kind, text, fields))
             self._news.set()
 
     def plain(self, text: str, level: str = "") -> None:
-        """Queue one line without a kind; plain logs show it unchanged.
+        """Queue one line without a kind, which plain logs show unchanged.
 
-        In JSON its level is ``level``, or ``info`` if that is empty.
+        In JSON, an empty ``level`` becomes ``info``.
         """
         self._lines.append((time.time(), level, "", text, {}))
         self._news.set()
 
     def take_over_logging(self) -> None:
-        """Receive the warnings and errors of all modules from Python's logging."""
+        """Log the warnings and errors that all modules send to Python's logging."""
         handler = _LogHandler(self)
         handler.setLevel(logging.WARNING)
         logging.getLogger().addHandler(handler)
 
     def close(self, patience: float = 1.0) -> None:
-        """Write the queued lines, for at most ``patience`` s."""
+        """Write the queued lines, for up to ``patience`` s."""
         self._closing = True
         self._news.set()
         self._thread.join(patience)
@@ -84,7 +84,7 @@ class EventLog:
                 try:
                     print(self._shown(*self._lines.popleft()), file=out, flush=True)
                 except (OSError, ValueError):
-                    pass  # the output was closed
+                    pass  # The output was closed.
             if self._closing:
                 return
 
@@ -98,7 +98,7 @@ class EventLog:
             shown = text
         else:
             shown = f"{level:7} {kind:8} {text}"
-            if not self._journal:  # the journal adds the time itself
+            if not self._journal:  # The journal adds the time itself.
                 date = "%H:%M:%S" if self._file is None else "%Y-%m-%d %H:%M:%S"
                 shown = f"{_clock(date, timestamp)} {shown}"
         if self._journal:
@@ -108,7 +108,7 @@ class EventLog:
 
 
 def _clock(date: str, timestamp: float) -> str:
-    """Format the time of day; return the seconds if the system clock is invalid."""
+    """Format the time of day, or the plain seconds if the system clock is invalid."""
     try:
         clock = time.strftime(date, time.localtime(timestamp))
     except (OverflowError, OSError, ValueError):
@@ -136,5 +136,5 @@ class _LogHandler(logging.Handler):
         level = _LEVELS.get(record.levelno, "error")
         try:
             self._log.line(level, record.name.rpartition(".")[2], record.getMessage())
-        except Exception:  # an error in logging must not end the caller
+        except Exception:  # A logging error must not end the caller.
             self.handleError(record)

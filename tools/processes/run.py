@@ -1,4 +1,4 @@
-"""Run ``softfinger run``, the daemon's process: settings, signals and exit status."""
+"""Run ``softfinger run``, the daemon process: settings, signals and exit status."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from softfinger.tools.processes.event_log import EventLog
 from softfinger.tools.stop_condition import Interrupted, Signals
 
 _STARTED = time.monotonic()
-_DETAIL = "realtime"  # kind of event that is logged only with --verbose
+_DETAIL = "realtime"  # event kind that is logged only with --verbose
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,22 +56,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run until a signal or the end of ``--duration``.
+    """Run until a signal arrives or ``--duration`` ends.
 
     Returns
     -------
-    0, or 1 after a message with the reason of the failure.
+    0 on success, 1 after a failure, 2 if the settings or the log file are unusable.
 
     Raises
     ------
     SettingsError
-        With the report of all errors.
+        The message reports all errors.
     """
     settings = profile(arguments)
     if arguments.no_task:
         settings = settings.model_copy(update={"task": TaskSettings()})
     signals = Signals()
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # ignored until the loop runs
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until the loop runs
     try:
         log = EventLog(arguments.log, arguments.log_file)
     except OSError as error:
@@ -90,10 +90,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _serve(
     settings: Settings, arguments: argparse.Namespace, signals: Signals, log: EventLog
 ) -> int:
-    # The following imports load numpy, numba and zmq; report wrong settings before this delay.
+    # The following imports are slow (numpy, numba, zmq), so settings errors are reported earlier.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # garbage collections during imports take a tenth of the start-up time
+    gc.disable()  # Garbage collections during imports take a tenth of the start-up time.
     from softfinger.daemon.loop.build import Daemon
     from softfinger.tools.processes.compile import build_kernels
 
@@ -109,7 +109,7 @@ def _serve(
         daemon = Daemon(settings, on_event=on_event)
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
-        # The service is not restarted after status 2.
+        # systemd does not restart the service after status 2.
         return 2 if isinstance(error, SettingsError) else 1
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
@@ -132,7 +132,7 @@ def _serve(
                 log.plain(f"softfinger: {error}")
                 return 1
         page: AbstractContextManager[Any] = nullcontext()
-        log.quiet = arguments.monitor  # the page now uses the terminal
+        log.quiet = arguments.monitor  # The page now uses the terminal.
         if arguments.monitor:
             addresses = settings.stream.address, settings.commands.address
             page = MonitorProcess(*addresses, loop.end, settings.access.keys)
@@ -162,7 +162,7 @@ def _serve(
 
 @contextmanager
 def _service(loop: Any) -> Iterator[None]:
-    """Notify systemd, if it asks for that: ready at the first tick, alive at each, stopping."""
+    """Notify systemd, if requested: ready on the first tick, alive on each tick, and stopping."""
     service = Service.of_environment()
     if service is None:
         yield
@@ -176,7 +176,7 @@ def _service(loop: Any) -> Iterator[None]:
 
 
 def _record(arguments: argparse.Namespace, settings: Settings, daemon: Any) -> Any:
-    """Start a recorder and wait until it has subscribed; raise RecorderError on failure."""
+    """Start a recorder and wait until it has subscribed. Raises RecorderError."""
     from softfinger.daemon.wire import schema
     from softfinger.daemon.wire.publisher import bit
 
@@ -203,10 +203,10 @@ def _scene(settings: Settings) -> str:
 
 
 def _numbers(state: State) -> dict[str, Any]:
-    """Return the numbers logged with an event; ``seq`` locates the event in a recording."""
+    """Return the numbers to be logged with an event; ``seq`` locates the event in a recording."""
     numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
     real = {
-        name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON has no NaN
+        name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON lacks NaN.
         for name, pair in numbers.items()
     }
     return {"seq": state.seq, "mode": state.mode, **real}

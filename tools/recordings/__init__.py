@@ -1,8 +1,8 @@
-"""Recordings of the stream in MCAP files: `record`, `replay` and `export`.
+"""Record the stream in MCAP files, and replay and export recordings.
 
-Messages are stored as JSON with the schema of their topic (`wire.schema_docs.json_schema`), so that
-Foxglove and PlotJuggler open the file. Floats keep all digits, and NaN is stored as null. Tactile
-frames are stored as ``foxglove.RawImage`` with the topic's own fields added, in one channel per
-finger. Log times are the messages' Unix times. The extra ``record`` is required; it is imported
-when a file is opened.
+Messages are stored as JSON with the topic's schema (`wire.schema_docs.json_schema`), so Foxglove
+and PlotJuggler can open the file. Floats are stored with all digits, and NaN as null. Each finger
+has its own channel of tactile frames, which are stored as ``foxglove.RawImage`` with the topic's
+fields added. Log times are the messages' Unix times. The ``record`` extra is required; it is
+imported when a file is opened.
 """

@@ -1,4 +1,4 @@
-"""Convert the map of a topic to the JSON of a channel and back, for the writer and the reader."""
+"""Convert a topic's map to a channel's JSON and back, for the writer and the reader."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
 LIBRARY = "softfinger"
 
-# Frames and events also follow Foxglove's schemas and contain the fields that these require. A
-# field of the stream whose name is used by Foxglove gets another name in the recording.
+# Frames and events also contain the fields that Foxglove's schemas require. If a stream field has
+# the same name as a Foxglove field, it is renamed in the recording.
 _STAMP = {
     "type": "object",
     "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
@@ -37,26 +37,26 @@ _FOXGLOVE: dict[bytes, tuple[str, dict[str, Any]]] = {
     ),
 }
 _STORED_AS = {"timestamp": "unix", "level": "severity"}
-_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's levels; its level 0 means unknown
+_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's levels, where 0 means unknown
 
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 def channel_name(topic: bytes, message: dict[str, Any]) -> str:
-    """Return the channel of a message: its topic, for a frame followed by the finger."""
+    """Return a message's channel: the topic, followed by the finger if it is a tactile frame."""
     if topic == schema.TACTILE:
         return f"{topic.decode()}/{message.get('finger')}"
     return topic.decode()
 
 
 def topic_of(channel: str) -> bytes:
-    """Return the topic of the messages in a channel."""
+    """Return the topic of a channel's messages."""
     topic = schema.TACTILE.decode()
     return schema.TACTILE if channel.startswith(f"{topic}/") else channel.encode()
 
 
 def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
-    """Return name and JSON schema of a topic's channels; an unknown topic may hold any object."""
+    """Return the schema name and JSON Schema of a topic; unknown topics may contain any object."""
     if topic not in schema.TOPICS:
         return topic.decode(), {"type": "object"}
     described = schema_docs.json_schema(topic)
@@ -71,12 +71,12 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
 
 
 def to_json(topic: bytes) -> Converter:
-    """Return the converter from maps to JSON; the converter may modify the map."""
+    """Return a function that converts a map to JSON and may modify the map."""
     return {schema.TACTILE: _image, schema.EVENT: _log}.get(topic, lambda message: message)
 
 
 def from_json(topic: bytes) -> Converter:
-    """Return the converter from a channel's JSON to the map on the wire."""
+    """Return a function that converts a channel's JSON to the stream's map."""
     fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
     floats = [field.name.split(".") for field in fields if field.kind == "float"]
     return partial(_restored, topic, floats, [field.name for field in fields])
@@ -124,9 +124,9 @@ def _log(message: dict[str, Any]) -> dict[str, Any]:
 def _restored(
     topic: bytes, floats: list[list[str]], names: list[str], message: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the topic's own map: nulls become NaN, base64 becomes bytes, Foxglove's fields go.
+    """Restore the stream's map: convert nulls to NaN and base64 to bytes, drop Foxglove's fields.
 
-    Raises ValueError, TypeError or AttributeError if the map is not a message of the topic.
+    Raises ValueError, TypeError or AttributeError if the map is not a message of this topic.
     """
     if topic in _FOXGLOVE and _STORED_AS["timestamp"] in message:
         for name in _FOXGLOVE[topic][1]:

@@ -1,4 +1,4 @@
-"""Run ``softfinger export FILE.mcap``: export topics as CSV or Parquet, and frames as arrays."""
+"""Run ``softfinger export FILE.mcap``: export topics to CSV or Parquet, and frames to arrays."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export the topics; return 1 if there is nothing to export.
+    """Export the topics. Return 1 if there is nothing to export.
 
     Raises
     ------
@@ -78,11 +78,11 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
 
 
 Row = dict[str, Any]
-_BLOCK = 2000  # rows written at a time
+_BLOCK = 2000  # rows per write
 
 
 class CsvTable:
-    """CSV file; floats keep all digits, NaN is an empty cell, byte fields are left out."""
+    """CSV file with full float precision and empty cells for NaN, without byte fields."""
 
     suffix = ".csv"
 
@@ -100,12 +100,12 @@ class CsvTable:
 
 
 class ParquetTable:
-    """Parquet file with the types of the schema."""
+    """Parquet file with the schema's types."""
 
     suffix = ".parquet"
 
     def __init__(self, path: Path, columns: dict[str, str]) -> None:
-        """Open the file; raise MissingExtra without pyarrow."""
+        """Open the file. Raises MissingExtra if pyarrow is not installed."""
         require("parquet")
         import pyarrow
         import pyarrow.parquet
@@ -151,7 +151,7 @@ def export(
     end: float = math.inf,
     progress: Any = None,
 ) -> list[Path]:
-    """Write a table for each topic into ``folder``, and one ``.npz`` file of frames per sensor.
+    """Write one table per topic and one ``.npz`` file with frames per sensor into ``folder``.
 
     The first column ``t`` is the time since the recording's first message [s] by the daemon's
     clock, in all files alike. The others are those of the schema and any additional fields of the
@@ -159,14 +159,14 @@ def export(
 
     Returns
     -------
-    The files written.
+    The files that were written.
 
     Raises
     ------
     OSError, MissingExtra
     """
     tables: dict[bytes, Table] = {}
-    grids: dict[str, tuple[list[float], list[Any]]] = {}  # (times, counts) by finger
+    grids: dict[str, tuple[list[float], list[Any]]] = {}  # by finger, times and counts
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):
@@ -193,12 +193,12 @@ def export(
 
 
 def _file_name(topic: bytes) -> str:
-    """Return a safe file name for a topic of any recording: not hidden, and without a folder."""
+    """Return a safe file name for any topic: not hidden and without a folder."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 
 def _flat(message: Row, outer: str = "") -> Row:
-    """Flatten nested maps: ``left.force`` for the force in ``left``."""
+    """Flatten nested maps; the entry ``force`` in the map ``left`` becomes ``left.force``."""
     row: Row = {}
     for key, value in message.items():
         if isinstance(value, dict):

@@ -1,7 +1,7 @@
-"""Read MCAP files: `Recording` gives a summary of a file and its messages in order of arrival.
+"""Read MCAP files: `Recording` provides a file's summary and its messages in order of arrival.
 
-A recording may come from any writer of the format, with or without chunks, indexes, statistics and
-channels of other programs. Sizes and counts in the file are not trusted: memory and time are
+A recording may have been written by any MCAP writer, with or without chunks, indexes, statistics
+and other programs' channels. Sizes and counts in the file are not trusted: memory and time are
 bounded by the file's size on disk. `read_recording` returns the states as NumPy columns.
 """
 
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
 __all__ = ["Recording", "read_recording"]
 
 _MESSAGE_SIZE_MAX = 1 << 20  # bytes; a frame of the largest grid has 0.2 MB
-_SETTINGS_SIZE_MAX = 4 << 20  # bytes; includes calibrations of each cell
-_CHUNK_SIZE_MAX = 64 << 20  # bytes unpacked; chunks usually have 1 to 8 MB
-# bytes counted at least for each channel or message, because each takes time to read
+_SETTINGS_SIZE_MAX = 4 << 20  # bytes, including per-cell calibrations
+_CHUNK_SIZE_MAX = 64 << 20  # bytes, unpacked; chunks usually have 1 to 8 MB
+# bytes, minimum size counted per channel or message, because each record takes time to read.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
-_OTHERS_NAMED_MAX = 3  # channels of other programs named in a message
-_FIELD_COUNT_MAX = 500  # fields in one message
+_OTHERS_NAMED_MAX = 3  # other programs' channels that are named in a warning
+_FIELD_COUNT_MAX = 500  # fields per message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
-_RECORD = struct.Struct("<BQ")  # head of each record: kind, size of the content
-_BEFORE_DATA = struct.Struct("<HIQQ")  # head of a message: channel, number, log time, publish time
-# Head of a chunk: first and last time, size, CRC, length of the compression's name.
+_RECORD = struct.Struct("<BQ")  # record header: kind, content size
+_BEFORE_DATA = struct.Struct("<HIQQ")  # message header: channel, number, log time, publish time
+# Chunk header: first time, last time, size, CRC, length of the compression method's name.
 _BEFORE_CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 _MAGIC = b"\x89MCAP0\r\n"
@@ -48,7 +48,7 @@ _END = struct.Struct("<BQQQI8s")  # footer and magic
 
 
 def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read a recording's states as one array per field, in the order in which they arrived.
+    """Read a recording's states as one array per field, in order of arrival.
 
     Names are those of `hand/state`, nested ones with a dot (``left.force``). The first, ``t``, is
     the time since the recording's first message [s], as in all files of ``softfinger export``.
@@ -57,7 +57,7 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     RecordingError
-        If the file is not a recording or contains no state.
+        If the file is not a recording or does not contain states.
     """
     from softfinger.daemon.client.stream import read, to_columns
     from softfinger.daemon.wire.schema import STATE, HandState
@@ -71,39 +71,40 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 class MessageSource(Protocol):
-    """Source of messages, in a file or in memory; ``path`` names it in messages to the user."""
+    """Source of messages, in a file or in memory; user messages refer to it as ``path``."""
 
     path: Path
 
     def messages(
         self, topics: Collection[bytes] | None = None
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield topic and map of each message of ``topics``, in order."""
+        """Yield the topic and map of each message in ``topics``, in order."""
 
 
 class Recording:
-    """Existing recording; raises RecordingError if the file is not a recording.
+    """Existing recording. Raises RecordingError if the file is not a recording.
 
-    ``counts`` (messages by channel), ``start`` and ``end`` (Unix time [s], NaN when empty) come
-    from the summary at the end of the file. A file without a full summary, or with channels of
-    other programs, is read once as a whole instead. The file of a killed recorder has no end and is
-    marked ``truncated``. Damaged chunks are skipped. ``others`` counts the messages in channels of
-    other programs, which are ignored. ``say`` is called once for each of these findings.
+    ``counts`` (number of messages by channel), ``start`` and ``end`` (Unix time [s], NaN if empty)
+    are read from the summary at the end of the file. If the summary is incomplete, or if there are
+    other programs' channels, the whole file is read once instead. A killed recorder leaves a file
+    without an end, which is marked ``truncated``. Corrupted chunks are skipped. Messages in other
+    programs' channels are ignored; ``others`` counts them. ``say`` is called once for each of these
+    findings.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
         require("record")
         self.path = path
         self.truncated = False
-        self.damage = ""  # description of the first damage found so far
+        self.damage = ""  # description of the first defect found so far
         self._say = say
         self.counts: dict[str, int] = {}
-        self.others: dict[str, int] = {}  # number of messages in channels of other programs
+        self.others: dict[str, int] = {}  # number of messages in each of other programs' channels
         self.start = math.nan
         self.end = math.nan
         self.chunks = 0
-        self._first = 0  # log time of the earliest message [ns]
-        self._left = 0  # bytes that may still be unpacked
+        self._first = 0  # ns, log time of the earliest message
+        self._left = 0  # bytes, remaining limit for unpacked data
         self._names: dict[int, str] = {}  # channel names by channel number
         self._other_names: dict[int, str] = {}
         try:
@@ -138,7 +139,7 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last message [s]; 0 when empty."""
+        """Time from the first to the last message [s], or 0 if empty."""
         return 0.0 if math.isnan(self.start) else self.end - self.start
 
     @property
@@ -152,7 +153,7 @@ class Recording:
         return sorted({topic_of(name) for name, count in self.counts.items() if count})
 
     def count(self, topic: bytes) -> int:
-        """Return the number of messages of one topic."""
+        """Return the number of messages with this topic."""
         return sum(n for name, n in self.counts.items() if topic_of(name) == topic)
 
     @cached_property
@@ -182,11 +183,11 @@ class Recording:
         end: float = math.inf,
         progress: Callable[[int], None] | None = None,
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield topic and map of each message from ``start`` to ``end`` [s], as on the wire.
+        """Yield the topic and stream map of each message from ``start`` to ``end`` [s].
 
-        Times count from the recording's first message. ``progress`` is called with the number of
-        bytes read so far. A truncated file is read up to its first incomplete record. Damaged
-        chunks and messages that do not fit their topic are skipped.
+        Times are relative to the recording's first message. ``progress`` is called with the number
+        of bytes read so far. A truncated file is read up to its first incomplete record. Corrupted
+        chunks, and messages that do not match their topic, are skipped.
         """
         import orjson
 
@@ -219,7 +220,7 @@ class Recording:
     def _messages(
         self, times: tuple[int, int] = (0, 2**64), progress: Callable[[int], None] | None = None
     ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield channel number, log time [ns] and data of each message, and record new channels.
+        """Yield channel number, log time [ns] and data of each message; register new channels.
 
         Chunks outside ``times`` are skipped.
         """
@@ -246,7 +247,7 @@ class Recording:
     def _messages_in(
         self, chunk: bytes, times: tuple[int, int]
     ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the messages of a chunk, up to a damaged record."""
+        """Yield a chunk's messages, up to the first corrupted record."""
         first, last, size, crc, length = _BEFORE_CHUNK.unpack_from(chunk)
         self._count(size)
         if last < times[0] or first > times[1]:
@@ -260,11 +261,11 @@ class Recording:
             for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
                 if (message := self._take_record(kind, content)) is not None:
                     yield message
-        except Exception as error:  # errors of the format, of the compression and others
+        except Exception as error:  # Format and compression errors have no common base class.
             self._damaged(error)
 
     def _take_record(self, kind: int, content: bytes) -> tuple[int, int, bytes] | None:
-        """Process a channel record (returns None) or a message."""
+        """Process a channel record or a message; return None for a channel record."""
         if kind == _CHANNEL:
             self._count(max(0, _RECORD_SIZE_MIN - len(content)))
             self._learn(content)
@@ -286,7 +287,7 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
-        # In a recording by softfinger, an unknown topic comes from a newer version.
+        # In a softfinger recording, an unknown topic comes from a newer version.
         if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
             self._other_names[channel.id] = channel.topic
             return
@@ -295,7 +296,7 @@ class Recording:
             raise ValueError(f"more than {_CHANNEL_COUNT_MAX} channels")
 
     def check(self) -> bool:
-        """Read every message; return True if the file is complete and undamaged."""
+        """Read all messages; return True if the file is complete and not corrupted."""
         for _ in self._messages():
             pass
         return not self.truncated and not self.damage
@@ -303,14 +304,14 @@ class Recording:
     def _damaged(self, error: Exception | None) -> None:
         first = not self.damage
         usual = "its end is missing" if self.truncated else "a chunk can't be read"
-        # The MCAP library's messages about a wrong length or checksum do not help the user.
+        # The MCAP library's messages about lengths and checksums would not help the user.
         self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
         if first and self._say is not None:
             what = "cut short" if self.truncated else "damaged"
             self._say(f"{self.path}: {what} ({self.damage}); what is sound in it is read")
 
     def _begin(self, file: BinaryIO) -> str:
-        """Check the file's end; return the profile in the header, PROFILE if it is damaged."""
+        """Check the file's end; return the header's profile, or PROFILE if it is unreadable."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Header
 
@@ -328,7 +329,7 @@ class Recording:
             return PROFILE
 
     def _summary(self, file: BinaryIO) -> Statistics | None:
-        """Return the summary's statistics; None if they or their channels are missing."""
+        """Return the summary's statistics, or None if they or their channels are missing."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Statistics
 
@@ -366,7 +367,7 @@ class Recording:
             self.end = statistics.message_end_time * 1e-9
 
     def _scan(self) -> None:
-        """Read all messages to count them and to find their times."""
+        """Read all messages to determine their number and time range."""
         start, end = 2**64, -1
         for channel, log_time, _ in self._messages():
             if channel in self._names:
@@ -382,10 +383,10 @@ class Recording:
 
 
 def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and content of each record of the ``wanted`` kinds.
+    """Yield the kind and content of each record whose kind is in ``wanted``.
 
-    For a message that is too long, only the part before its data is returned. Raises EOFError for
-    an incomplete record, ValueError for an invalid or too long one.
+    If a message is too long, its content is truncated to the header. Raises EOFError for an
+    incomplete record, and ValueError for an invalid record or another record that is too long.
     """
     while head := file.read(_RECORD.size):
         if len(head) < _RECORD.size:
@@ -411,7 +412,7 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
 def _plain(message: dict[str, Any]) -> dict[str, Any]:
     """Check that a map has plain values, at most two levels of nested maps and few fields.
 
-    Raises ValueError if it does not, AttributeError if it is not a map.
+    Raises ValueError if the check fails and AttributeError if the message is not a map.
     """
     count, maps = 0, [message]
     for _ in range(3):
@@ -427,7 +428,7 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
-    """Unpack a chunk's records; raise ValueError for a wrong checksum or an excessive size."""
+    """Unpack a chunk's records. Raises ValueError for a wrong checksum or an excessive size."""
     if size > _CHUNK_SIZE_MAX:
         raise ValueError(f"a chunk of {size >> 20} MB")
     if method == "zstd":

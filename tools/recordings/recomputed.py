@@ -1,4 +1,4 @@
-"""Recompute the states of a recording from its inputs and compare them with the recorded states."""
+"""Recompute a recording's states from its inputs and compare them with the recorded states."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from softfinger.tools.recordings.reader import MessageSource, Recording
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
-# Fields that depend on the machine's timing and not on the loop's inputs.
+# Fields that depend on the machine's timing instead of the loop's inputs.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of hand/settings
@@ -36,24 +36,24 @@ _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of h
 
 @dataclass(slots=True)
 class Difference:
-    """Differences in one field of ``hand/state``: how often, where first and where largest."""
+    """Differences in one ``hand/state`` field: their number, the first and the largest one."""
 
     count: int = 0
     first_tick: int = 0
-    recorded: Any = None  # at the first difference
+    recorded: Any = None  # value at the first difference
     recomputed: Any = None
-    worst: float = 0.0  # largest difference of numbers
+    worst: float = 0.0  # largest numerical difference
     worst_tick: int = 0
 
 
 @dataclass(slots=True)
 class Comparison:
-    """Result of a comparison: ticks run, states compared and fields that differ."""
+    """Comparison result: number of ticks, number of compared states, and differing fields."""
 
     ticks: int = 0
     states: int = 0
     fields: int = 0
-    from_start: bool = False  # the recording contains the first tick
+    from_start: bool = False  # True if the recording contains the first tick
     missing_ticks: int = 0
     missing_frames: int = 0
     differences: dict[str, Difference] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class Comparison:
 def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
     """Return the recording's settings and its calibrations (JSON).
 
-    References to files are removed from the settings, because recordings are not trusted.
+    File paths are removed from the settings, because recordings are not trusted.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
 
 
 def recorded_models(recording: MessageSource) -> tuple[FingerModel, FingerModel]:
-    """Return the finger models that follow from the recording's settings and calibrations.
+    """Create the finger models from the recording's settings and calibrations.
 
     Raises
     ------
@@ -103,12 +103,12 @@ def recorded_models(recording: MessageSource) -> tuple[FingerModel, FingerModel]
 def counts_of(
     recording: MessageSource, message: dict[str, Any], settings: Settings
 ) -> NDArray[np.uint16]:
-    """Return the counts of a frame.
+    """Return a frame's counts.
 
     Raises
     ------
     RecordingError
-        If the frame holds pressures, or a grid of another shape.
+        If the frame contains pressures, or its grid has another shape.
     """
     if message.get("unit") != "count":
         raise RecordingError(
@@ -130,10 +130,10 @@ def recompute(
     settings: Settings | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Comparison:
-    """Run the recorded inputs through the loop and compare every state.
+    """Process the recorded inputs with the loop and compare all states.
 
-    ``settings`` replace the recorded ones. Raises RecordingError if the recording lacks a topic or
-    frames.
+    ``settings`` replaces the recorded settings. Raises RecordingError if the recording lacks a
+    topic or frames.
     """
     own, calibrations = recorded_settings(recording)
     if not recording.count(schema.INPUT):
@@ -158,7 +158,7 @@ def _run(
     calibrations: list[str],
     progress: Callable[[int], None] | None,
 ) -> None:
-    # Refuse a recording without settings and inputs before the loop is imported.
+    # Reject a recording without settings and inputs before the slow import of the loop.
     from softfinger.daemon.loop.process_replay import ProcessReplay
     from softfinger.daemon.loop.publishing import parts
 
@@ -194,12 +194,12 @@ def _run(
         result.ticks += 1
         if state is not None:
             step = state.get("seq_step", 1)
-            # Pack and unpack as for the recorded state, to get the same types and rounding.
+            # Pack and unpack the state like the recorded one, for identical types and rounding.
             again = msgpack.unpackb(pack_state(now, scene, step))
             _compare(result, state, again)
 
 
-# A tick's input, the counts of recent frames by (finger, seq), its commands, and its state if any.
+# A tick's input, counts of recent frames by (finger, seq), commands, and state (None if missing).
 _Tick = tuple[
     dict[str, Any], dict[tuple[int, int], Any], list[dict[str, Any]], dict[str, Any] | None
 ]
@@ -208,7 +208,7 @@ _Tick = tuple[
 def _ticks(
     recording: Recording, used: Settings, progress: Callable[[int], None] | None
 ) -> Iterator[_Tick]:
-    """Yield each tick: frames and commands are stored before its input, its state after it."""
+    """Yield all ticks. A tick's frames and commands precede its input, and its state follows it."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}
@@ -240,7 +240,7 @@ def _ticks(
 
 
 def _request(text: str) -> dict[str, Any] | None:
-    """Return a command's map; None if there is none."""
+    """Return a command's map, or None if the text contains no map."""
     try:
         found = json.loads(text)
     except (ValueError, RecursionError):

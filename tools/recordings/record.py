@@ -1,4 +1,4 @@
-"""Run ``softfinger record FILE.mcap``: record the running daemon's stream into an MCAP file."""
+"""Run ``softfinger record FILE.mcap``: record the running daemon's stream to an MCAP file."""
 
 from __future__ import annotations
 
@@ -49,24 +49,24 @@ With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mc
 `replay --recompute` needs --topics all; `run --record` records all topics from the first tick on.
 Exit status: 0 everything was written, 1 not everything was written, with the reason."""
 
-_SILENCE_TIME = 2.0  # s without a message before a notice is printed
-# s between two reads of the socket; waking up for each message would cost more than processing it.
+_SILENCE_TIME = 2.0  # s, time without messages before a notice is printed
+# s between socket reads, because waking up for each message would cost more than processing it.
 _POLL_INTERVAL = 0.1
-_BACKLOG_TIMEOUT = 10.0  # s for processing queued messages after the end is requested
-_TRANSIT_TIME = 0.5  # s to wait at the end for messages still in transit on a busy machine
-_PROGRESS_INTERVAL = 0.5  # s between progress lines, and between flushes
-_BATCH_SIZE = 1000  # messages between two checks of the time
+_BACKLOG_TIMEOUT = 10.0  # s, time limit for processing queued messages at the end
+_TRANSIT_TIME = 0.5  # s, wait at the end for messages in transit on a busy machine
+_PROGRESS_INTERVAL = 0.5  # s, time between progress lines and between flushes
+_BATCH_SIZE = 1000  # messages between time checks
 
 
-# A killed recorder loses at most the incomplete chunk, i.e. the messages since the last flush.
-CHUNK_SIZE = 256 * 1024  # bytes before compression: a fifth of a second of state at 1 kHz
+# A killed recorder loses only the incomplete chunk, i.e. the messages since the last flush.
+CHUNK_SIZE = 256 * 1024  # bytes before compression, 0.2 s of state at 1 kHz
 
 
 class RecordingWriter:
-    """Write one file; ``messages`` and ``size`` [bytes] count the complete chunks in it.
+    """Writer for one file; ``messages`` and ``size`` [bytes] count complete chunks only.
 
-    Raises RecordingError if the file cannot be opened or already exists. After a failed write the
-    file is closed; the data written before remain readable.
+    Raises RecordingError if the file cannot be opened or already exists. If a write fails, the file
+    is closed, and the data that were written earlier remain readable.
     """
 
     def __init__(self, path: Path) -> None:
@@ -78,17 +78,17 @@ class RecordingWriter:
         self.messages = 0
         self.size = 0
         self._dumps = orjson.dumps
-        self._added = 0  # number of messages, including the incomplete chunk
-        self._filled = 0  # bytes of messages in the incomplete chunk
-        # By topic, for frames by channel name.
+        self._added = 0  # number of messages, including those in the incomplete chunk
+        self._filled = 0  # bytes in the incomplete chunk
+        # The key is the topic or, for tactile frames, the channel name.
         self._channels: dict[bytes | str, tuple[int, Converter]] = {}
         self._schemas: dict[bytes, int] = {}
         self._ended = False
-        self._newest = math.nan  # time of the newest message [s]
-        # Repeated messages that came before any other message.
+        self._newest = math.nan  # s, time of the newest message
+        # Repeated messages that arrived before any other message.
         self._early: list[tuple[bytes, dict[str, Any]]] = []
         try:
-            self._file = path.open("xb", buffering=4 * CHUNK_SIZE)  # a chunk is written at once
+            self._file = path.open("xb", buffering=4 * CHUNK_SIZE)  # one write per chunk
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; nothing is written over it") from None
         except FileNotFoundError:
@@ -96,7 +96,7 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
-            # Larger than the limit at which `add` ends a chunk.
+            # This size exceeds the limit at which `add` ends a chunk.
             self._mcap = Writer(self._file, 2 * CHUNK_SIZE)
             self._mcap.start(PROFILE, LIBRARY)
             self._wrote()
@@ -104,11 +104,11 @@ class RecordingWriter:
             raise self._failed(error) from None
 
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Write one message; the map may be modified. Raises RecordingError.
+        """Write one message, possibly modifying its map. Raises RecordingError.
 
-        A repeated message (``again``) contains its original time, from before the recording. Its
-        log time in the file is that of the preceding message, so that log times stay within the
-        recording.
+        A repeated message (``again``) contains its original time, which precedes the recording. Its
+        log time is therefore set to that of the previous message, so that all log times are within
+        the recording.
         """
         assert not self._ended
         stamp = message.get("timestamp")
@@ -125,7 +125,7 @@ class RecordingWriter:
         self._write(topic, message, when)
 
     def flush(self) -> None:
-        """End the chunk and pass it to the system, so that it survives a killed process."""
+        """End the chunk and pass it to the system, so that it is safe if this process is killed."""
         try:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._wrote()
@@ -133,7 +133,7 @@ class RecordingWriter:
             raise self._failed(error) from None
 
     def close(self) -> None:
-        """Write the last chunk and the summary; raise RecordingError if that fails."""
+        """Write the last chunk and the summary. Raises RecordingError."""
         if self._ended:
             return
         if self._early:
@@ -143,7 +143,7 @@ class RecordingWriter:
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._wrote()
             self._file.close()
-            del self._mcap  # frees the index of all chunks, which takes most of the writer's memory
+            del self._mcap  # Free the index of all chunks, which uses most of the writer's memory.
         except OSError as error:
             raise self._failed(error) from None
 
@@ -160,7 +160,7 @@ class RecordingWriter:
             channel, convert = self._channels[key]
             try:
                 data = self._dumps(convert(message))
-            except TypeError:  # also orjson's error for values that JSON cannot represent
+            except TypeError:  # orjson also raises this for values that JSON cannot represent.
                 return
             sequence = message.get("seq")
             sequence = sequence & 0xFFFFFFFF if isinstance(sequence, int) else 0
@@ -187,11 +187,11 @@ class RecordingWriter:
 
     def _failed(self, error: OSError) -> RecordingError:
         self._ended = True
-        # The remaining buffer does not fit either and is dropped.
+        # The remaining buffer cannot be written either and is dropped.
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):
-            os.truncate(self.path, self.size)  # keep only complete records
+            os.truncate(self.path, self.size)  # Only complete records remain.
         return RecordingError(
             f"{self.path}: {error.strerror}; what was written until then can be read, "
             f"`softfinger record --recover {self.path}` closes it"
@@ -219,7 +219,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Record until the end; return 1 if not everything was written. Raises SoftfingerError."""
+    """Record until the end. Return 1 if the recording is incomplete. Raises SoftfingerError."""
     if arguments.recover:
         messages, damage = recover(arguments.file)
         state = f"was damaged ({damage}), its sound part is kept" if damage else "sound"
@@ -230,21 +230,21 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Recorder:
-    """State of one call of ``record``: socket, files and counters."""
+    """State of one ``record`` call: socket, files and counters."""
 
     def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
         self._ending = ending
-        self._keys = client_keys(arguments.keys)  # fail before a file is created
+        self._keys = client_keys(arguments.keys)  # Errors must occur before a file is created.
         self._gaps: dict[bytes, Gaps] = {}
-        self._writers = [RecordingWriter(arguments.file)]  # messages go to the last one
+        self._writers = [RecordingWriter(arguments.file)]  # The last writer is the active one.
         self._opened = time.monotonic()
         self._messages = 0  # number of messages received for writing
         self._unreadable = 0
-        self._waiting = False  # the notice about the missing stream was printed
+        self._waiting = False  # True once the notice about the missing stream was printed
 
     def record(self) -> int:
-        """Record messages until the end; return the exit status."""
+        """Record messages until the end, and return the exit status."""
         arguments, failure = self._arguments, ""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
@@ -264,7 +264,7 @@ class _Recorder:
         return self._summary(failure)
 
     def _take_all(self, socket: zmq.Socket[bytes]) -> str:
-        """Read messages until the end; return the reason of a failure, or an empty text."""
+        """Read messages until the end; return the reason for a failure, or an empty string."""
         arguments, ending = self._arguments, self._ending
         began = shown = last = time.monotonic()
         ending.begin()
@@ -287,14 +287,14 @@ class _Recorder:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)
                 shown = now
-        # Messages sent before a signal may still be in transit, e.g. the daemon's last ones.
+        # Messages that were sent before a signal, such as the daemon's last ones, may arrive late.
         self._read_remaining(
             socket, _TRANSIT_TIME if ending.is_requested or not ending.is_met else 0.0
         )
         return failure
 
     def _take_batch(self, socket: zmq.Socket[bytes]) -> int:
-        """Process at most ``_BATCH_SIZE`` waiting messages; return their number."""
+        """Process up to ``_BATCH_SIZE`` queued messages and return their number."""
         count = 0
         for message in drain(socket, _BATCH_SIZE):
             self._take(message)
@@ -302,7 +302,7 @@ class _Recorder:
         return count
 
     def _read_remaining(self, socket: zmq.Socket[bytes], quiet: float) -> None:
-        """Process the waiting messages, and those that arrive within ``quiet`` s of waiting."""
+        """Process the queued messages and those that arrive within another ``quiet`` s."""
         end = time.monotonic() + _BACKLOG_TIMEOUT
         while time.monotonic() < end:
             if self._take_batch(socket) < _BATCH_SIZE:
@@ -310,7 +310,7 @@ class _Recorder:
                     return
                 began = time.monotonic()
                 socket.poll(int(_POLL_INTERVAL * 1e3))
-                # A stall of the process counts as one step.
+                # If the process stalls, this counts as one poll interval.
                 quiet -= min(time.monotonic() - began, _POLL_INTERVAL)
 
     def _take(self, frames: list[bytes]) -> None:
@@ -332,7 +332,7 @@ class _Recorder:
             return
         path = arguments.file
         path = path.with_name(f"{path.stem}-{len(self._writers) + 1}{path.suffix}")
-        # Open the new file before closing the old one, which stays usable if opening fails.
+        # Open the new file before closing the old file, which remains usable if opening fails.
         self._writers.append(RecordingWriter(path))
         self._opened = time.monotonic()
         writer.close()
@@ -356,7 +356,7 @@ class _Recorder:
             if written:
                 print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
             else:
-                # An empty file would block the next call with this name.
+                # An empty file would prevent the next recording with this name.
                 path.unlink(missing_ok=True)
         lost = ", ".join(
             f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost
@@ -377,10 +377,10 @@ def _topics(named: list[bytes] | None) -> list[bytes]:
 
 
 def recover(path: Path) -> tuple[int, str]:
-    """Close a recording in place; return its number of messages and the reason it was incomplete.
+    """Repair a recording; return its number of messages and the reason why it was incomplete.
 
-    A complete file is not changed. The new file replaces the old one only once it is complete.
-    Raises RecordingError.
+    A complete file is not changed. The repaired file replaces the original only once it is
+    complete. Raises RecordingError.
     """
     recording = Recording(path)
     if recording.check():

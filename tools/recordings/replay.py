@@ -1,4 +1,4 @@
-"""Run ``softfinger replay FILE.mcap``: publish a recording again, or recompute its states."""
+"""Run ``softfinger replay FILE.mcap``: publish a recording, or recompute its states."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ a recording of all topics: `record --topics all`, or `run --record`, which start
 From the first tick on, the same code and settings give identical bits.
 Exit status: 0 identical or published, 1 the file can't be read, 3 states differ."""
 
-_SUBSCRIBER_WAIT = 10.0  # s to wait for a subscriber
+_SUBSCRIBER_WAIT = 10.0  # s, timeout for the first subscriber
 _EXIT_DIFFERENT = 3
 
 
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Publish or compare.
+    """Publish the recording, or recompute and compare its states.
 
     Raises
     ------
@@ -97,10 +97,10 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
                 pass
         began, first = time.monotonic(), None
         for topic, message in recording.messages(start=arguments.start, end=arguments.end):
-            if message.get("again") is not True:  # a repeated message is older than the recording
+            if message.get("again") is not True:  # Repeated messages are older than the recording.
                 stamp = message.get("timestamp", 0.0)
                 if not isinstance(stamp, int | float):
-                    continue  # not a message of this stream
+                    continue  # Ignore invalid messages.
                 if first is None:
                     began, first = time.monotonic(), stamp
                 due = began + (stamp - first) / arguments.speed
@@ -118,7 +118,7 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     from softfinger.tools.recordings.recomputed import recompute, recorded_settings
     from softfinger.tools.sweep import Progress
 
-    # This fails for a recording without settings before kernels are loaded.
+    # Check for missing settings before the kernels are loaded.
     recorded, _ = recorded_settings(recording)
     from softfinger.tools.processes.compile import build_kernels, print_event
 
@@ -148,15 +148,15 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     return _EXIT_DIFFERENT
 
 
-_QUEUE_LENGTH = 10_000  # messages queued for a subscriber; further messages are lost
-_SEND_TIMEOUT = 1.0  # s for the gateway to accept a message
+_QUEUE_LENGTH = 10_000  # messages queued for a subscriber; excess messages are lost
+_SEND_TIMEOUT = 1.0  # s, timeout for the gateway to accept a message
 
 
 class Wire:
-    """Context that publishes on ``address``; with ``keys``, only to clients with these keys.
+    """Context manager for a gateway that publishes on ``address``, with access control by ``keys``.
 
-    Raises RecordingError if the address cannot be bound, or is reachable from other machines
-    without keys.
+    Raises RecordingError if the address cannot be bound, or if other machines can reach it and
+    there are no keys.
     """
 
     def __init__(self, address: str, keys: Path | None = None) -> None:
@@ -176,13 +176,13 @@ class Wire:
         self._link = self._gateway.link
 
     def subscribed(self, seconds: float) -> bool:
-        """Wait ``seconds`` for a change of the subscribers; return True if there are any."""
+        """Wait up to ``seconds`` for new subscriptions; return True if there are subscribers."""
         self._link.wait(seconds)
         return bool(self._link.wanted)
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Publish one message as soon as the gateway has room for it."""
-        if topic not in schema.TOPICS:  # topic of another version
+        """Publish one message as soon as the gateway can accept it."""
+        if topic not in schema.TOPICS:  # a topic from another version
             return
         self._link.wait_for_room(_SEND_TIMEOUT)
         index = GATEWAY_TOPICS.index(topic.decode())

@@ -1,1 +1,1 @@
-"""Setup commands: `doctor`, `scan`, `keys`, `limits`, `config`, `envelope`, `install-service`."""
+"""Implement the setup commands, such as `doctor`, `scan`, `keys`, `config` and `envelope`."""

@@ -1,6 +1,6 @@
-"""Run ``softfinger completion SHELL``: print a script that completes softfinger's arguments.
+"""Run ``softfinger completion SHELL``: print a shell completion script for softfinger.
 
-The script contains all arguments, so completing a word starts no process.
+The script contains all arguments, so completion does not start a process.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Yield all actions of a parser and of its subcommands."""
+    """Yield all actions of a parser and its subcommands."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Check a profile, or print the requested list, profile or reference.
 
-    Raises SettingsError for an unknown profile, section or key, or OSError.
+    Raises SettingsError for an unknown profile, section or key. Raises OSError for a file error.
     """
     if arguments.action == "check":
         return _check(arguments)
@@ -95,14 +95,14 @@ def _text(profile: Path) -> str:
 
 
 def subject(profile: Path) -> str:
-    """Return the first sentence of the comment at the start of a profile."""
+    """Return the first sentence of a profile's opening comment."""
     comment = itertools.takewhile(lambda line: line.startswith("#"), _text(profile).splitlines())
     words = " ".join(line[1:].strip() for line in comment if not line.startswith("#:"))
     return min((words.partition(mark)[0] for mark in (": ", ". ")), key=len)
 
 
 def _explained(what: str) -> str:
-    """Return the reference of a section, or of the keys named ``section.key`` or ``key``."""
+    """Return the reference text for a section, or for keys named ``section.key`` or ``key``."""
     if not what:
         return reference.profile()
     if what in reference.sections():

@@ -1,7 +1,7 @@
-"""Run ``softfinger doctor``: check ports, servos, boards and machine, and name fixes.
+"""Run ``softfinger doctor``: check ports, servos, boards and machine, and suggest fixes.
 
-Each check prints one line. This module handles arguments, order, printing and exit status; the
-checks are in :mod:`softfinger.daemon.diagnosis`.
+Each check prints one line. This module handles the arguments, the order of the checks, printing and
+the exit status. The checks are in :mod:`softfinger.daemon.diagnosis`.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
 def results(
     settings: Settings, fix: bool, save: Path | None = None, restore: Path | None = None
 ) -> Iterator[Finding]:
-    """Run all checks in the order of their dependencies, after the requested repairs."""
+    """Perform the requested repairs, then run all checks in the order of their dependencies."""
     ports = _ports(settings)
     for kind in BUILT_IN:
         yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))
@@ -129,7 +129,7 @@ def _register_files(
 
 
 def _ports(settings: Settings) -> list[tuple[str, str]]:
-    """Return (key, path) of every port that the scene needs; ports of plugins are unknown."""
+    """Return (key, path) for each port that the scene needs. Plugin ports are not included."""
     ports = []
     servos = backend("servos", settings.servos.backend)
     tactile = backend("tactile", settings.tactile.backend)
@@ -147,7 +147,7 @@ def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
         if repaired is not None:
             yield repaired
     servos = path == settings.servos.port
-    # A board sends on its own: the latency timer delays its frames but does not cause failures.
+    # A board sends frames without requests, so the latency timer only delays the frames.
     found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
     if found is not None:
         yield found

@@ -1,4 +1,7 @@
-"""Run ``softfinger envelope``: simulate which shapes, sizes, frictions and masses a hand holds."""
+"""Run ``softfinger envelope``: simulate which objects a hand can hold.
+
+The objects vary in shape, size, friction and mass.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +31,13 @@ from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.sweep import Sweep, add_sweep
 
 SHAPES = ("rectangle", "disc")
-SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # mm: width or diameter
+SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # mm, width or diameter
 FRICTIONS = (0.2, 0.4, 0.6, 0.8)
 MASSES = (0.05, 0.2, 0.5, 1.0, 2.0)  # kg
-_SETTLING_TIME = 3.0  # s for the grip to settle
-_LOAD_TIME = 1.0  # s in which the weight is applied
-_OBSERVATION_TIME = 1.0  # s of observation afterwards
-_LOAD_STEP_COUNT = 20  # steps in which the weight is applied
+_SETTLING_TIME = 3.0  # s, settling time of the grip
+_LOAD_TIME = 1.0  # s, ramp time of the weight
+_OBSERVATION_TIME = 1.0  # s, observation time under the full weight
+_LOAD_STEP_COUNT = 20  # steps of the weight ramp
 _TURN_MIN = math.radians(5.0)
 _SLIDE_MAX = 0.010  # m, displacement along the faces at which the object counts as lost
 _GRAVITY = 9.81  # m/s²
@@ -44,12 +47,12 @@ _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#7777
 class Cell(NamedTuple):
     """Result of one grasp."""
 
-    outcome: str  # a key of MEANING
-    turned: float  # largest rotation of the object [rad]
+    outcome: str  # key of MEANING
+    turned: float  # rad, maximum object rotation
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``envelope``."""
+    """Add the ``envelope`` arguments."""
     add_profile(parser)
     force = _between("a force above 0 N", 0.0, 1e9)
     parser.add_argument(
@@ -73,18 +76,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _between(what: str, low: float, high: float) -> Callable[[str], float]:
-    """Return a parser for numbers within bounds; ``low`` itself is allowed if it is not 0."""
+    """Return a parser for numbers within bounds; ``low`` itself is allowed unless it is 0."""
     return lambda text: number(text, what, low, high, includes_low=low > 0.0)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Simulate every grasp, print the map and write the requested files.
+    """Simulate all grasps, print the map and write the requested files.
 
     Raises
     ------
     SettingsError, SweepError, OSError
     MissingExtra
-        Without matplotlib or Dask.
+        If matplotlib or Dask is needed but not installed.
     """
     settings = profile(arguments)
     if arguments.plot:
@@ -92,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     shapes = tuple(arguments.shape or SHAPES)
     axes = (
         tuple(sorted(arguments.friction or FRICTIONS)),
-        tuple(sorted(arguments.mass or MASSES)),  # sorted, as the reader of the map requires
+        tuple(sorted(arguments.mass or MASSES)),  # The map reader requires sorted values.
         tuple(sorted(arguments.size or SIZES)),
     )
     print(
@@ -122,7 +125,7 @@ def sweep(
     axes: tuple[tuple[float, ...], ...],
     arguments: argparse.Namespace,
 ) -> Iterator[Cell]:
-    """Yield the result of each grasp; size varies fastest, then mass, friction and shape."""
+    """Yield the result of each grasp. Size varies fastest, then mass, friction and shape."""
     build_kernels(settings, print_event)
     journal = _journal(arguments.keep) if arguments.keep else None
     cases = list(itertools.product(shapes, *axes))
@@ -142,10 +145,10 @@ def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, 
 def grasped(
     settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
 ) -> Cell:
-    """Grasp an object on the table, then apply its weight so that it pulls out of the fingers.
+    """Grasp an object on the table, then apply its weight so that it pulls the object out.
 
     The daemon's settings contain the object's width or diameter ``size`` [m], friction and weight
-    (``mass`` in kg). They do not contain its shape: the daemon assumes a block.
+    (``mass`` [kg]), but not its shape. The daemon always assumes a block.
     """
     from softfinger.tools.simulated_daemon import SimulatedDaemon
 
@@ -171,7 +174,7 @@ def grasped(
         if hand.mode != "holding":
             return Cell(REFUSED, math.nan)
         before = hand.plant.object_pose.copy()
-        # Friction of the table opposes the load, so add it.
+        # Table friction opposes the load, so it is added to the load.
         pull = weight * (1.0 + settings.simulation.table_friction)
         for k in range(_LOAD_STEP_COUNT):
             load, phi = pull * (k + 1) / _LOAD_STEP_COUNT, float(hand.plant.object_pose[2])

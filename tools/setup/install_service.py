@@ -1,4 +1,4 @@
-"""Run ``softfinger install-service``: print a systemd unit or udev rules without enabling them."""
+"""Run ``softfinger install-service``: print a systemd unit or udev rules, without enabling them."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the unit or the rules; raise SettingsError if the user or profile does not exist."""
+    """Print the unit or the rules. Raises SettingsError if the user or profile does not exist."""
     rules = _file("70-softfinger.rules") if arguments.udev else ""
     print(rules or unit(arguments.config, arguments.user), end="")
     return 0
 
 
 def unit(config: Path | None, user: str) -> str:
-    """Return the unit's text; raise SettingsError if the user or profile does not exist."""
+    """Return the unit's text. Raises SettingsError if the user or profile does not exist."""
     words = [sys.executable, "-P", "-m", "softfinger", "run", "--no-task", "--log", "json"]
     if config is not None:
         if not find(config).is_file():
@@ -57,7 +57,7 @@ def _file(name: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """Quote a word of ExecStart: escape specifiers, variables and separators."""
+    """Quote one word in ExecStart: escape specifiers, variables and separators."""
     if any(ord(character) < 32 for character in word):
         raise SettingsError(f"{word!r}: control characters can't stand in a unit")
     word = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")

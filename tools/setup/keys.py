@@ -1,4 +1,4 @@
-"""Run ``softfinger keys FOLDER [CLIENT …]``: make keys for access from other machines."""
+"""Run ``softfinger keys FOLDER [CLIENT …]``: create keys for access from other machines."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make the keys; raise KeyFileError if that fails."""
+    """Create the keys. Raises KeyFileError."""
     for folder in make_keys(arguments.folder, arguments.clients):
         print(folder)
     return 0

@@ -1,4 +1,4 @@
-"""Run ``softfinger limits``: print a table of all limits with the numbers of a profile."""
+"""Run ``softfinger limits``: print a table of all limits with a profile's values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the table; raise SettingsError for invalid settings."""
+    """Print the table. Raises SettingsError for invalid settings."""
     settings = profile(arguments)
     from softfinger.daemon.safety.limits import LIMITS
 
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _values(settings: Settings, row: Limit) -> list[str]:
-    """Return the settings of a limit, each with the fraction of it that is the threshold."""
+    """Return a limit's settings, each with the fraction at which the limit applies."""
     share = "" if row.fraction == 1.0 else f"{row.fraction:g} × "
     return [f"{share}{key} = {_shown(_value(settings, key))}" for key in row.keys]
 

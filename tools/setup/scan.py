@@ -1,4 +1,4 @@
-"""Run ``softfinger scan [PORT …]``: find the servos and their baud rates, changing nothing."""
+"""Run ``softfinger scan [PORT …]``: find servos and their baud rates without changing them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Scan the ports and print a line for each servo; return 0 if at least one was found."""
+    """Scan the ports and print a line for each servo. Return 0 if a servo was found."""
     paths = arguments.ports or [path for path, _ in serial_ports()]
     if not paths:
         print("scan: this machine has no serial port; name one", file=sys.stderr)
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         for servo in found.servos:
             rates.setdefault(replace(servo, baud=0), []).append(str(servo.baud))
         for servo, at in rates.items():
-            # An emulated servo may answer at several rates; they are joined in one line.
+            # An emulated servo may reply at several rates, which are listed in one line.
             print(f"{path}: {servo.describe(', '.join(at))}", flush=True)
         for garbled in found.garbled:
             print(f"{path}: {garbled}\n  → {ONE_SERVO_ONLY}", flush=True)

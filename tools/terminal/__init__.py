@@ -1,1 +1,1 @@
-"""Terminal clients of the running daemon: `monitor`, `send` and `status`."""
+"""Implement the daemon's terminal clients: `monitor`, `send` and `status`."""

@@ -1,7 +1,7 @@
 """Draw pressure maps in a terminal with half-block characters.
 
-A half-block character shows two pixels, one above the other. A character cell is about twice as
-tall as wide, so the pixels are square.
+Each half-block character shows two pixels, one above the other. The pixels are square, because a
+character cell is about twice as tall as it is wide.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from rich.text import Span, Text
 
 FloatArray = NDArray[np.float64]
 
-LEVELS = 32  # number of colours; fewer colours give longer runs of one style and faster redraws
-SHADES = " ·░▒▓█"  # used on terminals with too few colours
+LEVELS = 32  # number of colours; with fewer colours, redraws are faster
+SHADES = " ·░▒▓█"  # for terminals with too few colours
 
-# Blue to yellow in equal steps of lightness, from dark to bright: the order is kept in greyscale
-# and for colour-blind users.
+# Lightness increases in equal steps from dark blue to bright yellow, so the order of the colours
+# also shows in greyscale and to colour-blind users.
 _ANCHORS = (
     (24, 18, 56),
     (50, 46, 110),
@@ -33,7 +33,7 @@ _ANCHORS = (
 
 
 def colour_map() -> list[tuple[int, int, int]]:
-    """Return the colours of the scale from zero to full, as (red, green, blue) in 0…255."""
+    """Return the scale's colours from zero to full scale, as (red, green, blue) in 0…255."""
     at = np.linspace(0.0, len(_ANCHORS) - 1.0, LEVELS)
     channels = [np.interp(at, range(len(_ANCHORS)), each) for each in zip(*_ANCHORS, strict=True)]
     return [(r, g, b) for r, g, b in np.rint(channels).T.astype(int).tolist()]
@@ -49,7 +49,7 @@ def _pair_style(top: int, bottom: int) -> Style:
 
 @lru_cache(maxsize=16)
 def _overlaps(cells: int, pixels: int) -> FloatArray:
-    """Return the overlap of each cell with each pixel of the same length; rows sum to 1."""
+    """Return the fraction of each pixel covered by each cell in one dimension; rows sum to 1."""
     edges = np.arange(pixels + 1) * (cells / pixels)
     low, high = edges[:-1, None], edges[1:, None]
     cell = np.arange(cells)[None, :]
@@ -59,16 +59,16 @@ def _overlaps(cells: int, pixels: int) -> FloatArray:
 
 
 def resample(grid: FloatArray, height: int, width: int) -> FloatArray:
-    """Resample ``grid`` [rows, cols] to [height, width] by area averaging, which keeps the mean."""
+    """Resample ``grid`` [rows, cols] to [height, width] by averaging areas, preserving the mean."""
     rows, cols = grid.shape
     result: FloatArray = _overlaps(rows, height) @ grid @ _overlaps(cols, width).T
     return result
 
 
 def fit(rows: int, cols: int, lines: int, columns: int, aspect: float = 1.0) -> tuple[int, int]:
-    """Return the largest (lines, columns) that fit into the box and keep the shape of the cells.
+    """Return the largest (lines, columns) that fit into the box and preserve the cell shape.
 
-    ``aspect`` is the height of a cell divided by its width.
+    ``aspect`` is a cell's height divided by its width.
     """
     slope = aspect * rows / cols
     width = min(columns, max(1, round(2 * lines / slope)))
@@ -77,15 +77,15 @@ def fit(rows: int, cols: int, lines: int, columns: int, aspect: float = 1.0) -> 
 
 
 def levels_of(pixels: FloatArray, full: float) -> NDArray[np.int64]:
-    """Return colour indices: 0 for values up to zero, LEVELS − 1 from ``full`` on."""
+    """Convert values to colour indices: 0 for values ≤ 0, LEVELS − 1 for values ≥ ``full``."""
     scaled = np.clip(np.nan_to_num(pixels / full), 0.0, 1.0)
     return np.rint(scaled * (LEVELS - 1)).astype(np.int64)
 
 
 def picture(grid: FloatArray, full: float, lines: int, columns: int, coloured: bool) -> list[Text]:
-    """Draw ``grid`` as ``lines`` of ``columns`` characters; y points up, so row 0 is at the bottom.
+    """Draw ``grid`` as ``lines`` of ``columns`` characters, with row 0 at the bottom.
 
-    ``full`` is the value shown in the brightest colour, or with the densest shade.
+    ``full`` is the value shown in the brightest colour or with the densest shade.
     """
     if not coloured:
         return [_shades(row) for row in levels_of(resample(grid, lines, columns), full)[::-1]]
@@ -94,7 +94,7 @@ def picture(grid: FloatArray, full: float, lines: int, columns: int, coloured: b
 
 
 def _runs(top: NDArray[np.int64], bottom: NDArray[np.int64]) -> Text:
-    """Return one line in which neighbouring characters of equal colours share a span."""
+    """Return one line in which adjacent characters of the same colours share a span."""
     changes = np.flatnonzero(np.diff(top) | np.diff(bottom)) + 1
     starts, styles = [0, *changes.tolist()], (top * LEVELS + bottom).tolist()
     spans = [
@@ -110,13 +110,13 @@ def _shades(levels: NDArray[np.int64]) -> Text:
 
 
 def colour_bar(columns: int, coloured: bool) -> Text:
-    """Draw the colour scale from zero to full in one line."""
+    """Draw the colour scale from zero to full scale in one line."""
     levels = levels_of(np.linspace(0.0, 1.0, columns), 1.0)
     return _runs(levels, levels) if coloured else _shades(levels)
 
 
 def round_up(value: float) -> float:
-    """Return the next round number at or above ``value`` > 0, as the end of a scale."""
+    """Round ``value`` > 0 up to the next round number, for the end of a scale."""
     decade = 10.0 ** np.floor(np.log10(value))
     for step in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0):
         if value <= step * decade * (1.0 + 1e-9):
@@ -125,17 +125,17 @@ def round_up(value: float) -> float:
 
 
 class FullScale:
-    """End of a colour scale that follows a signal's peak: up immediately, down with a delay."""
+    """Full-scale value that follows a signal's peak: up immediately, down after a delay."""
 
     def __init__(self, smallest: float, patience: float = 3.0) -> None:
         self._smallest = smallest
-        # s for which the peak must stay below the next smaller scale before the scale shrinks
+        # s, time for which the peak must stay below the next smaller scale before the scale shrinks
         self._patience = patience
         self._since: float | None = None
         self.value = smallest
 
     def follow(self, peak: float, now: float) -> float:
-        """Update the scale for a signal's maximum ``peak`` at ``now`` [s]; return its end."""
+        """Update the scale with the signal's ``peak`` at time ``now`` [s]; return its end."""
         end = max(self._smallest, round_up(peak)) if peak > 0.0 else self._smallest
         if end >= self.value:
             self.value = end

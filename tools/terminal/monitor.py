@@ -1,8 +1,8 @@
-"""Run ``softfinger monitor``, a live page of the hand in the terminal.
+"""Run ``softfinger monitor``, which shows a live page about the hand in the terminal.
 
-This module parses the arguments and runs the loop: it reads keys and signals and redraws the page,
-or prints plain lines if the output is not a terminal. `monitor_page` draws the page, `feed`
-collects its data.
+This module parses the arguments, handles keys and signals, and redraws the page. If the output is
+not a terminal, it prints plain lines. `stream_state` collects the data and `monitor_page` draws the
+page.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from softfinger.tools.terminal.status import describe
 from softfinger.tools.terminal.stream_state import Commander, StreamReader, StreamState, printable
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
-STEP_ANGLE = math.radians(5.0)  # rad, object rotation per press of an arrow key
+STEP_ANGLE = math.radians(5.0)  # rad, object rotation per arrow key press
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # (upper force limit [N], step below it [N])
-_ACCUMULATION_TIME = 1.0  # s, presses within this time accumulate
-_CONFIRMATION_TIME = 3.0  # s within which a second d confirms disarming
+_ACCUMULATION_TIME = 1.0  # s, time within which key presses add up
+_CONFIRMATION_TIME = 3.0  # s, time limit for the second d that confirms disarming
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
@@ -49,11 +49,11 @@ class HandKeys:
         self._commander = commander
         self._target: float | None = None  # object angle [rad]
         self._chosen = math.nan  # grasp force [N]
-        self._pressed = -math.inf  # time of the last force change made here
-        self._asked = -math.inf  # time of the first d during a grip
+        self._pressed = -math.inf  # time of this page's last force change
+        self._asked = -math.inf  # time of the first d key during a grip
 
     def press(self, key: str, now: float) -> None:
-        """Send the command of a key; ignore other keys."""
+        """Send the command assigned to a key; ignore unassigned keys."""
         if key in ("left", "right"):
             self._rotate(STEP_ANGLE if key == "right" else -STEP_ANGLE, now)
         elif key in "+=-_":
@@ -68,14 +68,14 @@ class HandKeys:
             self._commander.send(now, _COMMAND_KEYS[key], _COMMAND_KEYS[key])
 
     def force(self, now: float) -> float:
-        """Return the force of the next grasp, or the requested force of the current grip [N].
+        """Return the current grip's requested force, or the force for the next grasp [N].
 
         Returns NaN if the force is unknown.
         """
         feed = self._feed
         if not self._gripping or self._adding(now):
             return feed.force_default if math.isnan(self._chosen) else self._chosen
-        # The grip may have been commanded before this page was started.
+        # The grip command may have been sent before this page was opened.
         candidates = (feed.commanded, feed.state.goal_force, self._chosen)
         return next((force for force in candidates if not math.isnan(force)), math.nan)
 
@@ -84,13 +84,13 @@ class HandKeys:
         return self._feed.mode in _GRIPPING
 
     def _adding(self, now: float) -> bool:
-        """Return True shortly after a force key, while the chosen force is not yet published."""
+        """Return True shortly after a force key, when the stream may not have the new force yet."""
         reply = self._commander.reply
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
         return now - self._pressed < _ACCUMULATION_TIME and not refused
 
     def _change_force(self, sign: float, now: float) -> None:
-        """Change the force by one step; a current grip is changed immediately."""
+        """Change the force by one step, and apply it to the current grip, if any."""
         present = self.force(now)
         if not math.isfinite(present):
             self._commander.refuse(now, "grasp: the hand's settings are not known yet")
@@ -111,7 +111,7 @@ class HandKeys:
             self._commander.send(now, label, "grasp", force=self._chosen)
 
     def _rotate(self, step: float, now: float) -> None:
-        """Rotate by one step from the last target, not the current angle: presses add up."""
+        """Rotate by one step from the last target, not from the current angle; presses add up."""
         reply, pose = self._commander.reply, self._feed.state.object
         refused = reply is not None and not reply.ok
         if self._target is None or refused or self._feed.mode not in ("rotating", "holding"):
@@ -124,9 +124,9 @@ class HandKeys:
         self._commander.send(now, label, "rotate", angle=self._target)
 
 
-REDRAW_INTERVAL = 0.1  # s, shortest time between redraws
-PLAIN_READ_INTERVAL = 0.1  # s between reads of the stream in plain mode
-PLAIN_LINE_INTERVAL = 1.0  # s between plain lines
+REDRAW_INTERVAL = 0.1  # s, minimum time between redraws
+PLAIN_READ_INTERVAL = 0.1  # s, time between stream reads in plain mode
+PLAIN_LINE_INTERVAL = 1.0  # s, time between plain lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -140,11 +140,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until q, a signal, the end of the duration or of the daemon; return 1 without a stream.
+    """Run until the q key, a signal, the duration's end or the daemon's end.
 
-    Raises
-    ------
-    KeyFileError
+    Returns 1 if no stream was received. Raises KeyFileError.
     """
     state, commands = args.address
     if args.lifeline is not None:
@@ -174,7 +172,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lower_priority() -> None:
-    """Reset the real-time priority inherited from the daemon."""
+    """Reset the real-time priority that was inherited from the daemon."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):
@@ -189,14 +187,14 @@ def _is_page(args: argparse.Namespace) -> bool:
 
 
 class _MonitorStop(StopCondition):
-    """Stop condition of the monitor: also suspension, and no stream with ``--no-wait``."""
+    """The monitor's stop condition, which also handles suspension and ``--no-wait``."""
 
     signals = available_signals("SIGINT", "SIGTERM", "SIGHUP")
 
     def __init__(self, args: argparse.Namespace) -> None:
         super().__init__(args.duration, args.lifeline)
         self.begin()
-        self.why = ""  # printed after the terminal is restored
+        self.why = ""  # message to be printed once the terminal is restored
         self.suspend = False
         self.terminal: Terminal | None = None
         self._no_wait: bool = args.no_wait
@@ -220,7 +218,7 @@ class _MonitorStop(StopCondition):
         self.wake()
 
     def watch(self, feed: StreamState, address: str, now: float) -> None:
-        """Request the end if ``--no-wait`` is given and there is no stream."""
+        """Request the end if there is no stream and ``--no-wait`` was given."""
         if not self._no_wait or self.is_met:
             return
         status = feed.status(now)
@@ -244,11 +242,11 @@ def _run_page(
         while not ending.is_met:
             with terminal:
                 _page_loop(page, terminal, keyboard, subscriber, commander, ending)
-            if ending.suspend and not ending.is_met:  # Ctrl-Z: return the terminal to the shell
+            if ending.suspend and not ending.is_met:  # After Ctrl-Z, the shell gets the terminal.
                 ending.suspend = False
                 os.kill(os.getpid(), signal.SIGSTOP)
     except TerminalGone:
-        pass  # the terminal was closed
+        pass  # The terminal was closed.
 
 
 def _page_loop(
@@ -267,7 +265,7 @@ def _page_loop(
         for each in ending.wait_readable(due - time.monotonic(), *keyboards):
             typed = _read(each)
             if not typed:
-                keyboard = None  # the keyboard was closed; keep showing the page
+                keyboard = None  # The keyboard was closed; continue without it.
             for key in keys.decode(typed):
                 if key == "q":
                     return ending.end()
@@ -313,8 +311,8 @@ def _run_plain(address: str, subscriber: StreamReader, ending: _MonitorStop) -> 
                 due = now + PLAIN_LINE_INTERVAL
                 _say(f"{_clock()} {printable(describe(feed.state))}")
         return
-    # The reader has closed the pipe. Python flushes its output again at exit; send that to
-    # /dev/null.
+    # The reader has closed the pipe. Python flushes its output again at exit, so redirect the
+    # output to /dev/null.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

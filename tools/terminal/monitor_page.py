@@ -1,8 +1,8 @@
-"""Lay out the page of ``softfinger monitor`` as lines of styled text.
+"""Lay out the ``softfinger monitor`` page as lines of styled text.
 
 Lengths are in mm, angles in degrees, energies in mJ, pressures in kPa. The left finger's map is on
-the left, the right finger's map on the right, and the numbers of both fingers and of the object are
-in between. Widths are terminal columns: a wide character takes two.
+the left and the right finger's map on the right. The numbers for both fingers and the object are in
+between. Widths are in terminal columns; a wide character takes two columns.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from softfinger.tools.terminal.text_layout import (
     wrapped,
 )
 
-WIDTH, HEIGHT = 80, 24  # smallest size into which everything fits
-CENTRE = 34  # width of the numbers, columns
-MAP_LINES = 11  # height of each map at the smallest page size
+WIDTH, HEIGHT = 80, 24  # minimum page size, columns and lines
+CENTRE = 34  # columns, width of the numbers
+MAP_LINES = 11  # height of each map at the minimum page size
 OLD_AGE = 1.0  # s, age above which a frame is marked as old
-REPLY_TIME = 12.0  # s for which a reply is shown
+REPLY_TIME = 12.0  # s, time for which a reply is shown
 DELAY_MIN = 0.05  # s, delay above which a message is shown
 
 GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
@@ -85,15 +85,15 @@ _ROWS = (
 
 @dataclass
 class MonitorPage:
-    """Page that shows a feed; ``now`` is monotonic time [s]."""
+    """Page that shows a `StreamState`; ``now`` is monotonic time [s]."""
 
     feed: StreamState
     address: str
-    coloured: bool = True  # the terminal has more than 16 colours
-    keys: bool = True  # a keyboard is available
-    guarded: bool = False  # subscribed with keys
-    force: float = math.nan  # N, force that the grasp key requests
-    explains: bool = False  # show the meanings of the numbers in place of the numbers
+    coloured: bool = True  # True if the terminal has more than 16 colours
+    keys: bool = True  # True if a keyboard is available
+    guarded: bool = False  # True if subscribed with access keys
+    force: float = math.nan  # N, force requested by the grasp key
+    explains: bool = False  # True to show explanations instead of the numbers
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
 
     def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
@@ -168,7 +168,7 @@ class MonitorPage:
         return truncated(Text(f" {why_invalid(feed.state)}", WARN), width)
 
     def _body(self, width: int, lines: int, now: float) -> list[Text]:
-        """Draw titles, both maps with the numbers between them, their scale and the object."""
+        """Draw the titles, both maps, the numbers between them, the colour scale and the object."""
         box = min(2 * lines, (width - CENTRE - 2) // 2)
         frames = self.feed.frames
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
@@ -187,7 +187,7 @@ class MonitorPage:
     def _map(
         self, name: str, lines: int, box: int, full: float, now: float, counts: bool
     ) -> list[Text]:
-        """Draw title, ``lines`` of map and scale, each at most ``box`` columns wide."""
+        """Draw the title, a map with ``lines`` lines and its scale, up to ``box`` columns wide."""
         frame = self.feed.frames.get(name)
         title = Text(name.upper(), FINGER_STYLES[name])
         picture = [Text() for _ in range(lines)]
@@ -211,7 +211,7 @@ class MonitorPage:
         return [title, *picture, Text.assemble(("0 ", DIM), bar, (end, DIM))]
 
     def _numbers(self, lines: int) -> list[Text]:
-        """Draw heads, one row per quantity and the object, vertically centred in ``lines``."""
+        """Draw the column heads, a row per quantity and the object, centred in ``lines`` lines."""
         rows = [self._row(*row) for row in _ROWS]
         between = [Text()] if lines > len(rows) + 3 else []
         block = [self._heads(), *between, *rows, *(each.copy() for each in between), self._object()]
@@ -233,7 +233,7 @@ class MonitorPage:
             value, style = getattr(finger, key), "default" if finger.valid else DIM
             if key == "temperature":
                 style = BAD if finger.time_to_limit < self.feed.heat_warning_time else style
-                value = value or math.nan  # 0 means unknown
+                value = value or math.nan  # A value of 0 means unknown.
             spread = factor * getattr(finger, std) if std else math.nan
             shown = format_aligned(factor * value, decimals)
             beside = "" if math.isnan(spread) else "±" + format_narrow(spread)
@@ -254,7 +254,7 @@ class MonitorPage:
         )
 
     def _ticks(self) -> Text:
-        """Return rate and overruns, then median, tail and maximum of the times of all ticks."""
+        """Draw the rate, the overruns, and the median, tail and maximum of all tick durations."""
         times, overruns = self.feed.times, self.feed.state.overruns
         rate = math.nan if times is None else times.rates.tick
         line = Text(f" tick {format_value(rate, 0)} Hz").append("  overruns ", DIM)
@@ -269,7 +269,7 @@ class MonitorPage:
         return line.append(" µs", DIM)
 
     def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
-        """Draw commander and last reply, then texts too long for their line, then events."""
+        """Draw the commander, the last reply, texts that did not fit their line, and events."""
         who = truncated(Text(self.feed.commander(now)), 16)
         title = Text(f"events ─ {who} commands the hand" if who else "events")
         full: list[Text] = []
@@ -300,7 +300,7 @@ class MonitorPage:
         return lines + [Text() for _ in range(count - len(lines))]
 
     def _footer(self, width: int) -> Text:
-        """Name the keys; a narrow terminal shows only those that are useful in the current mode."""
+        """List the keys. On a narrow terminal, list only those useful in the current mode."""
         if not self.keys:
             return Text(" no keyboard here: commands go through softfinger send", DIM)
         force = f"{self.force:.3g} N" if math.isfinite(self.force) else "N"
@@ -329,9 +329,9 @@ def _named(keys: dict[str, str]) -> Text:
 
 
 def _heights(width: int, height: int) -> tuple[int, int]:
-    """Return the number of lines of each map and of the events for a page of this size."""
+    """Return the number of lines for each map and for the events at this page size."""
     spare = height - HEIGHT
-    widest = (width - CENTRE - 2) // 4  # a map is twice as many columns wide as lines high
+    widest = (width - CENTRE - 2) // 4  # A map has twice as many columns as lines.
     maps = max(MAP_LINES, min(widest, MAP_LINES + (2 * spare + 2) // 3))
     return maps, 5 + spare - (maps - MAP_LINES)
 

@@ -18,7 +18,7 @@ from softfinger.tools.arguments import add_daemon, client_keys, command_address,
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
-_UNITS = {  # units allowed for each key; a number without a unit is in SI units
+_UNITS = {  # allowed units per key; numbers without a unit are in SI units
     "force": {"N": 1.0, "mN": 1e-3},
     **dict.fromkeys(("angle", "left", "right"), _ANGLES),
 }
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the command and print the reply; return 1 if the command was refused."""
+    """Send the command and print the reply. Return 1 if the command was refused."""
     request: dict[str, Any] = {"command": arguments.command}
     if arguments.client:
         request["client"] = arguments.client
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def si_numbers(words: list[str]) -> dict[str, float]:
-    """Parse ``key=value`` words to SI numbers; raise ValueError with the word and the reason."""
+    """Parse ``key=value`` words into SI numbers. Raises ValueError with the word and the reason."""
     numbers = {}
     for key, text in _pairs(words):
         found = _NUMBER.fullmatch(text)
@@ -82,7 +82,7 @@ def si_numbers(words: list[str]) -> dict[str, float]:
 
 
 def _pairs(words: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield keys and their values; ``angle=8 deg`` may be given as two words."""
+    """Yield keys and values. A unit may be a separate word, as in ``angle=8 deg``."""
     text = " ".join(words)
     for pair in re.split(r"\s+(?=\S+=)", text) if words else ():
         key, equals, value = pair.partition("=")

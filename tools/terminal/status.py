@@ -1,4 +1,4 @@
-"""Run ``softfinger status``: describe the state of the running hand in one line."""
+"""Run ``softfinger status``: describe the running hand's state in one line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the next state; return 1 if the hand has a fault, 2 if no state arrives."""
+    """Print the next state. Return 1 if the hand has a fault, 2 if no state arrives."""
     try:
         with Hand(arguments.address, keys=arguments.keys) as hand:
             state = hand.state()

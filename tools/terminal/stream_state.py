@@ -1,7 +1,7 @@
-"""Collect the live page's data from the daemon's sockets; drawing is done elsewhere.
+"""Collect the live page's data from the daemon's sockets, without drawing it.
 
-Message contents are not trusted: a missing or wrong-typed field becomes NaN or empty, and a message
-that cannot be decoded is counted and skipped.
+Message contents are not trusted. Fields that are missing or have the wrong type become NaN or
+empty. Messages that cannot be decoded are counted and skipped.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-RECENT_TIME = 3.0  # s, window over which waits for a busy machine are summed and shown
-EVENT_COUNT_MAX = 200  # number of events kept
-GLOSSARY = (  # meanings of the words on the pages
+RECENT_TIME = 3.0  # s, time window for the sum of waits for a busy machine
+EVENT_COUNT_MAX = 200  # number of stored events
+GLOSSARY = (  # meanings of the terms on the pages
     ("d", "displacement of the object's face into the tip"),
     ("θ", "tilt of the object's face against the tip"),
     ("force", "F(d, θ), contact force on the tip, normal to the face"),
@@ -53,12 +53,12 @@ GLOSSARY = (  # meanings of the words on the pages
 )
 # Fraction of the requested force above which the grip is reported as raised.
 _INCREASED_RATIO = 1.01
-_DRAIN_COUNT_MAX = 4000  # messages read per call, so that a flood of messages cannot block drawing
-_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid is 131 kB
+_DRAIN_COUNT_MAX = 4000  # messages read per call, limited so that a flood cannot block drawing
+_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid has 131 kB
 
 
 def field(record: object, *path: str) -> Any:
-    """Return the value at ``path`` in nested maps; None if it is missing."""
+    """Return the value at ``path`` in nested maps, or None if it is missing."""
     for key in path:
         if not isinstance(record, dict):
             return None
@@ -67,7 +67,7 @@ def field(record: object, *path: str) -> Any:
 
 
 def number(record: object, *path: str) -> float:
-    """Return the number at ``path``; NaN if it is missing."""
+    """Return the number at ``path``, or NaN if it is missing."""
     value = field(record, *path)
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
@@ -75,7 +75,7 @@ def number(record: object, *path: str) -> float:
 
 
 def text(record: object, *path: str) -> str:
-    """Return the text at ``path`` without control characters, which would reach the terminal."""
+    """Return the string at ``path``, without terminal control characters."""
     value = field(record, *path)
     return printable(value) if isinstance(value, str) else ""
 
@@ -86,17 +86,17 @@ def printable(value: str) -> str:
 
 
 class ShownFrame(NamedTuple):
-    """Tactile frame in the form in which the page draws it."""
+    """Tactile frame, prepared for drawing."""
 
-    arrived: float  # monotonic s
-    scale: float  # Pa per count, NaN when unknown
-    grid: NDArray[np.float64]  # [rows, cols] pressures [Pa], or counts if the scale is unknown
-    aspect: float  # height of a cell divided by its width
+    arrived: float  # monotonic time [s]
+    scale: float  # Pa per count, NaN if unknown
+    grid: NDArray[np.float64]  # pressures [Pa], or counts if the scale is unknown; [rows, cols]
+    aspect: float  # cell height divided by cell width
     source: schema.TactileFrame
 
 
 class ShownEvent(NamedTuple):
-    """One event of ``hand/event``."""
+    """One ``hand/event``, prepared for drawing."""
 
     timestamp: float  # Unix time [s], NaN if unknown
     level: str
@@ -112,32 +112,31 @@ class ShownEvent(NamedTuple):
 
 
 class StreamState:
-    """Process the stream's messages and keep the data that a page shows.
+    """Process stream messages and store the data that a page shows.
 
-    ``now`` is monotonic time [s] in all methods. ``events`` are sorted by the time at which they
-    happened; this differs from the order of arrival after a late subscription. `news` returns
-    events in the order of arrival.
+    In all methods ``now`` is monotonic time [s]. ``events`` are sorted by time of occurrence. After
+    a late subscription this differs from the order of arrival, in which `news` returns them.
     """
 
     def __init__(self) -> None:
         self.state = read(schema.HandState, None)
         self.state_time = -math.inf
-        self.mode = self.fault = ""  # of the last state
+        self.mode = self.fault = ""  # from the last state
         self.frames: dict[str, ShownFrame] = {}
         self.events: list[ShownEvent] = []
         self._news: deque[ShownEvent] = deque(maxlen=EVENT_COUNT_MAX)
         self._event_times: deque[tuple[float, float]] = deque(maxlen=2 * EVENT_COUNT_MAX)
-        self.times: schema.LoopStatistics | None = None  # statistics of all ticks so far
-        # s to a servo's temperature limit below which a warning is shown
+        self.times: schema.LoopStatistics | None = None  # statistics for all ticks so far
+        # s, time to a servo's temperature limit, below which a warning is shown
         self.heat_warning_time = 0.0
-        self._lease_holder = "", -math.inf  # holder of the commander's lease, end of the lease
-        self._lease = math.nan  # s
-        self.commanded = math.nan  # N, force of the last grasp command of any client
-        self.force_default = math.nan  # N, force of a grasp command without a force
-        self.force_limit = math.inf  # N, highest grip force that a command may request
+        self._lease_holder = "", -math.inf  # holder of the command lease, end of the lease [s]
+        self._lease = math.nan  # s, lease duration
+        self.commanded = math.nan  # N, force in the last grasp command from any client
+        self.force_default = math.nan  # N, force used if a grasp command has none
+        self.force_limit = math.inf  # N, maximum grip force for commands
         self.skipped_count = 0
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
-        self._period = 0.0  # s between states, smoothed
+        self._period = 0.0  # s, smoothed time between states
         self.topics: dict[bytes, Callable[[Any, float], None]] = {
             schema.STATE: self._read_state,
             schema.TACTILE: self._read_frame,
@@ -155,7 +154,7 @@ class StreamState:
             self.skipped_count += 1
 
     def process(self, topic: bytes, record: dict[str, Any], now: float) -> None:
-        """Process one message that is already unpacked."""
+        """Process one unpacked message."""
         try:
             if topic in self.topics:
                 self.topics[topic](read(schema.TOPICS[topic].record, record), now)
@@ -164,7 +163,7 @@ class StreamState:
 
     def _read_state(self, state: schema.HandState, now: float) -> None:
         before = self.state
-        if state.seq < before.seq:  # the daemon was restarted
+        if state.seq < before.seq:  # The daemon was restarted.
             self._waits.clear()
             self.frames.clear()
             self._period = 0.0
@@ -192,8 +191,8 @@ class StreamState:
         )
 
     def _read_event(self, event: schema.Event, _: float) -> None:
-        # A repeated event, sent for a late subscriber, keeps its original seq and time. An event of
-        # another daemon has a different time.
+        # An event that is repeated to a late subscriber has its original seq and time. An event
+        # from another daemon has a different time.
         name = event.seq, event.timestamp
         if event.again and name in self._event_times:
             return
@@ -213,7 +212,7 @@ class StreamState:
         self.times = times
 
     def _read_command(self, answered: schema.AnsweredCommand, now: float) -> None:
-        """Record the commanding client, and show a refused command as an event."""
+        """Store the commanding client, and show a refused command as an event."""
         client = printable(answered.client)
         if answered.again:
             return
@@ -240,18 +239,18 @@ class StreamState:
         self.heat_warning_time = 0.0 if math.isnan(warm) else warm
 
     def news(self) -> list[ShownEvent]:
-        """Return the events received since the last call."""
+        """Return the events that arrived since the last call."""
         fresh = list(self._news)
         self._news.clear()
         return fresh
 
     def commander(self, now: float) -> str:
-        """Return the holder of the commander's lease; empty if there is none or it is unnamed."""
+        """Return the name of the client that holds the command lease, or an empty string."""
         client, until = self._lease_holder
         return client if now < until else ""
 
     def grip(self) -> str:
-        """Return a description of the grip's goal; empty if there is no grip."""
+        """Describe the grip's goal; return an empty string without a grip."""
         force, angle = self.state.goal_force, math.degrees(self.state.goal_angle)
         if not math.isfinite(force):
             return ""
@@ -261,7 +260,7 @@ class StreamState:
         return f"grip: goal {force:.1f} N{raised}{turned}"
 
     def age(self, now: float) -> float:
-        """Return the time since the last state [s]; infinite before the first."""
+        """Return the time since the last state [s], or infinity before the first state."""
         return now - self.state_time
 
     def status(self, now: float) -> str:
@@ -274,19 +273,19 @@ class StreamState:
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
 
     def waited(self, now: float) -> float:
-        """Return the time that a simulated hand recently waited for a busy machine [s]."""
+        """Return the time for which a simulated hand recently waited for a busy machine [s]."""
         while self._waits and self._waits[0][0] < now - RECENT_TIME:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)
 
     @property
     def rate(self) -> float:
-        """Number of states per second; NaN if unknown."""
+        """Number of states per second, or NaN if unknown."""
         return 1.0 / self._period if self._period else math.nan
 
 
 class StreamReader:
-    """Subscriber socket that passes all waiting messages to a feed."""
+    """Subscriber socket that passes all queued messages to a `StreamState`."""
 
     def __init__(self, context: zmq.Context[Any], address: str, feed: StreamState) -> None:
         self.feed = feed
@@ -298,7 +297,7 @@ class StreamReader:
 
 
 class ShownReply(NamedTuple):
-    """Reply to a command, as the page shows it."""
+    """Reply to a command, prepared for drawing."""
 
     at: float
     ok: bool
@@ -307,26 +306,26 @@ class ShownReply(NamedTuple):
 
 @dataclass(slots=True)
 class _Pending:
-    """Command that has not been answered yet."""
+    """Command whose reply has not arrived yet."""
 
     label: str
     socket: zmq.Socket[bytes]
     attempts: Attempts
     sent: float
-    late: dict[str, Any] | None = None  # "too late" reply, kept until the command is sent again
-    again_at: float = 0.0  # time at which it is sent again
-    warned: bool = False  # a message about the missing answer was shown
+    late: dict[str, Any] | None = None  # refusal as late, stored until the command is sent again
+    again_at: float = 0.0  # time of the next attempt
+    warned: bool = False  # True once a message about the missing reply was shown
 
 
 class Commander:
-    """Send commands without waiting for their replies; ``reply`` holds the newest reply.
+    """Send commands without waiting for replies; ``reply`` is the newest reply.
 
-    Each command uses its own request socket, so a missing answer does not delay other commands. If
-    the daemon runs on this machine under the same user, a stop bypasses the requests of all
-    clients. It is answered at the next tick, and the wait for a stalled daemon is short.
+    Each command uses its own request socket, so a missing reply does not delay other commands. If
+    the same user runs the daemon on this machine, a stop bypasses the requests of all clients. The
+    daemon replies on the next tick. If the daemon is stalled, the wait for this reply is short.
     """
 
-    OPEN_LIMIT = 8  # number of open commands; further commands except stop are dropped
+    OPEN_LIMIT = 8  # maximum number of open commands; others are dropped, except stop
 
     def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
         self._context = context
@@ -336,7 +335,7 @@ class Commander:
         self.reply: ShownReply | None = None
 
     def send(self, now: float, label: str, command: str, **fields: float) -> None:
-        """Send ``command`` with ``fields``; show its reply under ``label``."""
+        """Send ``command`` with ``fields``; label its reply with ``label``."""
         if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
             self.refuse(now, f"{label}: dropped, the daemon doesn't answer")
             return
@@ -359,7 +358,7 @@ class Commander:
         self.reply = ShownReply(now, False, why)
 
     def collect(self, now: float) -> None:
-        """Process the replies received, and close commands whose reply is overdue."""
+        """Process received replies, and close commands whose reply is overdue."""
         for each in list(self._pending):
             if each.late is not None:
                 if now < each.again_at:
@@ -367,7 +366,7 @@ class Commander:
                 if each.attempts.remaining():
                     each.late = None
                     each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
-                else:  # the process was suspended in between
+                else:  # The process was suspended in the meantime.
                     self._end(each, now, each.late)
                 continue
             try:
@@ -401,11 +400,11 @@ class Commander:
 
 
 def judge(now: float, label: str, record: Any) -> ShownReply:
-    """Convert the daemon's answer to the command shown as ``label`` into a reply for the page."""
+    """Convert the daemon's reply into a reply for the page, labelled with ``label``."""
     if field(record, "ok") is True:
         if text(record, "torque_off") == "unconfirmed":
             return ShownReply(now, False, f"{label}: {UNCONFIRMED_TEXT}")
         return ShownReply(now, True, f"{label}: ok")
     why = text(record, "error") or "an answer that can't be read"
-    named = why.split(":")[0] == label.split()[0]  # the daemon's message already names the command
+    named = why.split(":")[0] == label.split()[0]  # True if the message names the command
     return ShownReply(now, False, why if named else f"{label}: {why}")

@@ -1,7 +1,6 @@
-"""Control the terminal of a full-screen page: screen modes, key decoding, output, and restoring.
+"""Control the terminal for a full-screen page: screen modes, key decoding, output, restoring.
 
-A redraw writes only the lines that changed, in one write. This is fast over ssh and does not
-flicker.
+A redraw sends all changed lines in a single write, which is fast over ssh and avoids flicker.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ with contextlib.suppress(ModuleNotFoundError):  # Windows supports only `monitor
     import tty
 
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, bracketed paste
-_LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # CAN ends an incomplete sequence
-_HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # synchronised update, where the terminal supports it
+_LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # begins with CAN to end a partial sequence
+_HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # synchronised update, if supported by the terminal
 
 _COLOUR_SYSTEMS = {
     "truecolor": ColorSystem.TRUECOLOR,
@@ -37,39 +36,39 @@ _COLOUR_SYSTEMS = {
 _ARROWS = {b"D": "left", b"C": "right"}
 _KEY = re.compile(
     rb"\x1b\[200~(?s:.)*?\x1b\[201~"  # a paste
-    rb"|(?P<part>\x1b(\[(200~(?s:.)*|[0-?]*[ -/]*)|O)?\Z)"  # incomplete; the rest is still to come
+    rb"|(?P<part>\x1b(\[(200~(?s:.)*|[0-?]*[ -/]*)|O)?\Z)"  # an incomplete sequence
     rb"|\x1b[\[O](?P<arrow>[CD])"
-    rb"|\x1b(\[[0-?]*[ -/]*[@-~]|O(?s:.)|(?s:.))"  # a sequence that is not used here
+    rb"|\x1b(\[[0-?]*[ -/]*[@-~]|O(?s:.)|(?s:.))"  # an unused sequence
     rb"|(?P<character>[ -~])"
     rb"|(?s:.)"
 )
 
 
 class TerminalGone(SoftfingerError):
-    """The terminal cannot be written to, or a signal interrupted a blocked write."""
+    """The terminal is not writable, or a signal interrupted a blocked write."""
 
 
 class KeyDecoder:
-    """Decode a terminal's bytes to names of keys, ignoring pasted text."""
+    """Decode a terminal's bytes into key names, and ignore pasted text."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def decode(self, data: bytes) -> list[str]:
-        """Return the keys in ``data``: ``left``, ``right`` or the character itself."""
+        """Return the key names in ``data``: ``left``, ``right`` or the typed character."""
         keys = list(_KEY.finditer(self._rest + data))
         self._rest = keys[-1]["part"] or b"" if keys else b""
         known = (_ARROWS.get(key["arrow"]) or (key["character"] or b"").decode() for key in keys)
         return [key for key in known if key]
 
     def settle(self) -> None:
-        """Drop an incomplete key when no more bytes are waiting, e.g. after a single Escape."""
+        """Drop an incomplete key if no more bytes are queued, for example after a single Escape."""
         if not self._rest.startswith(b"\x1b[200~"):
             self._rest = b""
 
 
 class Terminal:
-    """Context in which the page controls the terminal; the terminal is restored afterwards."""
+    """Context manager that gives the page control of the terminal and restores it afterwards."""
 
     def __init__(self, output: int, keyboard: int | None, suspendable: bool = True) -> None:
         self._output = output
@@ -83,13 +82,13 @@ class Terminal:
         self._console = Console()
         name = None if self._console.no_color else self._console.color_system
         self._colours = _COLOUR_SYSTEMS.get(name) if name else None
-        self.coloured = name in ("truecolor", "256")  # 16 colours are too few for a map
+        self.coloured = name in ("truecolor", "256")  # 16 colours are too few for a map.
 
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
             self._attributes = termios.tcgetattr(self._keyboard)
-            tty.setcbreak(self._keyboard)  # also discards keys typed before
-            if not self._suspendable:  # Ctrl-Z would also stop the daemon, with the torque on
+            tty.setcbreak(self._keyboard)  # This also discards keys that were typed earlier.
+            if not self._suspendable:  # Ctrl-Z would also suspend the daemon with torque on.
                 ours = termios.tcgetattr(self._keyboard)
                 ours[6][termios.VSUSP] = b"\0"
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, ours)
@@ -104,12 +103,12 @@ class Terminal:
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError, termios.error, TerminalGone):
             if self._attributes is not None and self._keyboard is not None:
-                # Do not wait for the output to drain: this would block on a stopped terminal.
+                # Do not wait for the output to drain, because a stopped terminal would block.
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, self._attributes)
         with contextlib.suppress(OSError, termios.error, TerminalGone):
-            if self._stuck:  # discard the rest of the page
+            if self._stuck:  # Discard the rest of the page.
                 termios.tcflush(self._output, termios.TCOFLUSH)
-            # Resume a terminal stopped by Ctrl-S; otherwise the next write blocks.
+            # Resume a terminal that was stopped by Ctrl-S, because the next write would block.
             termios.tcflow(self._output, termios.TCOON)
             self._write(_LEAVE)
 
@@ -123,7 +122,7 @@ class Terminal:
         return size.columns or 80, size.lines or 24
 
     def draw(self, lines: Sequence[Text]) -> None:
-        """Show ``lines``, each exactly as wide as the terminal."""
+        """Show ``lines``, which must be exactly as wide as the terminal."""
         output = []
         if (size := self.size()) != self._size:
             self._size = size

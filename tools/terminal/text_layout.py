@@ -1,6 +1,6 @@
-"""Format numbers and lines for a page of fixed width.
+"""Format numbers and lines for a fixed-width page.
 
-Widths are terminal columns: a wide character takes two.
+Widths are in terminal columns; a wide character takes two columns.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ DIM = "#8b929c"
 
 
 def plain_table(*, heads: bool = True) -> Table:
-    """Return a table without rules, with two blank columns between its columns."""
+    """Create a table without rules, whose columns are separated by two blanks."""
     return Table(box=None, padding=(0, 2, 0, 0), show_header=heads)
 
 
 def table_text(table: Table, width: int) -> str:
-    """Return a table as text without colours, at most ``width`` columns wide."""
+    """Convert a table to uncoloured text with a maximum width of ``width`` columns."""
     console = Console(width=width, highlight=False, markup=False, color_system=None)
     with console.capture() as printed:
         console.print(table)
@@ -29,13 +29,13 @@ def table_text(table: Table, width: int) -> str:
 
 
 def truncated(line: Text, columns: int) -> Text:
-    """Shorten ``line`` to at most ``columns`` columns, with an ellipsis at the cut."""
+    """Truncate ``line`` to at most ``columns`` columns, with an ellipsis at the end."""
     line.truncate(max(columns, 0), overflow="ellipsis")
     return line
 
 
 def wrapped(line: Text, columns: int) -> list[Text]:
-    """Wrap ``line`` to ``columns`` columns, indented by one; return the first two lines."""
+    """Wrap ``line`` to ``columns`` columns, indented by one column; return the first two lines."""
     lines = line.wrap(Console(), columns)[:2]
     for each in lines:
         each.pad_left(1)
@@ -43,18 +43,18 @@ def wrapped(line: Text, columns: int) -> list[Text]:
 
 
 def justified(left: Text, right: Text, width: int) -> Text:
-    """Place ``left`` and ``right`` at the two ends of ``width`` columns."""
+    """Place ``left`` and ``right`` at the ends of a line with ``width`` columns."""
     return Text.assemble(left, " " * max(1, width - left.cell_len - right.cell_len), right)
 
 
 def centred(line: Text, width: int) -> Text:
-    """Centre ``line`` in ``width`` columns, without padding at its end."""
+    """Centre ``line`` in ``width`` columns, without trailing blanks."""
     line.pad_left((width - line.cell_len) // 2)
     return line
 
 
 def rule(width: int, title: Text, note: Text | None = None) -> Text:
-    """Return a horizontal rule with a title at its left end and a note at its right end."""
+    """Draw a horizontal rule with a title at the left end and a note at the right end."""
     head = f"─ {truncated(title, width - 4)} " if title else ""
     if not note:
         return Text(head + "─" * (width - len(head)), DIM)
@@ -64,13 +64,13 @@ def rule(width: int, title: Text, note: Text | None = None) -> Text:
 
 
 def dimmed(line: Text) -> Text:
-    """Return ``line`` in the faded style of outdated data, except the maps."""
+    """Return ``line`` in the faded style for outdated data, except for map characters."""
     maps = [span for span in line.spans if isinstance(span.style, Style) and span.style.bgcolor]
     return Text(line.plain, DIM, spans=maps)
 
 
 def format_aligned(value: float, decimals: int) -> str:
-    """Format a number at most 7 columns wide, with the decimal point in the fourth column."""
+    """Format a number in up to 7 columns, with the decimal point in the fourth column."""
     if not math.isfinite(value):
         return "  —"
     shown = f"{value:{4 + decimals}.{decimals}f}"
@@ -83,12 +83,12 @@ def format_narrow(value: float) -> str:
 
 
 def format_value(value: float, decimals: int) -> str:
-    """Format a number; a missing number becomes a dash."""
+    """Format a number, or a dash if the number is missing."""
     return f"{value:.{decimals}f}" if math.isfinite(value) else "—"
 
 
 def format_microseconds(seconds: float) -> str:
-    """Format a time in at most 4 columns: in µs, or from 10 ms on in ms with its unit."""
+    """Format a duration in up to 4 columns: in µs below 10 ms, otherwise in ms with the unit."""
     if not math.isfinite(seconds):
         return "—"
     return f"{1e6 * seconds:.0f}" if seconds < 9.9995e-3 else f"{1e3 * seconds:.0f}ms"

@@ -1,8 +1,8 @@
 """Serve the stream to Foxglove with its WebSocket protocol (foxglove/ws-protocol, version 1).
 
-Channels have the names, schemas and messages of recordings (`tools.recordings.channels`), so that
-one layout works for both. The additional channel ``hand/scene`` contains the moving hand. Messages
-without subscribers are not packed.
+Channels have the same names, schemas and messages as in recordings (`tools.recordings.channels`),
+so the same layout works for both. The additional channel ``hand/scene`` contains the moving hand.
+Messages without subscribers are not packed.
 """
 
 from __future__ import annotations
@@ -33,30 +33,30 @@ ORIGINS = ("https://app.foxglove.dev", "file://")  # Foxglove in the browser and
 PROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
 CLIENT_COUNT_MAX = 8
 SCENE = "hand/scene"
-_FRAME = "hand"  # coordinate frame: x from the left to the right pivot, y away from the palm [m]
+_FRAME = "hand"  # coordinate frame [m]: x from the left to the right pivot, y away from the palm
 _LIST = {"type": "array", "items": {"type": "object", "properties": {}}}
 _ENTITIES = {"type": "object", "properties": {"deletions": _LIST, "entities": _LIST}}
-_HEAD = struct.Struct("<BIQ")  # head of a message: kind, subscription, time [ns]
-_EVENT_COUNT = 50  # events kept for new subscribers, as many as the daemon repeats
-_QUEUE_LENGTH = 500  # messages queued for a client; further messages are dropped
-_SEND_TIMEOUT = 2.0  # s for a client to accept a message
+_HEAD = struct.Struct("<BIQ")  # message header: kind, subscription, time [ns]
+_EVENT_COUNT = 50  # events stored for new subscribers, the same number as in the daemon
+_QUEUE_LENGTH = 500  # messages queued for a client; excess messages are dropped
+_SEND_TIMEOUT = 2.0  # s, timeout for a client to accept a message
 
 
 class _Client:
-    """Subscriptions of a client by channel, and the messages queued for it."""
+    """A client's subscriptions by channel, and its queued messages."""
 
     def __init__(self) -> None:
         self.subscribed: dict[str, int] = {}
         self.queue: asyncio.Queue[bytes] = asyncio.Queue(_QUEUE_LENGTH)
 
     def give(self, channel: str, stamp: float, data: bytes) -> None:
-        """Queue a message if the client subscribes to its channel and the queue has room."""
+        """Queue a message if the client subscribes to its channel and the queue is not full."""
         if channel in self.subscribed and not self.queue.full():
             head = _HEAD.pack(1, self.subscribed[channel], int(stamp * 1e9))
             self.queue.put_nowait(head + data)
 
     async def send(self, socket: ServerConnection) -> None:
-        """Send queued messages; end the connection if the client does not read them."""
+        """Send queued messages, and disconnect the client if it does not read them."""
         try:
             while True:
                 message = await self.queue.get()
@@ -67,13 +67,13 @@ class _Client:
 
 
 class Foxglove:
-    """Server running in ``loop``; messages and scenes come from another thread."""
+    """Server that runs in ``loop``. Another thread supplies the messages and scenes."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._clients: list[_Client] = []
         self._events: deque[tuple[float, bytes]] = deque(maxlen=_EVENT_COUNT)
-        self._frames: dict[str, dict[str, Any]] = {}  # newest frame by channel
+        self._frames: dict[str, dict[str, Any]] = {}  # newest frame of each channel
         tactile = schema.TACTILE.decode()
         described = {SCENE: ("foxglove.SceneUpdate", _ENTITIES)}
         described |= {f"{tactile}/{name}": channels.schema_of(schema.TACTILE) for name in FINGERS}
@@ -91,7 +91,7 @@ class Foxglove:
         ]
 
     async def serve(self, socket: ServerConnection) -> None:
-        """Serve one client until it leaves, stops reading or sends an invalid request."""
+        """Serve one client until it disconnects, stops reading or sends an invalid request."""
         if len(self._clients) == CLIENT_COUNT_MAX:
             return
         client = _Client()
@@ -120,7 +120,7 @@ class Foxglove:
         client.subscribed = kept
 
     def take(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Process one message of the stream; frames are kept until `draw`."""
+        """Process one stream message; frames are stored until `draw` is called."""
         channel = channels.channel_name(topic, message)
         if topic == schema.TACTILE:
             self._frames[channel] = message
@@ -128,7 +128,7 @@ class Foxglove:
             self._send(channel, number(message, "timestamp"), message, topic)
 
     def draw(self, settings: Settings, state: HandState, truth: dict[str, Any] | None) -> None:
-        """Send the newest frames and the current scene of the hand."""
+        """Send the newest frames and the hand's current scene."""
         for channel, frame in self._frames.items():
             self._send(channel, number(frame, "timestamp"), frame, schema.TACTILE)
         self._frames.clear()
@@ -147,8 +147,8 @@ class Foxglove:
         if not keeps and not self._wanted(channel):
             return
         try:
-            data = orjson.dumps(channels.to_json(topic)(dict(message)))  # NaN becomes null
-        except TypeError:  # also orjson's error for values that JSON cannot represent
+            data = orjson.dumps(channels.to_json(topic)(dict(message)))  # NaN becomes null.
+        except TypeError:  # orjson also raises this for values that JSON cannot represent.
             return
         self._loop.call_soon_threadsafe(partial(self._give, channel, stamp, data, keeps))
 

@@ -1,8 +1,8 @@
-"""Compute lines to draw: fingers, soft tips, object and forces, and footprints on frames.
+"""Compute lines for drawings: fingers, soft tips, object, forces, and footprints on frames.
 
 Coordinates are in the hand's plane [m]: x from the left to the right pivot, y away from the palm. A
-tip's own axes are x along its base and z normal to it; in these axes the object's face is ``x sin θ
-+ z cos θ = a − d``. `hand.geometry` gives the positions of the tips.
+tip's own axes are x along its base and z normal to the base. In these axes the object's face is
+``x sin θ + z cos θ = a − d``. `hand.geometry` computes the tip positions.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.viewing.landscape import fingers_of
 
 FloatArray = NDArray[np.float64]
-GOAL, OBJECT = "goal", "object"  # colour names, in addition to those of the fingers
+GOAL, OBJECT = "goal", "object"  # colour names, in addition to the finger names
 
-# Distinguishable for colour-blind users on a dark background. The page defines its own colours for
-# each theme.
+# Colour-blind users can distinguish these colours on a dark background. The page defines separate
+# colours for each theme.
 COLOURS = {
     "left": (51, 136, 221),
     "right": (230, 126, 0),
@@ -36,7 +36,7 @@ COLOURS = {
     OBJECT: (0, 158, 115),
 }
 
-_ARROW_SCALE = 1.6e-3  # m, length of a force arrow per newton
+_ARROW_SCALE = 1.6e-3  # m/N, force arrow length
 _ARROW_MAX = 0.045  # m
 _HALF_TURN = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 _TURN = np.linspace(0.0, 2.0 * np.pi, 61)
@@ -44,25 +44,25 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
 
 
 class DrawnPart(NamedTuple):
-    """Part of a picture; empty if it is not present at the moment."""
+    """Part of a picture, empty if it is currently absent."""
 
     lines: list[tuple[str, float, FloatArray]]  # (colour name, width [m], points [n, 2] [m])
     texts: list[tuple[str, FloatArray, str]]  # (colour name, position [2], text)
 
 
 class FingerLines(NamedTuple):
-    """Lines of one finger, each [n, 2] m."""
+    """Lines of one finger [m], each with shape [n, 2]."""
 
-    link: FloatArray  # pivot, end of the link, centre of the tip's base
+    link: FloatArray  # pivot, link end, centre of the tip's base
     base: FloatArray
     skin: FloatArray
-    face: FloatArray | None  # contact line with the object's face, end to end
-    # Point where the tip pushes on the object, unit vector of the direction.
+    face: FloatArray | None  # end points of the contact line on the object's face
+    # Point where the tip pushes on the object, unit vector of the push direction.
     push: FloatArray | None
 
 
 def touches(finger: FingerState) -> bool:
-    """Return True if a tip has a contact that can be drawn."""
+    """Return True if the tip has a contact that can be drawn."""
     return finger.contact and 0.0 < finger.d < math.inf and math.isfinite(finger.theta)
 
 
@@ -90,7 +90,7 @@ def finger_lines(
         skin = np.clip((h - rim * n_x) / n_z, 0.0, skin)
         ends = math.sqrt(2.0 * a * d - d * d) * np.array([-1.0, 1.0])
         face = place(h * n_x + ends * n_z, h * n_z - ends * n_x)
-        x = (a - d / 3.0) * n_x  # centroid of pressure
+        x = (a - d / 3.0) * n_x  # pressure centroid
         push = np.array([place(x, (h - x * n_x) / n_z), out])
     link = np.array([pivot, pivot + hand.finger_length * np.array([side * sine, cosine]), centre])
     return FingerLines(link, place([-a, a], [0.0, 0.0]), place(rim, skin), face, push)
@@ -104,10 +104,10 @@ def held_outline(
     width: float,
     height: float,
 ) -> FloatArray:
-    """Return the held object's closed outline [5, 2] m from joint angles and contacts, left first.
+    """Return the held object's closed outline [m], shape [5, 2], with the left finger first.
 
-    Across the faces the position follows from the contacts; along the faces the object is assumed
-    to be centred on them.
+    The position across the faces follows from the joint angles and contacts. Along the faces, the
+    object is assumed to be centred on the contacts.
     """
     a, tips = hand.tip_radius, hand.tips(q)
     angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])
@@ -120,16 +120,16 @@ def held_outline(
 
 
 def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
-    """Return the simulated object's closed outline [n, 2] m by ``hand/truth``; empty without."""
+    """Return the outline [m] of the object in ``hand/truth``, [n, 2]; empty without an object."""
     pose = read(TrueState, truth).true_object
     try:
         shape = shape_of(settings)
-    except ValueError:  # a wedge whose faces intersect
+    except ValueError:  # The faces of the wedge intersect.
         return []
     own = np.vstack((shape.corners, shape.corners[:1]))
     if shape.roundness > 0.0:
         own = shape.roundness * _UNIT_CIRCLE
-    # NumPy's functions return NaN for an infinite angle.
+    # Unlike `math`, NumPy returns NaN for an infinite angle.
     cosine, sine = np.cos(pose.angle), np.sin(pose.angle)
     turned = own @ np.array([(cosine, sine), (-sine, cosine)]) + (pose.x, pose.y)
     return [turned] if shape.kind != NO_OBJECT and np.isfinite(turned).all() else []
@@ -138,7 +138,7 @@ def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]
 def hand_parts(
     settings: Settings, state: HandState, truth: dict[str, Any] | None = None
 ) -> dict[str, DrawnPart]:
-    """Return all parts of the moving hand by name; ``truth`` is a ``hand/truth`` message."""
+    """Return all moving parts by name; ``truth`` is a ``hand/truth`` message."""
     hand = geometry_of(settings)
     half = hand.half_separation + 0.012
     parts = {"palm": DrawnPart([(GOAL, 2.4e-3, np.array([(-half, 0.0), (half, 0.0)]))], [])}
@@ -152,7 +152,7 @@ def hand_parts(
 
 
 def _held(hand: HandGeometry, state: HandState, height: float) -> list[FloatArray]:
-    """Return the outline of the object between both tips; empty unless both hold it."""
+    """Return the outline of the object between the tips, empty unless both tips hold it."""
     tips = state.left, state.right
     if not state.object.valid or not all(map(touches, tips)):
         return []
@@ -163,7 +163,7 @@ def _held(hand: HandGeometry, state: HandState, height: float) -> list[FloatArra
 
 
 def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
-    """Return one finger with its tip, the contact line on the face and the force arrow."""
+    """Draw one finger with its tip, the contact line on the face and the force arrow."""
     contact = (state.d, state.theta) if touches(state) else ()
     q = state.q if math.isfinite(state.q) else 0.0
     link, base, skin, face, push = finger_lines(hand, FINGERS.index(name), q, *contact)
@@ -179,15 +179,15 @@ def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
     return part
 
 
-# A picture's coordinates are cells: x along the columns, y along the rows, from the corner of the
-# first cell. In the sensor's axes, the footprint of displacement d and outward normal n is an
+# Picture coordinates are in cells from the corner of the first cell: x along the columns, y along
+# the rows. In the sensor's axes, the footprint for displacement d and outward normal n is an
 # ellipse with centre h·(n_x, n_y), h = a − d, and semi-axes ρ n_z along the tilt and ρ across it,
-# ρ² = 2ad − d². The centroid of pressure is at (a − d/3)·(n_x, n_y). This is exact for a constant
-# modulus of any value and a close approximation for a measured law.
+# ρ² = 2ad − d². The pressure centroid is at (a − d/3)·(n_x, n_y). This position is exact for any
+# constant modulus and a close approximation for a measured material law.
 
 
 def grid_of(frame: TactileFrame) -> SensorGrid | None:
-    """Return the grid of a ``hand/tactile`` message; None if its fields are invalid."""
+    """Return the grid of a ``hand/tactile`` message, or None if its fields are invalid."""
     more = (frame.pitch_y, frame.centre_x, frame.centre_y, frame.rotation)
     pitch_y, x, y, rotation = (value if math.isfinite(value) else 0.0 for value in more)
     pitches = frame.pitch, pitch_y or frame.pitch
@@ -200,10 +200,10 @@ def grid_of(frame: TactileFrame) -> SensorGrid | None:
 def footprint(
     grid: SensorGrid, radius: float, d: float, tilt_x: float, tilt_y: float
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return the outline [n, 2], closed, and the centroid [2] of a contact on ``grid``'s picture.
+    """Return a contact's closed outline [n, 2] and centroid [2] in ``grid``'s picture.
 
-    ``radius`` and ``d`` are in m, the tilts in rad in the finger's axes. Returns None if the
-    numbers do not describe a contact.
+    ``radius`` and ``d`` are in m. The tilts are in rad, in the finger's axes. Returns None if the
+    values do not describe a contact.
     """
     if not 0.0 < d < radius or not math.isfinite(tilt_x) or not math.isfinite(tilt_y):
         return None
@@ -219,12 +219,12 @@ def footprint(
 
 
 def tip_circle(grid: SensorGrid, radius: float) -> FloatArray:
-    """Return the tip's rim on the picture, [n, 2]."""
+    """Return the tip's rim in the picture, [n, 2]."""
     return on_picture(grid, radius * _UNIT_CIRCLE)
 
 
 def on_picture(grid: SensorGrid, points: FloatArray) -> FloatArray:
-    """Convert points [..., 2] m from the tip's centre, in the sensor's axes, to cells."""
+    """Convert points [..., 2] in m, in the sensor's axes from the tip's centre, to cells."""
     middle = np.array([0.5 * grid.cols, 0.5 * grid.rows])
     cells: FloatArray = (points + np.array(grid.centre)) / np.array(grid.pitches) + middle
     return cells

@@ -1,7 +1,7 @@
 """Read the hand's settings from ``hand/settings``, and draw its energy landscape U(d, θ).
 
-Keys of another version that cannot be read keep their default values, so that the rest can be
-shown.
+If a key comes from another version and cannot be read, its default value is used, so that the
+remaining data can be shown.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from softfinger.kinematics.contact.table_record import TableError
 from softfinger.tools.terminal import heatmap
 
 WIDTH, HEIGHT = 240, 200  # pixels of the landscape
-THETA_END = 45.0  # degrees to each side
-_TOLERANCE = 1e-6  # relative error of a table used for a picture
+THETA_END = 45.0  # degrees, range of θ per side
+_TOLERANCE = 1e-6  # relative error of the table for the picture
 
 
 class Landscape(NamedTuple):
-    """Energy of a tip, with θ to the right and d upwards.
+    """A tip's energy, with θ on the horizontal axis and d on the vertical axis.
 
-    The colour changes in steps with the cube root of U, which is proportional to d, so that the
-    valley along θ = 0 is visible at every depth. The edge of a step is a line of equal energy.
+    The colour changes in steps with the cube root of U, which is proportional to d, so the valley
+    along θ = 0 is visible at every depth. The edges between colours are lines of constant energy.
     """
 
-    # [HEIGHT, WIDTH] of `heatmap`; the next higher value marks impossible contacts
+    # `heatmap` levels [HEIGHT, WIDTH]; the level above the highest marks impossible contacts.
     levels: NDArray[np.uint8]
-    d_end: float  # m, at the upper edge
-    highest: float  # J, of the last colour
+    d_end: float  # m, d at the upper edge
+    highest: float  # J, energy of the last colour
 
 
 def landscape(settings: Settings) -> Landscape | None:
-    """Return the energy landscape of the settings' material; None if no table can be built."""
+    """Return the material's energy landscape, or None if the contact table cannot be built."""
     try:
         material, tip = make_material(settings.material), make_tip(settings)
         table = ContactTable.build(tip, material, tolerance=_TOLERANCE)
@@ -58,12 +58,12 @@ def landscape(settings: Settings) -> Landscape | None:
 
 
 def fingers_of(settings: Settings) -> list[str]:
-    """Return the fingers of the hand, left first."""
+    """Return the hand's fingers, left first."""
     return [name for name in FINGERS if name in settings.scene.fingers]
 
 
 def read_settings(message: dict[str, Any]) -> tuple[Settings, list[str]]:
-    """Read a ``hand/settings`` message; return the settings and the keys that could not be read."""
+    """Read a ``hand/settings`` message; return the settings and the unreadable keys."""
     try:
         sections = json.loads(message.get("settings") or "{}")
         return Settings.model_validate_json(json.dumps(sections)), []

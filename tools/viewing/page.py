@@ -1,9 +1,9 @@
-"""Serve the web page of ``softfinger view``, with its pictures and commands, on the loopback.
+"""Serve the ``softfinger view`` page, its pictures and its commands on the loopback interface.
 
-One thread serves. The main thread reads the stream or plays a recording, and makes one picture for
-all pages. A page requests the next picture after drawing the last one, so a slow page skips
-pictures without delaying the others. Pages with the token that the terminal prints may send
-commands, each page as a separate client.
+One thread serves the pages. The main thread reads the stream or plays a recording, and creates each
+picture once for all pages. A page requests the next picture after drawing the last one, so a slow
+page skips pictures without delaying the others. The terminal prints a token. Pages with this token
+may send commands, and each page is a separate client.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ _WEB = Path(__file__).with_name("web")
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
 _NICENESS = 5  # lower priority than all real-time threads
-_WAITING_COUNT_MAX = 40  # commands of all pages waiting for an answer
-_REQUEST_TIMEOUT = 5.0  # s for the head of a request, sufficient for a busy browser
-_NAME_LENGTH_MAX = 40  # characters of a command's name that are shown
+_WAITING_COUNT_MAX = 40  # commands awaiting a reply, all pages combined
+_REQUEST_TIMEOUT = 5.0  # s, timeout for a request's header, long enough for a busy browser
+_NAME_LENGTH_MAX = 40  # characters shown of a command name
 _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
 _BUFFER_SIZE = 256 << 10  # bytes queued for a page or a Foxglove client
-_MESSAGE_SIZE_MAX = 65536  # bytes, largest message accepted from a page or a Foxglove client
+_MESSAGE_SIZE_MAX = 65536  # bytes, size limit for messages from a page or a Foxglove client
 _HEADERS = {
-    "Cache-Control": "no-store",  # the page may contain a token, which changes with each start
+    "Cache-Control": "no-store",  # The page may contain a token, which changes at each start.
     "Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -64,7 +64,7 @@ _say = to_stderr("view")
 
 
 def _page() -> str:
-    """Return the page as one document that includes style and scripts."""
+    """Return the page as a single document that includes the style and scripts."""
     html, style, *scripts = (
         (_WEB / name).read_text("utf-8")
         for name in ("page.html", "page.css", "charts.js", "controls.js", "page.js")
@@ -77,7 +77,7 @@ _PAGE = _page()
 
 
 class _Published(NamedTuple):
-    """A picture, and the other data that a page needs with it."""
+    """Picture, with the other data that a page needs."""
 
     scene: str
     picture: str
@@ -85,13 +85,14 @@ class _Published(NamedTuple):
 
 
 class Site:
-    """Serve the page, the pictures and commands of all pages, and Foxglove clients.
+    """Serve the page, its pictures and commands, and Foxglove clients.
 
-    Requests must name this server as their host and, from a browser, come from its own pages. This
-    blocks DNS rebinding, where the host has another name, and requests of foreign pages, which
-    carry another origin. Pages with the ``token`` may send commands through ``send``; pages without
-    it may control the playback of a recording through ``wish``. If other machines can reach the
-    server, watching also requires the token. A browser then obtains the token with a one-time code.
+    Requests must name this server as their host. A browser's requests must also come from this
+    server's pages. These rules block DNS rebinding, where the host has another name, and requests
+    from foreign pages, which have another origin. Pages with the ``token`` may send commands
+    through ``send``. All pages may control a recording's playback through ``wish``. If other
+    machines can reach the server, the token is required even for watching. A browser then obtains
+    the token with a one-time code.
     """
 
     def __init__(
@@ -103,9 +104,10 @@ class Site:
         stale: float,
         announce: Callable[[str], None] | None = None,
     ) -> None:
-        """``stale`` [s]: age of its picture above which a command is dropped.
+        """Create a server; `run` serves the pages.
 
-        ``announce`` is called with each one-time code if other machines can reach the page.
+        A command is dropped if its picture is older than ``stale`` [s]. If other machines can reach
+        the page, ``announce`` is called with each one-time code.
         """
         self._loop = loop
         self._token = token
@@ -114,11 +116,11 @@ class Site:
         self._send = send
         self._stale = stale
         self._ended = asyncio.Event()
-        self._hosts: set[str] = set()  # valid host names of this server
+        self._hosts: set[str] = set()  # this server's valid host names
         self._at_once = asyncio.Semaphore(_WAITING_COUNT_MAX)
         self.waiting: list[asyncio.Future[_Published]] = []  # pages waiting for the next picture
-        self.record: Callable[[], str] = lambda: ""  # starts or ends a recording
-        # Receives the text by which a page requests each picture.
+        self.record: Callable[[], str] = lambda: ""  # function that starts or ends a recording
+        # Function that receives the string with which a page requests each picture.
         self.wish: Callable[[str], None] = lambda _: None
         self._routes: dict[str, Callable[[ServerConnection], Awaitable[None]]] = {
             "/pictures": self._show,
@@ -128,23 +130,23 @@ class Site:
             self._routes["/"] = foxglove.serve
 
     def publish(self, scene: str, picture: str, rows: list[Row]) -> None:
-        """Send a picture to the waiting pages; called from another thread."""
+        """Send a picture to the waiting pages. Called from another thread."""
         self._loop.call_soon_threadsafe(self._give, _Published(scene, picture, rows))
 
     def announce(self) -> None:
-        """Make a new one-time code and announce it, if codes are used."""
+        """Create a new one-time code and announce it, if codes are used."""
         if self._announce is not None:
             self._code = secrets.token_urlsafe(8)
             self._announce(self._code)
 
     def end(self) -> None:
-        """End `run`; called from another thread."""
+        """End `run`. Called from another thread."""
         self._loop.call_soon_threadsafe(self._ended.set)
 
     async def run(self, listener: socket.socket) -> None:
-        """Serve on ``listener`` until the end."""
+        """Serve requests on ``listener`` until `end` is called."""
         quiet = logging.getLogger("softfinger.view")
-        quiet.disabled = True  # invalid requests of other programs are not logged
+        quiet.disabled = True  # Do not log invalid requests from other programs.
         self._hosts = {f"{name}:{listener.getsockname()[1]}" for name in (_LOOPBACK, "localhost")}
         server = await serve(
             self._serve,
@@ -155,13 +157,13 @@ class Site:
             select_subprotocol=lambda _, offered: next(
                 (each for each in offered if each in PROTOCOLS), None
             ),
-            compression=None,  # no benefit on a local connection
+            compression=None,  # Compression has no benefit on a local connection.
             open_timeout=_REQUEST_TIMEOUT,
             max_size=_MESSAGE_SIZE_MAX,
             logger=quiet,
         )
         await self._ended.wait()
-        # Connections that do not read would never close by themselves.
+        # A client that does not read would never close its connection.
         for connection in server.connections:
             connection.transport.abort()
         others = asyncio.all_tasks() - {asyncio.current_task()}
@@ -170,14 +172,14 @@ class Site:
         await asyncio.gather(*others, return_exceptions=True)
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the page or a refusal; None accepts a WebSocket."""
+        """Return the page or a refusal, or None to accept a WebSocket."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         path, upgrade = urlsplit(request.path).path, "Upgrade" in request.headers
         known = [[], *([f"http://{host}"] for host in hosts)]
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
-        # Each request contains a secret, so the host may have any name.
+        # Here each request contains a secret, so the host may have any name.
         if self._announce is not None:
             here = True
             if not self._allows(request):
@@ -197,7 +199,7 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Redirect a browser with the one-time code to the page with the token; refuse others."""
+        """Redirect a browser that has the one-time code to the page with the token, or refuse."""
         if not self._code or not _has(request, "code", self._code):
             said = "This page needs the newest address that softfinger view prints; each works once"
             return connection.respond(403, said)
@@ -221,7 +223,7 @@ class Site:
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Send a page the next picture whenever it asks, with the rows that it does not have yet.
+        """Send a page the next picture each time it requests one, with the rows that it lacks.
 
         A new scene is sent before the picture.
         """
@@ -238,7 +240,7 @@ class Site:
             await page.send(f'{picture[:-1]},"rows":[{",".join(fresh)}]}}')
 
     async def _command(self, page: ServerConnection) -> None:
-        """Execute the commands of a page that has the token and return the answers."""
+        """Execute the commands of a page that has the token, and send the replies."""
         assert page.request is not None
         allowed = self._send is not None and self._allows(page.request)
         async for text in page:
@@ -249,11 +251,11 @@ class Site:
             await page.send(answer)
 
     def _in_thread(self, text: str | bytes) -> asyncio.Future[str]:
-        """Run `_answer` in a thread that does not outlive the process; return its future."""
+        """Run `_answer` in a thread that ends with the process; return its future."""
         future: asyncio.Future[str] = self._loop.create_future()
 
         def give(answer: str) -> None:
-            if not future.done():  # the page may have left meanwhile
+            if not future.done():  # The page may have disconnected.
                 future.set_result(answer)
 
         def work() -> None:
@@ -265,13 +267,13 @@ class Site:
     def _answer(self, text: str | bytes) -> str:
         """Send the request ``text`` to the daemon, which checks it; return a line about the result.
 
-        Commands except stop are dropped if their picture (``seen``, monotonic s) is too old.
+        A command other than stop is dropped if its picture (``seen``, monotonic s) is too old.
         """
         try:
             asked = json.loads(text)
             name = str(asked["command"])[:_NAME_LENGTH_MAX]
             age = time.monotonic() - float(asked.pop("seen", "nan"))
-            # This fails for values that msgpack cannot represent: deep nesting, long integers.
+            # This call fails for values that msgpack can't represent: deep nesting, long integers.
             msgpack.packb(asked)
         except _NO_COMMAND as error:
             return f"✗ no command: {error!r}"
@@ -293,13 +295,13 @@ def _add_headers(_: ServerConnection, __: Request, response: Response) -> None:
 
 
 def _has(request: Request, name: str, secret: str) -> bool:
-    """Return True if the request's query has this secret under ``name``."""
+    """Return True if the request's query contains this secret under ``name``."""
     given = parse_qs(urlsplit(request.path).query).get(name, [""])[0]
     return secrets.compare_digest(given.encode(), secret.encode())
 
 
 def listen(host: str, port: int | None) -> socket.socket:
-    """Open a socket on ``port`` of ``host``; None selects 9090, or a free port if 9090 is taken.
+    """Open a listening socket; without a port, use 9090, or a free port if 9090 is taken.
 
     Raises ViewError.
     """
@@ -311,13 +313,13 @@ def listen(host: str, port: int | None) -> socket.socket:
             at = f"--host {host}" if port is None else f"port {port} of {host}"
             raise ViewError(f"{at} can't be used: {error.strerror}") from None
         return listen(host, 0)
-    # A small buffer, because data in the system's buffer count as accepted although not yet read.
+    # Use a small buffer, because data in it count as accepted before the client has read them.
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_SIZE)
     return listener
 
 
 def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
-    """Serve the page until the end; raise SoftfingerError if nothing can be shown."""
+    """Serve the page until the end. Raises SoftfingerError if nothing can be shown."""
     os.nice(_NICENESS)
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
@@ -372,7 +374,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
             else:
                 print(f"view: http://{address}/ to see it", flush=True)
             if foxglove is None and not away and not arguments.no_browser:
-                # Omit the token: other users of this machine may read a browser's command line.
+                # Omit the token, because other users may see the browser's command line.
                 webbrowser.open(f"http://{address}/")
             ending.begin()
             source()
@@ -386,7 +388,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
 
 
 def _address(listener: socket.socket) -> str:
-    """Return host and port for a browser; the machine's name if all its addresses are served."""
+    """Return host and port for a browser; use the machine's name if all addresses are served."""
     host, port = listener.getsockname()[:2]
     if host in ("0.0.0.0", "::"):
         host = socket.gethostname()

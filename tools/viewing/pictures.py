@@ -1,9 +1,9 @@
-"""Convert the stream's messages to data for the web page: scene, pictures and rows of the plots.
+"""Convert the stream's messages to data for the web page: scene, pictures and plot rows.
 
-A picture is JSON with lines, dots, texts and images for each panel at one moment. The scene
-contains the constant parts: the layout and the energy landscape. A row holds the values of all
-plots at one moment; a page gets each row once, even if it skips pictures. Colours are sent by name,
-and the page defines their RGB values.
+A picture is JSON with the lines, dots, texts and images for each panel at one time. The scene
+contains the constant parts: the layout and the energy landscape. A row contains the values of all
+plots at one time. A page receives each row once, even if it skips pictures. Colours are sent by
+name, and the page defines their RGB values.
 """
 
 from __future__ import annotations
@@ -40,29 +40,29 @@ if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
 TOPICS = (*StreamState().topics, schema.TRUTH)
-SECONDS = 60.0  # s of history that a page gets when it opens
-STEP = 0.1  # s between two rows of the plots
-_TRAIL_LENGTH = 60  # rows shown as a trail on the landscape
-_EVENT_COUNT = 50  # events shown
-_WARNING_TIME = 5.0  # s for which a warning is shown
-_LIMIT_FRACTION = 0.8  # fraction of a limit from which the value is reported
-_DARK_SIGMA = 2.0  # standard deviations of a cell's noise that a pressure map draws as zero
-_FULL_SCALE_MIN = 10.0  # smallest full scale, also in standard deviations
-_OLD_TIME = 0.35  # s without a message after which the last one is shown as old
-_OLD_PERIODS = 4.0  # the same in periods of the stream; the longer time applies
-_NUMBER_MAX = 1e6  # limit of drawn numbers, since messages may contain any value
+SECONDS = 60.0  # s, duration of the history that a newly opened page receives
+STEP = 0.1  # s, time between plot rows
+_TRAIL_LENGTH = 60  # rows in a trail on the landscape
+_EVENT_COUNT = 50  # number of displayed events
+_WARNING_TIME = 5.0  # s, display time of a warning
+_LIMIT_FRACTION = 0.8  # fraction of a limit above which a value is reported
+_DARK_SIGMA = 2.0  # standard deviations of cell noise; lower pressures are drawn as zero
+_FULL_SCALE_MIN = 10.0  # standard deviations of cell noise, minimum full scale
+_OLD_TIME = 0.35  # s without a message, after which the last message is shown as old
+_OLD_PERIODS = 4.0  # the same limit in stream periods; the longer time applies
+_NUMBER_MAX = 1e6  # limit for drawn numbers, because messages may contain any value
 _DEGREE = math.degrees(1.0)
 
 
 class _Plot(NamedTuple):
-    """Plot of lines over time, in ``unit``; ``span`` is the smallest height of its scale."""
+    """Plot of lines versus time; ``span`` is the minimum height of its scale, in ``unit``."""
 
     title: str
     unit: str
     factor: float
     span: float
-    paths: str  # fields of `hand/state`
-    detail: bool = False  # shown on demand
+    paths: str  # `hand/state` fields
+    detail: bool = False  # True if shown only on demand
 
 
 _PLOTS = (
@@ -83,21 +83,21 @@ _PLOTS = (
     ),
     _Plot("Loop times", "µs", 1e6, 50.0, "compute_s wake_late_s", True),
 )
-_HEADLINE = (  # title, decimals, fields of the plots
+_HEADLINE = (  # title, decimals, plotted fields
     ("Force", 1, "left.force right.force goal_force"),
     ("Object angle", 1, "object.angle goal_angle"),
     ("Object width", 1, "object.width"),
     ("Displacement d", 2, "left.d right.d"),
 )
-_SERVOS = ("q", "current")  # fields that a hand without servos lacks
-_DEVIATED = ("force", "d", "theta")  # fields of a finger for which {}_std is also drawn
-_OTHERS = {  # names and colours of lines that do not belong to a finger
+_SERVOS = ("q", "current")  # fields that are missing in a hand without servos
+_DEVIATED = ("force", "d", "theta")  # finger fields for which {}_std is also drawn
+_OTHERS = {  # names and colours of lines that are not for a finger
     "object.angle": ("object", OBJECT),
     "object.width": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
     "wake_late_s": ("late", "late"),
 }
-# Fields of a finger with a limit `safety.…_max`.
+# Finger fields that have a limit `safety.…_max`.
 _BOUNDED = ("force", "d", "current", "temperature")
 _FACTORS = {path: plot.factor for plot in _PLOTS for path in plot.paths.split()}
 _FACTORS |= {
@@ -110,7 +110,7 @@ _values = attrgetter(*_FACTORS)
 
 
 def _row(number: int, state: HandState) -> list[Any]:
-    """Make a row of the plots, with NaN for values that the hand lacks."""
+    """Create a plot row, with NaN for values that the hand does not have."""
     row = [number, state.timestamp, printable(state.mode)]
     for value, factor in zip(_values(state), _FACTORS.values(), strict=True):
         row.append(round(min(max(factor * value, -_NUMBER_MAX), _NUMBER_MAX), 4))
@@ -120,18 +120,18 @@ def _row(number: int, state: HandState) -> list[Any]:
 
 
 class Row(NamedTuple):
-    """Row of the plots in the form sent to a page; ``number`` counts up."""
+    """Plot row, prepared for sending to a page; ``number`` is consecutive."""
 
     number: int
     text: str
 
 
 class Pictures:
-    """Process messages of any content, and pass the scene and each picture to ``publish``.
+    """Process untrusted messages, and pass the scene and each picture to ``publish``.
 
     ``watched`` returns True if a page is open. ``say`` is called for messages that cannot be read.
-    Times are those of the machine for a ``live`` stream, and those of the messages for a recording.
-    ``foxglove`` receives the messages too.
+    Times are the machine's times for a ``live`` stream and the messages' times for a recording.
+    ``foxglove`` also receives the messages.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Pictures:
         period: float = STEP,
         foxglove: Foxglove | None = None,
     ) -> None:
-        """``period`` [s]: time between two pictures."""
+        """Create a converter; ``period`` [s] is the time between pictures."""
         self._publish = publish
         self._watched = watched
         self._say = say
@@ -153,23 +153,23 @@ class Pictures:
         self._period = period
         self._number = 0  # number of rows so far
         self._marks: list[Any] = []
-        self.recording: dict[str, Any] = {}  # set by the page's recorder
-        self._settings_text = ""  # as received
-        self.seen = self.unreadable = 0  # number of states; number of messages
+        self.recording: dict[str, Any] = {}  # status set by the page's recorder
+        self._settings_text = ""  # the last settings, unparsed
+        self.seen = self.unreadable = 0  # number of states, number of unreadable messages
         self.clear()
         self._read_settings(Settings())
 
     def clear(self) -> None:
-        """Discard everything except the hand's settings, before data of another time are read."""
+        """Discard all data except the hand's settings, before data from another time are read."""
         self.feed = StreamState()
-        self.states = 0  # number of states since then
-        self.time = math.nan  # time of the newest state [Unix s]
+        self.states = 0  # number of states since the last `clear`
+        self.time = math.nan  # Unix time of the newest state [s]
         self._truth: dict[str, Any] | None = None
         self._gaps = {topic: Gaps() for topic in TOPICS}
         self._begin_rows()
 
     def _begin_rows(self) -> None:
-        """Discard the rows; pages drop the rows before the next one."""
+        """Discard the rows; pages then also drop the older rows."""
         self._first = self._number
         self._past: deque[tuple[HandState, Row]] = deque(maxlen=round(SECONDS / STEP))
 
@@ -177,7 +177,7 @@ class Pictures:
         return time.monotonic() if self._live else self.time
 
     def take(self, topic: bytes, message: Any) -> None:
-        """Process one message of any content."""
+        """Process one untrusted message."""
         stamp = number(message, "timestamp")
         if topic not in self._gaps or not 0.0 <= stamp < 2.0**32:
             self.unreadable += 1
@@ -186,7 +186,7 @@ class Pictures:
             return
         if topic == schema.STATE:
             if number(message, "seq") < self.feed.state.seq:
-                self._begin_rows()  # the daemon was restarted
+                self._begin_rows()  # The daemon was restarted.
             elif self.states and self.time // STEP != stamp // STEP:
                 last = self.feed.state  # last state of the step
                 self._past.append((last, Row(self._number, _packed(_row(self._number, last)))))
@@ -207,7 +207,7 @@ class Pictures:
             self._foxglove.take(topic, message)
 
     def _read_settings(self, settings: Settings) -> None:
-        """Lay out the scene for a hand, with panels and plots only for the parts that it has."""
+        """Lay out the scene for a hand, with panels and plots for its existing parts only."""
         self._settings, self._fingers = settings, fingers_of(settings)
         self._pressure = heatmap.FullScale(
             heatmap.round_up(_FULL_SCALE_MIN * settings.tactile.noise)
@@ -255,7 +255,7 @@ class Pictures:
         self._scene_text = _packed(self._scene)
 
     def mark(self, marks: list[Any]) -> None:
-        """Show the ``marks`` of a recording, from `sources.marks_of`."""
+        """Show a recording's ``marks``, from `sources.marks_of`."""
         self._marks = self._scene["marks"] = marks
         self._scene_text = _packed(self._scene)
 
@@ -270,9 +270,9 @@ class Pictures:
         )
 
     def draw(self, place: dict[str, Any] | None = None) -> None:
-        """Publish a picture of the current data if a page waits for one.
+        """Publish a picture of the current data if a page is waiting for one.
 
-        ``place`` is the position in a recording, see `sources.Playback`.
+        ``place`` is the position in a recording; see `sources.Playback`.
         """
         now, feed, state = self._moment(), self.feed, self.feed.state
         if self._foxglove is not None and self.states:
@@ -307,7 +307,7 @@ class Pictures:
         self._publish(self._scene_text, _packed(picture), [row for _, row in self._past])
 
     def _set(self) -> dict[str, float]:
-        """Return the grip's requested force [N] and angle [°]; NaN without a grip."""
+        """Return the grip's requested force [N] and angle [°], or NaN without a grip."""
         feed, state = self.feed, self.feed.state
         angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
         force = feed.commanded if math.isfinite(feed.commanded) else state.goal_force
@@ -324,7 +324,7 @@ class Pictures:
         return {"lines": lines, "texts": texts}
 
     def _maps(self, now: float) -> dict[str, Any]:
-        """Return each tip's frame with its rim, and the contact's footprint and centroid."""
+        """Draw each tip's frame with its rim, and the contact's footprint and centroid."""
         frames, tip = self.feed.frames, self._settings.tip.radius
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
@@ -354,7 +354,7 @@ class Pictures:
         return maps
 
     def _contacts(self) -> dict[str, Any]:
-        """Return each contact on the landscape, in mm and degrees, with its trail."""
+        """Draw each contact on the landscape, in mm and degrees, with its trail."""
         lines, dots = [], []
         states = [self.feed.state, *(state for state, _ in reversed(self._past))][
             : 1 + _TRAIL_LENGTH
@@ -367,7 +367,7 @@ class Pictures:
         return {"lines": lines, "dots": dots}
 
     def _notes(self) -> list[str]:
-        """Return recent warnings, reasons for invalid fingers, and values near their limits."""
+        """Return recent warnings, reasons for invalid estimates, and values near their limits."""
         state, safety, feed = self.feed.state, self._settings.safety, self.feed
         last = [each for each in feed.events[-1:] if each.level == "warning"]
         notes = [each.text for each in last if self.time - each.timestamp < _WARNING_TIME]
@@ -388,12 +388,12 @@ class Pictures:
         return notes
 
     def _force_increase(self) -> str:
-        """Return a description of the grip's goal if the daemon has raised the force."""
+        """Describe the grip's goal if the daemon has raised the force."""
         grip = self.feed.grip()
         return grip if "raised" in grip else ""
 
     def _facts(self, now: float) -> list[tuple[str, str]]:
-        """Return names and values of the details: loop times, frames, servos and losses."""
+        """Return names and values for the details: loop times, frames, servos and losses."""
         feed, state, times = self.feed, self.feed.state, self.feed.times
         fingers = [state.finger(name) for name in self._fingers]
 
@@ -421,7 +421,7 @@ class Pictures:
 
 
 def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
-    """Describe a plot of the lines at ``paths`` for the page's layout."""
+    """Describe a plot with lines for the fields at ``paths``, for the page's layout."""
     lines = []
     for path in paths:
         finger, _, key = path.rpartition(".")
@@ -436,7 +436,10 @@ def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
 
 
 def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
-    """Describe a panel; ``box``: left, right, top, bottom; ``scaled``: widths in its unit."""
+    """Describe a panel whose ``box`` is (left, right, top, bottom).
+
+    If ``scaled`` is set, line widths are in the box's unit.
+    """
     return {"name": name, "title": title, "box": box, **more}
 
 

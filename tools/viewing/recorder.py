@@ -1,4 +1,4 @@
-"""Start and end recordings from the web page."""
+"""Start and end recordings at the web page's request."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ if TYPE_CHECKING:
 
 
 class PageRecorder:
-    """Run one `softfinger record` at a time, in the current folder.
+    """Run one `softfinger record` process at a time, in the current folder.
 
-    ``show`` is called with the ``file`` and start time ``since`` [Unix s] of the running recording,
-    with the reason if it ``failed``, or with an empty map if there is no recording.
+    ``show`` is called with a map. It contains the ``file`` and start time ``since`` (Unix time [s])
+    of the running recording, or the reason if the recording ``failed``. Without a recording, the
+    map is empty.
     """
 
     def __init__(self, address: str, keys: str, show: Callable[[dict[str, Any]], None]) -> None:
@@ -27,10 +28,10 @@ class PageRecorder:
         self._process: RecorderProcess | None = None
 
     def toggle(self) -> str:
-        """Start a recording or end the running one; return a line about the result."""
+        """Start a recording, or end the running one, and return a line about the result."""
         try:
             from softfinger.tools.processes.child_processes import RecorderError, RecorderProcess
-        except ImportError:  # termios is missing
+        except ImportError:  # The system has no termios.
             return "✗ record: only on Linux and macOS; use softfinger record"
         with self._lock:
             if self._process is not None:

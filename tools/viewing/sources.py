@@ -1,4 +1,4 @@
-"""Read messages from the stream or a recording, and draw pictures at a given rate."""
+"""Read messages from the stream or a recording, and draw pictures at a fixed rate."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.terminal.stream_state import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
-_SILENCE_TIME = 2.0  # s without a message before a notice is printed
-_DRAW_PAUSE_MAX = 1.0  # s, longest pause between two pictures if drawing is slow
-_MARK_COUNT_MAX = 2_000  # largest number of marks in a recording
+_SILENCE_TIME = 2.0  # s, time without messages before a notice is printed
+_DRAW_PAUSE_MAX = 1.0  # s, maximum pause between pictures if drawing is slow
+_MARK_COUNT_MAX = 2_000  # maximum number of marks shown for a recording
 _SPEED_RANGE = 0.1, 10.0
-# messages queued between reads: 2 s of state and truth at 1 kHz with their frames.
+# messages queued between reads, enough for 2 s of state and truth at 1 kHz, with frames.
 _QUEUE_LENGTH = 5_000
 
 
 class ViewError(SoftfingerError):
-    """Nothing can be shown; the message gives the reason and a remedy."""
+    """Nothing can be shown. The message gives the reason and a remedy."""
 
 
 def follow(
@@ -43,7 +43,7 @@ def follow(
     ending: StopCondition,
     say: Callable[[str], None],
 ) -> None:
-    """Show the stream selected by ``arguments`` until the end; may raise ViewError."""
+    """Show the stream selected by ``arguments`` until the end. Raises ViewError."""
     context: zmq.Context[Any] = zmq.Context()
     try:
         if keys is not None:
@@ -66,7 +66,7 @@ def follow(
                 where = waiting(arguments.address, arguments.keys)
                 say(where if silent else "the stream has begun")
             pictures.draw()
-            # Limit the load to half of the time, even on a slow machine.
+            # Use at most half of the CPU time, even on a slow machine.
             worked = time.thread_time() - worked
             rest = max(
                 1.0 / arguments.rate - (time.monotonic() - began), min(worked, _DRAW_PAUSE_MAX)
@@ -78,7 +78,7 @@ def follow(
 
 
 def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
-    """Return time [s], level, kind and text of mode changes, warnings and errors."""
+    """Return time [s], level, kind and text for each mode change, warning and error."""
     marks = []
     for _, message in recording.messages([schema.EVENT]):
         event = read(schema.Event, message)
@@ -94,19 +94,19 @@ def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
 
 
 class Playback:
-    """Position and playback state of a recording; ``run`` is executed in a separate thread."""
+    """Playback of a recording; ``run`` is executed in a separate thread."""
 
     def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
         self._recording = recording
         self._pictures = pictures
-        self._period = period  # s between two pictures
-        self._target: float | None = 0.0  # requested position, set from another thread
+        self._period = period  # s, time between pictures
+        self._target: float | None = 0.0  # s, requested position, set by another thread
         self.playing = True
         self.speed = 1.0
-        self.position = 0.0  # s from the first message
+        self.position = 0.0  # s, time since the first message
 
     def ask(self, wish: str) -> None:
-        """Execute a page's request: ``play``, ``pause``, ``speed N`` or a position [s]."""
+        """Handle a page's request: ``play``, ``pause``, ``speed N`` or a position [s]."""
         name, _, value = wish.partition(" ")
         with contextlib.suppress(ValueError):
             if name == "speed":
@@ -122,12 +122,12 @@ class Playback:
     def run(self, ending: StopCondition) -> None:
         """Play until the end is requested."""
         recording, pictures = self._recording, self._pictures
-        # Search the marks with a separate reader: this takes seconds for a long recording, and the
-        # first picture should not wait.
+        # Search for marks with a separate reader, because this takes seconds for a long recording
+        # and must not delay the first picture.
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
-        # Settings may occur only once.
+        # A recording may contain the settings only once, so read them first.
         for message in islice(recording.messages([schema.SETTINGS]), 1):
             pictures.take(*message)
         while not ending.is_met:
@@ -135,7 +135,7 @@ class Playback:
             if (target := self._target) is not None:
                 self._target, self.position = None, target
                 pictures.clear()
-                messages = recording.messages(TOPICS, target - SECONDS)  # history of the plots
+                messages = recording.messages(TOPICS, target - SECONDS)  # including plot history
                 ahead = next(messages, None)
             while ahead is not None and (self._is_past(ahead[1]) or not pictures.states):
                 pictures.take(*ahead)

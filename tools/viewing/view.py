@@ -72,7 +72,7 @@ def _rate(text: str) -> float:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show the page until the end; raise SoftfingerError if nothing can be shown."""
+    """Show the page until the end. Raises SoftfingerError if nothing can be shown."""
     if arguments.foxglove is not None and arguments.file is not None:
         print("view: --foxglove serves the stream alone, found FILE.mcap, too", file=sys.stderr)
         return 2

@@ -1,19 +1,19 @@
 "use strict";
-// Draw plots over time with a common time axis and cursor. A row is [number, time, mode, values …];
-// null is a missing value.
+// Draw plots versus time with a common time axis and cursor. A row is [number, time, mode, values …],
+// where null is a missing value.
 //
-// No plotting package is used: uPlot takes the same time, but the package that contains it requires
-// IPython; Plotly takes seven times as long and has 4.8 MB.
+// This module does not use a plotting package. uPlot takes the same time, but the package that
+// contains it requires IPython. Plotly takes seven times as long and has 4.8 MB.
 
 const [TIME, MODE] = [1, 2];
-const KEPT = 6000;  // rows, i.e. ten minutes
-const READABLE = 180;  // ms between two updates of a number, so that it can be read
+const KEPT = 6000;  // rows, ten minutes
+const READABLE = 180;  // ms, minimum time between updates of a number, for readability
 
 const inks = new Map();
 const ink = name => inks.get(name)
   ?? inks.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim()).get(name);
 
-// Context and size in CSS pixels of a canvas. The size is observed, because reading it would force a layout.
+// A canvas's context and its size in CSS pixels. The size is observed, because reading it would force a layout.
 class Surface {
   constructor(canvas, changed) {
     [this.canvas, this.pen, this.width, this.height] = [canvas, canvas.getContext("2d"), 0, 0];
@@ -39,14 +39,14 @@ class Surface {
 class History {
   rows = [];
 
-  // Rows before number `first` belong to another daemon, or to another position in a recording.
+  // Add rows. Rows before number `first` belong to another daemon or recording position and are dropped.
   add(rows, first) {
     if (this.rows.length && this.rows[0][0] < first) this.rows = this.rows.filter(row => row[0] >= first);
     this.rows.push(...rows.filter(row => row[0] >= first && row[0] > (this.rows.at(-1)?.[0] ?? -1)));
     if (this.rows.length > KEPT) this.rows.splice(0, this.rows.length - KEPT);
   }
 
-  // Return the index of the first row at or after a time.
+  // Return the index of the first row at or after the given time.
   from(time) {
     let [low, high] = [0, this.rows.length];
     while (low < high) {
@@ -63,19 +63,19 @@ class History {
   }
 }
 
-// Time range of all plots: `span` seconds until `end` or until the newest row, and the cursor's time.
+// Cursor time and common time range of all plots: `span` seconds before `end` or the newest row.
 class View {
   span = 20;
   end = null;
   cursor = null;
   newest = null;  // row
-  old = false;  // the stream is lost
-  start = null;  // start of a recording, from which times count; null if live
+  old = false;  // true if the stream is lost
+  start = null;  // start time of a recording, null if live
 
   constructor(changed) { this.changed = changed; }
 
   get range() {
-    const newest = this.newest?.[TIME] ?? 0;  // the axis does not move during the first seconds of a recording
+    const newest = this.newest?.[TIME] ?? 0;  // The axis does not move during a recording's first seconds.
     const end = this.end ?? (this.start === null ? newest : Math.max(newest, this.start + this.span));
     return [end - this.span, end];
   }
@@ -116,7 +116,7 @@ class View {
 
 const clock = time => new Date(1e3 * time).toTimeString().slice(0, 8);
 
-// Return the next round number at or above a value: 1, 2 or 5 times a power of ten.
+// Round a value up to the next round number: 1, 2 or 5 times a power of ten.
 function round(value) {
   const decade = 10 ** Math.floor(Math.log10(value));
   return decade * [1, 2, 5, 10].find(step => step * decade >= value * (1 - 1e-9));
@@ -172,13 +172,13 @@ class Chart {
     });
     canvas.addEventListener("dblclick", () => view.follow());
     canvas.addEventListener("wheel", event => {
-      if (!event.ctrlKey && !event.metaKey) return;  // the page scrolls
+      if (!event.ctrlKey && !event.metaKey) return;  // The page scrolls.
       event.preventDefault();
       view.zoom(event.deltaY > 0 ? 1.25 : 0.8, time(event));
     }, { passive: false });
   }
 
-  // Return the visible rows and one more on each side.
+  // Return the visible rows and one additional row on each side.
   shown() {
     const { history, view } = this, [from, to] = view.range;
     const first = Math.max(history.from(from) - 1, 0);
@@ -187,7 +187,7 @@ class Chart {
     return rows;
   }
 
-  // Fit the scale to the values: it grows at once and shrinks when half of it is empty.
+  // Fit the scale to the values. It grows immediately and shrinks once half of it is empty.
   rescale(rows) {
     let [low, high, least] = [Infinity, -Infinity, Infinity];
     for (const { column, spread } of this.plot.lines)
@@ -256,7 +256,7 @@ class Chart {
     pen.stroke();
   }
 
-  // Draw a line; of several rows in a pixel, draw the lowest and the highest value.
+  // Draw a line. If a pixel contains several rows, draw the lowest and the highest value.
   line({ column, colour, goal }, rows, x, y) {
     const { pen, width } = this.surface, each = Math.max(1, Math.floor(rows.length / width));
     pen.beginPath();
@@ -275,7 +275,7 @@ class Chart {
       if (high > low) to(rows[k][TIME], high);
     }
     pen.strokeStyle = ink(colour);
-    pen.lineWidth = 1;  // a wider line takes two and a half times as long without a graphics card
+    pen.lineWidth = 1;  // Without a graphics card, a wider line takes two and a half times as long.
     pen.lineJoin = "round";
     pen.stroke();
   }
@@ -337,7 +337,7 @@ class Chart {
     }
   }
 
-  // Write the values in the caption, and as text for screen readers.
+  // Write the values to the caption, and as text for screen readers.
   tell(row) {
     const { plot, values, canvas, view } = this, words = [], now = performance.now();
     if (view.cursor === null && now < (this.written ?? 0) + READABLE) return;
@@ -356,7 +356,7 @@ class Chart {
   }
 }
 
-// Format a number without a sign before zero, and with the minus sign U+2212.
+// Format a number with the minus sign U+2212, but without a sign before zero.
 function decimal(value, places) {
   const text = value.toFixed(places);
   return +text === 0 ? text.replace("-", "") : text.replace("-", "−");
@@ -369,7 +369,7 @@ function make(parent, kind, name = "", text = "") {
   return element;
 }
 
-// Set a text only if it differs, because the browser would lay out and paint it again.
+// Set a text only if it has changed, because the browser would lay it out and paint it again.
 function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }

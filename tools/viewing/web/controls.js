@@ -1,5 +1,5 @@
 
-// Commands: one of each kind is in transit; of those waiting for it, only the newest is sent next.
+// One command of each kind is in transit at a time. Of those that follow, only the newest is sent next.
 const client = "page " + Math.random().toString(16).slice(2, 6);
 const one = selector => document.querySelector(selector);
 const lanes = {}, settings = {};
@@ -12,7 +12,7 @@ function say(text, bad = false) {
   reply.classList.toggle("bad", bad);
 }
 
-// `answered` is called with the success and the text of the answer.
+// Call `answered` with the success flag and the text of the reply.
 function send(command, numbers = {}, answered = () => {}) {
   const lane = lanes[command] ??= { busy: 0, next: null };
   const asked = { message: { command, client, seen: picture?.now, ...numbers }, answered };
@@ -32,7 +32,7 @@ function transmit(lane, { message, answered }) {
   lane.busy++;
   say(`${message.command} …`);
   let answer = `✗ ${message.command}: the page's server doesn't answer`;
-  // Use a separate connection, because the one for pictures may be closed.
+  // Use a separate connection, because the picture connection may be closed.
   const line = new WebSocket(`ws://${location.host}/command${location.search}`);
   line.onopen = () => line.send(JSON.stringify(message));
   line.onmessage = ({ data }) => { answer = data; line.close(); };
@@ -47,8 +47,8 @@ function transmit(lane, { message, answered }) {
   };
 }
 
-// A setting of the hand with a slider and a field. It follows the hand, except after a change here:
-// it then shows the new value until the hand has reached or refused it.
+// A value of the hand with a slider and a field. It follows the hand. After a change on this page, it
+// shows the new value until the hand has reached or refused this value.
 class Setting {
   wanted = null;
   value = NaN;
@@ -85,13 +85,13 @@ class Setting {
     this.tell(`${text} is being sent …`);
     send(command, numbers, (done, answer) => {
       this.tell(done ? `✓ ${text} accepted` : answer.startsWith("✗") ? answer : `✗ ${text} was not sent: ${answer}`, !done);
-      if (this.wanted !== wanted) return;  // changed since then; the newer value is in transit
+      if (this.wanted !== wanted) return;  // A newer value is in transit.
       if (done) this.until = Date.now() + 2000; else this.wanted = null;
       this.show();
     });
   }
 
-  // Show the hand's value; NaN if it has none.
+  // Show the hand's value, which is NaN if it is unknown.
   follow(value) {
     if (!Number.isNaN(value)) this.value = value;
     const reached = Math.abs(value - this.wanted) < 0.05;
@@ -172,7 +172,7 @@ function showControls() {
   put(button, on ? `End recording, ${Math.floor(seconds)} s` : "Record");
 }
 
-// Keys as in the terminal's page. Space stops with any focus, although it would also press a button.
+// The keys are those of the terminal page. Space always stops, even if the focus is on a button.
 const KEYS = {
   a: ["arm", "Arm"], g: ["grasp", "Grasp"], r: ["release", "Release"], d: ["disarm", "Disarm"], c: ["clear", "Clear the fault"],
   "+": ["", "More force"], "-": ["", "Less force"], ArrowLeft: ["", "Turn by −5°"], ArrowRight: ["", "Turn by +5°"],
@@ -210,7 +210,7 @@ function beginKeys() {
   });
 }
 
-// Player of a recording. Wishes are sent with the next requests for pictures.
+// Recording player. Its requests are sent with the next picture requests.
 class Player {
   wishes = [];
 
@@ -233,7 +233,7 @@ class Player {
   }
 
   jump(step) {
-    // While playing, a mark that was just passed does not count as the previous one yet.
+    // During playback, a mark that was just passed does not count as the previous mark yet.
     const { position, playing } = picture.place, least = step < 0 && playing ? 0.5 : 0.03;
     const beyond = scene.marks.filter(([at]) => step * (at - position) > least);
     const mark = beyond.at(step > 0 ? 0 : -1);
@@ -265,10 +265,10 @@ class Player {
     if (this.drawn !== `${duration} ${scene.marks.length}`) this.draw();
   }
 
-  // Draw the modes along the recording, with its warnings and errors above them.
+  // Draw the recording's modes along its track, with warnings and errors above them.
   draw() {
     if (!picture || !scene.marks || !this.track.clear()) return;
-    const { pen, width } = this.track, { duration } = picture.place, inset = 8;  // px, half of the thumb
+    const { pen, width } = this.track, { duration } = picture.place, inset = 8;  // px, half of the thumb's width
     this.drawn = `${duration} ${scene.marks.length}`;
     const x = at => inset + (width - 2 * inset) * at / duration;
     const modes = scene.marks.filter(([, , kind]) => kind === "mode");

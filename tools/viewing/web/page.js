@@ -1,12 +1,12 @@
 
-// Draw the pictures that the server sends; `tools.viewing.pictures` describes their contents.
+// Draw the pictures that the server sends. `tools.viewing.pictures` describes their contents.
 let scene, picture, palette, panels = [], charts = [], player, arrived = 0, connected = false, events = "";
 const past = new History(), view = new View(() => redraw());
-const images = new Map();  // images of panels
+const images = new Map();  // panel images
 
 const seconds = value => value < 10 ? value.toFixed(1) : Math.round(value).toString();
 const elapsed = () => (performance.now() - arrived) / 1000;
-// Return the present value of an age in a picture; null means that the message never came.
+// Return the current value of an age that was sent in a picture; null means that there was no message.
 const aged = age => age === null ? Infinity : scene.live ? age + elapsed() : 0;
 const isOld = () => aged(picture.age) > picture.patience.state + scene.period;
 
@@ -54,7 +54,7 @@ function lineOf(path) {
     for (const line of plot.lines) if (line.column === column) return { ...line, unit: plot.unit };
 }
 
-// Draw an image's levels on a canvas of its size; levels beyond the palette are transparent.
+// Draw an image's levels on a canvas of the same size. Levels beyond the palette are transparent.
 function image({ rows, cols, data }, canvas = document.createElement("canvas")) {
   const levels = atob(data), pixels = new Uint32Array(levels.length);
   for (let k = 0; k < levels.length; k++) pixels[k] = palette[levels.charCodeAt(k)] ?? 0;
@@ -63,7 +63,7 @@ function image({ rows, cols, data }, canvas = document.createElement("canvas")) 
   return canvas;
 }
 
-// Draw a panel in the coordinates of its box: left, right, top, bottom.
+// Draw a panel in the coordinates of its box (left, right, top, bottom).
 function paint({ name, limits, equal, scaled, still: fixed = {}, surface, note, low, high }) {
   if (!surface.clear()) return;
   const drawn = picture.panels[name] ?? {}, [left, right, top, bottom] = limits, { pen, width, height } = surface;
@@ -159,7 +159,7 @@ function redraw() {
   put(one("#hold"), view.end === null ? "Pause" : "Resume");
 }
 
-// Mark panels with old data: each shows its age once the next picture is overdue.
+// Mark panels with old data. Each panel shows its data's age once the next picture is overdue.
 function showAges() {
   clearTimeout(showAges.timer);
   if (!picture) return;
@@ -203,7 +203,7 @@ function plotKey({ key }) {
   return true;
 }
 
-// Colours: those of the system, or chosen on the page.
+// The colours follow the system's theme or the user's choice on the page.
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const stored = () => { try { return localStorage.getItem("theme") ?? "auto"; } catch { return theme; } };
 let theme = "auto";
@@ -224,7 +224,7 @@ function setTheme(next) {
 function begin() {
   one("#theme").onclick = () => {
     const order = ["auto", "light", "dark"], next = order[(order.indexOf(theme) + 1) % 3];
-    try { localStorage.setItem("theme", next); } catch { /* the choice applies to this page only */ }
+    try { localStorage.setItem("theme", next); } catch { /* The choice applies to this page only. */ }
     setTheme(next);
   };
   dark.onchange = () => setTheme(theme);
@@ -236,7 +236,7 @@ function begin() {
   one("#follow").onclick = () => view.follow();
   for (const details of document.querySelectorAll("details")) details.ontoggle = () => picture && show();
   if (one("#place")) player = new Player();
-  one("#hold").hidden = !!player;  // the player has its own button
+  one("#hold").hidden = !!player;  // The player has its own button.
   if (one("#force")) beginControls();
   const keys = { ...(settings.force ? { Space: ["", "Stop"], ...KEYS } : {}), p: ["", "Pause or resume the plots"], "?": ["", "This help"],
     ...(player ? { Space: ["", "Play or pause"], "← →": ["", "1 s back or on; with Shift 5 s"], ", .": ["", "Previous or next mark"] } : {}) };
@@ -263,7 +263,7 @@ function connect() {
     view.start = given.place?.start ?? null;
     if (drawing) return more = true;
     drawing = true;
-    next();  // requested while this one is drawn; a hidden page requests only one more
+    next();  // Request the next picture while drawing this one. A hidden page requests only one more.
     requestAnimationFrame(() => {
       show();
       drawing = false;
