@@ -23,6 +23,7 @@ FloatArray = NDArray[np.float64]
 
 SERVOS = "servos"
 OBJECT = "object"
+ALL = "all"
 LATE_REPLY_DELAY = 0.010  # s
 
 
@@ -52,7 +53,8 @@ BOARD_FAULTS = {  # kind → default probability
     "saturated": 1.0,
     "zero": 1.0,
 }
-_WITHOUT_VALUE = ("unplug", "plug", "well")
+_PORT_FAULTS = ("unplug", "plug")
+WELL = "well"
 
 
 class FaultSource:
@@ -124,14 +126,17 @@ class FaultEvent(NamedTuple):
     """Start of a device fault or object load."""
 
     after: float  # s
-    part: str  # ``servos``, ``object``, or a finger (board or measurements)
+    part: str  # ``servos``, ``object``, ``all``, or a finger (board or measurements)
     kind: str
     value: float = 1.0  # probability, servo ID, load, or measurement fault value
     over: float = 0.0  # s over which the fault increases
 
     def __str__(self) -> str:
-        value = "" if self.kind in _WITHOUT_VALUE else f"={self.value:g}"
-        return f"{self.part}: {self.kind}{value}" + f" within {self.over:g} s" * bool(self.over)
+        if self.kind == WELL:
+            return "all faults ended" if self.part == ALL else f"{self.part}: all faults ended"
+        value = "" if self.kind in _PORT_FAULTS else f"={self.value:g}"
+        over = f" within {self.over:g} s" * bool(self.over)
+        return f"fault: {self.part}: {self.kind}{value}{over}"
 
 
 class _Form(NamedTuple):
@@ -167,8 +172,8 @@ _FORMS = (
     _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
     _Form(("push", "twist"), "=NUMBER", (OBJECT,)),  # N along the faces, away from the palm; N·m
-    _Form(_WITHOUT_VALUE[:2], "", (SERVOS,), sided=True),
-    _Form(_WITHOUT_VALUE[2:], "", (SERVOS, *FINGERS), sided=True),
+    _Form(_PORT_FAULTS, "", (SERVOS,), sided=True),
+    _Form((WELL,), "", (ALL,), sided=True),
 )
 _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?")
 
@@ -183,8 +188,8 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
       MEASUREMENT_FAULTS.
     - ``unplug`` and ``plug`` affect the servo port, and ``left:unplug`` affects a board's port.
     - ``push=15`` and ``twist=0.3`` apply a permanent load to the object; 0 removes it.
-    - ``well`` ends the faults of the servo line, boards and measurements; ``left:well`` ends the
-      faults of one finger.
+    - ``well`` ends all faults; ``left:well`` ends those of one finger's board and measurements.
+      Loads of the object stay.
 
     The suffix ``@START`` is the start time [s]. With ``@START..END``, a measurement fault increases
     linearly from START to END.

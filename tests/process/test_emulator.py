@@ -278,16 +278,17 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
         assert servos.silent(1)
         assert servos.silent(2)
         assert send(tmp_path, "well") == 0
-        assert servos.silent(1)
-        assert servos.ping(2) == 1020
-        assert send(tmp_path, "answer=1") == 0
-        assert servos.ping(1) == 1020
-        assert send(tmp_path, "unplug plug@0.05") == 0
+        assert log[-1] == "all faults ended"
+        assert servos.ping(1) == servos.ping(2) == 1020
+        for ended in ("plug left:plug@0.05", "well@0.05"):
+            assert send(tmp_path, "unplug left:unplug") == 0
+            servos.close()
+            assert [name for name in LINKS if (tmp_path / name).exists()] == ["tactile-right"]
+            assert send(tmp_path, ended) == 0
+            until(lambda: all((tmp_path / name).exists() for name in LINKS))
+            servos = SdkServos(tmp_path)
+            assert servos.ping(1) == 1020
         servos.close()
-        until((tmp_path / "servos").exists)
-        again = SdkServos(tmp_path)
-        assert again.ping(1) == 1020
-        again.close()
         assert capsys.readouterr().err == ""
         # If one word is invalid, all words are ignored.
         assert send(tmp_path, "silent=2 sillent=2") == 1
@@ -332,7 +333,7 @@ def test_injected_faults_change_measurements_but_not_the_hand(tmp_path):
         assert (left("current", 9.0), right("current", 9.0)) == (3.0, 1.0)
         assert send(tmp_path, "right:well left:gain=0@0.1..0.2") == 0
         until(lambda: board_mean(tmp_path, 1) < 10)
-        until(lambda: log[-2:] == ["fault: right: well", "fault: left: gain=0 within 0.1 s"])
+        until(lambda: log[-2:] == ["right: all faults ended", "fault: left: gain=0 within 0.1 s"])
         until(lambda: left("gain", made.clock.now()) == 0.0)
         assert left("current", 9.0) == 3.0
         assert send(tmp_path, "well") == 0

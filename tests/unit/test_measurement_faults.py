@@ -180,9 +180,7 @@ def test_faults_are_parsed():
         (1.0, "object", "twist", -0.3, 0.0),
     ]
     assert parse_faults(["well", "left:well@1", "right:plug", "noisy"], (1, 2)) == [
-        (0.0, "servos", "well", 1.0, 0.0),
-        (0.0, "left", "well", 1.0, 0.0),
-        (0.0, "right", "well", 1.0, 0.0),
+        (0.0, "all", "well", 1.0, 0.0),
         (0.0, "right", "plug", 1.0, 0.0),
         (0.0, "left", "noisy", 0.1, 0.0),
         (0.0, "right", "noisy", 0.1, 0.0),

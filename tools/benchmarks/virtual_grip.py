@@ -14,8 +14,7 @@ from statistics import fmean
 from typing import Any, Self
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.simulation.faults import OBJECT, parse_faults
-from softfinger.daemon.types import FINGERS
+from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 
@@ -116,12 +115,8 @@ class VirtualGrip(SimulatedDaemon):
 
     def begin(self, words: str) -> None:
         """Start faults given in the form of `softfinger emulate --fault`."""
-        for after, part, kind, value, over in parse_faults(words.split(), ()):
-            if part == OBJECT:
-                self.plant.load(**{kind: value})
-            else:
-                faults = self.plant.measurement_faults[FINGERS.index(part)]
-                faults.begin(kind, value, self.state.t + after, over)
+        for event in parse_faults(words.split(), ()):
+            self.plant.apply_fault(event._replace(after=self.state.t + event.after))
 
     def watched(self, asked: float) -> Watch:
         """Return a `Watch` that records each tick from now on."""

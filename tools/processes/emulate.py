@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
-import json
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.own_files import runtime_fault
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
 from softfinger.tools.stop_condition import Interrupted, Signals
@@ -19,7 +17,6 @@ from softfinger.tools.stop_condition import Interrupted, Signals
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
-_QUERY_INTERVAL = 0.1  # s, time between queries about a plate's or joint's motion
 _FAULTS = """\
 faults, each KIND[=VALUE][@START], any number of them:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
@@ -36,7 +33,8 @@ faults, each KIND[=VALUE][@START], any number of them:
                    negative), replay=S (repeats the last S seconds of frames, at most 3, with new
                    numbers), current=FACTOR of the reported current; to end: factors 1, others 0
   the object       push=N along its faces, away from the palm, twist=N·m; 0 ends it
-  recovery         well for the servos' line, boards and measurements, left:well for one finger
+  recovery         well ends all faults, left:well those of one board and its measurements. Loads of
+                   the object stay, and hardware errors of servos until a reboot
   @START           start time [s], by default at once. gain=0.5@3..5: a measurement changes linearly
                    from 3 to 5 s
 
@@ -178,8 +176,12 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
             made.callback(emulator.close)
         signals.hand_over(emulator.end)
         with RealTime(_unhurried(settings, arguments.baud > 0)):
-            emulator.run(lambda: print("ready", flush=True))
+            emulator.run(lambda: print(_ready(emulator.ports), flush=True))
     return 0
+
+
+def _ready(ports: dict[str, Path]) -> str:
+    return "\n".join(["ready", *(f"{name}: {path}" for name, path in ports.items())])
 
 
 def _unhurried(settings: Settings, paced: bool) -> Settings:
@@ -197,24 +199,13 @@ def _unhurried(settings: Settings, paced: bool) -> Settings:
 
 
 def _send(folder: Path, words: str) -> int:
-    from softfinger.daemon.simulation.emulator.folder import NoEmulator, send_words
+    from softfinger.daemon.simulation.emulator.folder import carry_out
 
     try:
-        reply = send_words(folder, words)
-        # The motion follows the emulated hand's clock, which stops while the emulator is suspended.
-        # Therefore query the remaining time repeatedly.
-        kind = words.partition(" ")[0]
-        while kind in ("press", "turn") and reply.startswith("{"):
-            left = json.loads(reply)["wait"]
-            if left == 0.0:
-                return 0
-            time.sleep(min(left, _QUERY_INTERVAL))
-            reply = send_words(folder, kind)
-    except NoEmulator as error:
-        reply = f"error: {error}"
-    if reply.startswith("error: "):
-        print(f"softfinger: {reply.removeprefix('error: ')}", file=sys.stderr)
+        reply = carry_out(folder, words)
+    except SoftfingerError as error:
+        print(f"softfinger: {error}", file=sys.stderr)
         return 1
-    if reply != "ok":
+    if reply:
         print(reply)
     return 0

@@ -26,17 +26,21 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.simulation.emulator.folder import ControlPort, FolderError, LinkFolder
+from softfinger.daemon.simulation.emulator.folder import (
+    ControlPort,
+    FolderError,
+    LinkFolder,
+    find_ports,
+)
 from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse_presses
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard, encoder_for
 from softfinger.daemon.simulation.faults import (
-    MEASUREMENT_FAULTS,
-    OBJECT,
+    ALL,
     SERVOS,
+    WELL,
     FaultError,
     FaultEvent,
-    LineFaults,
     parse_faults,
 )
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
@@ -244,6 +248,11 @@ class Emulator:
                 ready = True
                 on_ready()
 
+    @property
+    def ports(self) -> dict[str, Path]:
+        """Links to the ports: ``servos``, ``tactile-left``, ``tactile-right``."""
+        return find_ports(self._links.path)
+
     def end(self) -> None:
         """End :meth:`run`. Signal handlers and other threads may call this."""
         self._stopping = True
@@ -405,40 +414,23 @@ class Emulator:
         return {"t": t, "monotonic": time.monotonic(), **hand}
 
     def _apply(self, event: FaultEvent, t: float) -> None:
-        after, part, kind, value, over = event
-        self._tell(f"fault: {event}")
-        if part == OBJECT:
-            self.hand.load(**{kind: value})
+        self._tell(str(event))
+        if self.hand.apply_fault(event) and event.kind != WELL:
             return
-        if kind in MEASUREMENT_FAULTS:
-            self.hand.measurement_faults[FINGERS.index(part)].begin(kind, value, after, over)
-            return
-        if kind == "well" and part in FINGERS:
-            self.hand.measurement_faults[FINGERS.index(part)].clear()
-        device = self._servos if part == SERVOS else self._boards.get(part)
-        if device is None:
-            return
-        name = part if part == SERVOS else f"tactile-{part}"
-        if kind == "unplug":
-            self._links.unlink(name)
-            if device.plugged:
+        devices = {SERVOS: self._servos, **self._boards}
+        for part in devices if event.part == ALL else (event.part,):
+            device = devices.get(part)
+            if device is None:
+                continue
+            name, was_plugged = part if part == SERVOS else f"tactile-{part}", device.plugged
+            if was_plugged and event.kind == "unplug":
                 self._selector.unregister(device)
-            device.unplug()
-        elif kind == "plug":
-            if not device.plugged:
-                device.plug()
+                self._links.unlink(name)
+            device.apply_fault(event.kind, event.value, t)
+            if device.plugged and not was_plugged:
                 hear = device.hear if isinstance(device, TactileBoard) else None
                 self._selector.register(device, selectors.EVENT_READ, hear)
                 self._links.link(name, device.path)
-        elif isinstance(device, TactileBoard):
-            if kind == "well":
-                device.faults.clear()
-            else:
-                device.faults[kind] = value
-        elif kind == "well":
-            device.bus.faults.rates = LineFaults()
-        else:
-            device.bus.fault(kind, value, t)
 
 
 def with_board(settings: Settings) -> Settings:

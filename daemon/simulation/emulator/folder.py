@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
 import selectors
 import socket
 import stat
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from softfinger.daemon.errors import SoftfingerError
+from softfinger.daemon.errors import Reason, Refused, SoftfingerError
 from softfinger.kinematics.compiled.own_folder import require_own
 
 LINKS = ("servos", "tactile-left", "tactile-right")
@@ -26,6 +28,8 @@ _MESSAGE_SIZE_MAX = 4096  # bytes per message
 _REPLY_SIZE_MAX = 1 << 17
 _CLIENT_COUNT_MAX = 8  # simultaneous clients
 _CLIENT_TIMEOUT = 10.0  # s, client timeout, long enough for a busy machine
+_MOTIONS = ("press", "turn")
+_QUERY_INTERVAL = 0.1  # s, time between queries about a plate's or joint's motion
 
 
 class FolderError(SoftfingerError):
@@ -102,6 +106,11 @@ class LinkFolder:
             os.close(self._lock)
 
 
+def find_ports(folder: Path) -> dict[str, Path]:
+    """Return the links to ports in ``folder`` by their names."""
+    return {name: folder / name for name in LINKS if (folder / name).is_symlink()}
+
+
 class NoEmulator(SoftfingerError):
     """Raised if no emulator is running in the folder or it does not respond."""
 
@@ -169,6 +178,33 @@ class ControlPort:
             self._clients.remove(client)
             self._selector.unregister(client)
             client.close()
+
+
+def carry_out(folder: Path, text: str) -> str:
+    """Send ``text`` to the emulator in ``folder``, wait until motions arrive; return the reply.
+
+    The reply is empty unless a report was requested.
+
+    Raises
+    ------
+    NoEmulator
+        If no emulator runs there, or it does not answer.
+    Refused
+        If the emulator rejects the text; the message lists the expected words.
+    """
+    reply = send_words(folder, text)
+    # The motion is timed by the emulated hand's clock, which stops while the emulator is
+    # suspended, so ask again for the remaining time.
+    kind = text.partition(" ")[0]
+    while kind in _MOTIONS and reply.startswith("{"):
+        left = json.loads(reply)["wait"]
+        if left == 0.0:
+            return ""
+        time.sleep(min(left, _QUERY_INTERVAL))
+        reply = send_words(folder, kind)
+    if reply.startswith("error: "):
+        raise Refused(reply.removeprefix("error: "), Reason.REQUEST)
+    return "" if reply == "ok" else reply
 
 
 def send_words(folder: Path, text: str) -> str:

@@ -17,6 +17,7 @@ import time
 import tty
 from collections.abc import Callable
 
+from softfinger.daemon.simulation.faults import WELL
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 
 _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control characters, two speeds
@@ -105,6 +106,17 @@ class PtyServoBus:
             os.close(self._master)
             os.close(self._slave)
         self._master = self._slave = -1
+
+    def apply_fault(self, kind: str, value: float, t: float) -> None:
+        """Begin a fault of the port, the line or a servo; ``plug`` and ``well`` end faults."""
+        if kind == "unplug":
+            self.unplug()
+        elif kind in ("plug", WELL) and not self.plugged:
+            self.plug()
+        if kind == WELL:
+            self.bus.recover(t)
+        else:
+            self.bus.fault(kind, value, t)
 
     def client_baud(self) -> int:
         """Return the baud rate of the terminal."""

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.simulation.emulator.pty_bus import open_pty
+from softfinger.daemon.simulation.faults import BOARD_FAULTS, WELL
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
@@ -137,6 +138,17 @@ class TactileBoard:
         if self.plugged:
             self._writer.close()
         self.plugged = False
+
+    def apply_fault(self, kind: str, value: float, _t: float = 0.0) -> None:
+        """Begin a fault of the port or the board; ``plug`` and ``well`` end faults."""
+        if kind == "unplug":
+            self.unplug()
+        elif kind in ("plug", WELL) and not self.plugged:
+            self.plug()
+        if kind == WELL:
+            self.faults.clear()
+        elif kind in BOARD_FAULTS:
+            self.faults[kind] = value
 
     @property
     def dropped(self) -> int:

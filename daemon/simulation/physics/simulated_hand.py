@@ -20,7 +20,14 @@ from softfinger.daemon.servos.control_table import (
     POSITION_MODE,
     by_name,
 )
-from softfinger.daemon.simulation.faults import MeasurementFaults
+from softfinger.daemon.simulation.faults import (
+    ALL,
+    MEASUREMENT_FAULTS,
+    OBJECT,
+    WELL,
+    FaultEvent,
+    MeasurementFaults,
+)
 from softfinger.daemon.simulation.physics import plant
 from softfinger.daemon.simulation.physics.energy_guard import LOSSLESS_TOLERANCE
 from softfinger.daemon.simulation.physics.plant_state import (
@@ -351,6 +358,22 @@ class SimulatedHand:
         """
         angle = self.object_pose.item(2)
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
+
+    def apply_fault(self, event: FaultEvent) -> bool:
+        """Begin a load or a measurement fault, or end the latter; return False for other faults."""
+        kind, part = event.kind, event.part
+        if part == OBJECT:
+            self.load(**{kind: event.value})
+        elif kind in MEASUREMENT_FAULTS:
+            faults = self.measurement_faults[FINGERS.index(part)]
+            faults.begin(kind, event.value, event.after, event.over)
+        elif kind == WELL:
+            for finger, faults in zip(FINGERS, self.measurement_faults, strict=True):
+                if part in (ALL, finger):
+                    faults.clear()
+        else:
+            return False
+        return True
 
     @property
     def sample_count(self) -> int:

@@ -26,6 +26,7 @@ from softfinger.daemon.simulation.faults import (
     LINE_FAULTS,
     SERVO_FAULTS,
     FaultSource,
+    LineFaults,
 )
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, PacketParser
@@ -178,6 +179,13 @@ class ServoBus:
         for servo in self.servos:
             if kind in SERVO_FAULTS and servo.id == value:
                 servo.fault(kind, t)
+
+    def recover(self, t: float) -> None:
+        """End all faults. Hardware errors stay latched until a reboot."""
+        self.faults.rates = LineFaults()
+        for servo in self.servos:
+            for kind in ("answer", "recover"):
+                self.fault(kind, servo.id, t)
 
     def report(self, t: float) -> list[dict[str, Any]]:
         """Return each servo's state and record."""
