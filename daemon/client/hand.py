@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
 from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
@@ -83,8 +84,9 @@ class Hand(HandClient[None]):
     """
 
     _states: Subscription[HandState] | None = None
+    _now = staticmethod(time.monotonic)  # time of `wait_for` [s]
 
-    def __enter__(self) -> Hand:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -139,7 +141,7 @@ class Hand(HandClient[None]):
         NoStream
             If no state arrives.
         """
-        wait = Wait(condition, timeout)
+        wait = Wait(condition, timeout, self._now)
         with self.stream() as states:
             while True:
                 try:
@@ -159,8 +161,10 @@ class Hand(HandClient[None]):
         NoAnswer
             If the reply does not arrive in time.
         """
-        request = self._request(name, numbers)
-        return accepted(send(self.command_address, request, self.timeout, self._keys))
+        return accepted(self._send(self._request(name, numbers)))
+
+    def _send(self, request: dict[str, Any]) -> dict[str, Any]:
+        return send(self.command_address, request, self.timeout, self._keys)
 
     def _carry_out(self, command: str, **numbers: float | None) -> None:
         try:

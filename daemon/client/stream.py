@@ -218,15 +218,21 @@ class Subscriber(Generic[_Record]):
 class Wait:
     """Wait of up to ``timeout`` s for a state that satisfies ``condition``."""
 
-    def __init__(self, condition: Callable[[HandState], object], timeout: float) -> None:
+    def __init__(
+        self,
+        condition: Callable[[HandState], object],
+        timeout: float,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._condition = condition
         self._timeout = timeout
-        self._end = time.monotonic() + timeout
+        self._now = now
+        self._end = now() + timeout
         self._last: HandState | None = None
 
     def left(self) -> float:
         """Return the remaining time [s]. Raises NotInTime if it is over and a state has arrived."""
-        left = self._end - time.monotonic()
+        left = self._end - self._now()
         if left <= 0.0 and self._last is not None:
             raise self.over("")
         return max(left, 0.0)

@@ -27,9 +27,9 @@ _RESTART_DELAYS = 0.1, 2.0  # s, first and longest delay between an exit and the
 class Gateway:
     """Gateway process, restarted until `close` is called. The loop communicates through `link`."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, link: Link | None = None) -> None:
         """Start the process in the background. Call `wait` before use."""
-        self.link = Link()
+        self.link = link or Link()
         self._config = config
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None

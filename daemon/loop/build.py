@@ -29,6 +29,7 @@ from softfinger.daemon.tactile.base import TactileSensor, make_sensor
 from softfinger.daemon.types import FINGERS, HandInfo
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.local_stop import LocalStop
+from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
@@ -53,7 +54,7 @@ class Daemon:
         settings: Settings,
         *,
         on_event: EventSink | None = None,
-        wire: bool = True,
+        wire: bool | Link = True,
         hand: Settings | None = None,
     ) -> None:
         """Build and connect the daemon.
@@ -61,7 +62,7 @@ class Daemon:
         Parameters
         ----------
         on_event : called with the level, kind and text of each event
-        wire : serve clients over ZeroMQ
+        wire : serve clients over ZeroMQ; with a `Link`, its owner exchanges the messages instead
         hand : settings of the simulated hand if they differ from those the daemon assumes
         """
         self.settings = settings
@@ -75,9 +76,13 @@ class Daemon:
             self.close()
             raise
 
-    def _build(self, on_event: EventSink | None, wire: bool) -> None:
+    def _build(self, on_event: EventSink | None, wire: bool | Link) -> None:
         settings = self.settings
-        publisher, server = self._bind() if wire else (None, None)
+        publisher, server = None, None
+        if isinstance(wire, Link):
+            publisher, server = Publisher(wire), CommandServer(wire, clock=self.clock.now)
+        elif wire:
+            publisher, server = self._bind()
         self.publisher = publisher
         scene = WantedScene(settings, on_event)
         self.models = scene.models

@@ -6,59 +6,28 @@ Timing tests run the bus in a separate process instead of a thread.
 from __future__ import annotations
 
 import math
-import select
 import struct
-import threading
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT, by_name
+from softfinger.daemon.servos.control_table import COUNTS_PER_TURN
 from softfinger.daemon.servos.dynamixel import DynamixelServos
-from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.servos.port import SerialPort
-from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
-from softfinger.daemon.simulation.servo_model import framing, servo
+from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import PacketParser, frame
+from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from tests.harness.free_joints import FreeJoints
+from softfinger.testing.emulated import EmulatedBus, free_servos
 
-_LOOK = 0.005  # s between checks for changes by the test
 RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 
 
-def make_bus(
-    model: str = "XM430-W210",
-    ids: Sequence[int] = (1, 2),
-    *,
-    firmware: int | None = None,
-    counts: Sequence[int] = (),
-    prepared: bool = False,
-    t: float = 0.0,
-    **options: Any,
-) -> ServoBus:
-    """Return servos with factory settings on free joints at positions ``counts``, at time ``t``."""
-    plant, chosen = FreeJoints(len(ids), t), by_name(model)
-    eeprom = servo.prepared(chosen, reg.CURRENT_BASED_POSITION_MODE) if prepared else {}
-    for joint, count in enumerate(counts):
-        plant.q[joint] = count * RADIAN
-    servos = [
-        EmulatedServo(
-            chosen,
-            plant,
-            joint,
-            JointScale(1, 0, RADIAN, VELOCITY_UNIT, chosen.current_unit),
-            eeprom | {reg.ID: servo_id},
-            firmware=firmware,
-            t=t,
-        )
-        for joint, servo_id in enumerate(ids)
-    ]
-    return ServoBus(servos, plant, **options)
+def make_bus(model: str = "XM430-W210", ids: Sequence[int] = (1, 2), **options: Any) -> ServoBus:
+    """Return factory-new servos on free joints, by default at angle 0; see `free_servos`."""
+    return free_servos(model, ids, **options)
 
 
 def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: Any) -> ServoBus:
@@ -82,7 +51,7 @@ def backend_settings(path: str, **servos: Any) -> Settings:
 
 def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
     """Return a Dynamixel backend connected to a running bus."""
-    backend = DynamixelServos(backend_settings(bus.path, **servos), RealClock())
+    backend = DynamixelServos(backend_settings(bus.port, **servos), RealClock())
     backend.connect()
     return backend
 
@@ -159,28 +128,11 @@ class DirectPort(SerialPort):
         return False
 
 
-class RunningBus:
-    """Bus on a pty in monotonic time, served by a thread until closed."""
+class RunningBus(EmulatedBus):
+    """Bus served by a thread: a given one, or the servos of the settings."""
 
-    def __init__(
-        self,
-        bus: ServoBus | None = None,
-        baud: int = 0,
-        **options: Any,
-    ) -> None:
-        self._looked, self._stood = time.monotonic(), 0.0
-        if bus is None:
-            bus = hand_bus(t=self._now(), baud=baud, **options)
-        self.bus = bus
-        self.port = PtyServoBus(bus, baud=baud, clock=self._now)
-        self._between_packets = threading.Lock()
-        self._running = True
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
-
-    @property
-    def path(self) -> str:
-        return self.port.path
+    def __init__(self, bus: ServoBus | None = None, baud: int = 0, **options: Any) -> None:
+        super().__init__(baud=baud, bus=bus or hand_bus(baud=baud, **options))
 
     def servo(self, index: int) -> EmulatedServo:
         return self.bus.servos[index]
@@ -188,29 +140,3 @@ class RunningBus:
     def memory(self, index: int) -> bytes:
         """Return a copy of a servo's control table."""
         return self.call(lambda: bytes(self.servo(index).table.memory))
-
-    def call(self, job: Callable[[], Any]) -> Any:
-        """Run ``job`` between two packets and return its result."""
-        with self._between_packets:
-            return job()
-
-    def fault(self, text: str) -> None:
-        self.call(lambda: put_fault(self.bus, text, self._now()))
-
-    def close(self) -> None:
-        self._running = False
-        self._thread.join()
-        self.port.unplug()
-
-    def _serve(self) -> None:
-        while self._running:
-            wait = min(max(0.0, self.port.next_event() - self._now()), _LOOK)
-            select.select([self.port], [], [], wait)
-            with self._between_packets:
-                self.port.service(self._now())
-
-    def _now(self) -> float:
-        """Return monotonic time without this process's stalls, which must not affect the servos."""
-        looked, self._looked = self._looked, time.monotonic()
-        self._stood += max(self._looked - looked - 0.5, 0.0)
-        return self._looked - self._stood

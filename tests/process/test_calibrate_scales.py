@@ -65,6 +65,6 @@ def test_factors_can_be_taken_from_the_last_state_of_a_recording(tmp_path, capsy
     mean, std = told["torque_scale"], told["torque_scale_std"]
     assert found.torque == pytest.approx((mean, std / mean))
     without = tmp_path / "without.mcap"
-    record_hand(without, due, 0.1, without=(STATE,))
+    record_hand(without, {}, 0.1, ("stream.state_rate=1",))
     assert main([*words, str(without)]) == 1
     assert f"{without}: no hand/state in it" in capsys.readouterr().err

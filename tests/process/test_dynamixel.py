@@ -23,9 +23,7 @@ FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fas
 
 def placed(firmware: int, *counts: int) -> ServoBus:
     """Return servos of a firmware at these counts, configured for the hand."""
-    return make_bus(
-        "XM430-W350", firmware=firmware, prepared=True, counts=counts, t=time.monotonic()
-    )
+    return make_bus("XM430-W350", firmware=firmware, for_daemon=True, counts=counts)
 
 
 def read(backend: DynamixelServos) -> Reading:
@@ -98,7 +96,7 @@ def test_torque_on_waits_for_a_moving_joint(bus, connect, monkeypatch):
 
     monkeypatch.setattr(ServoLine, "store", store)
     backend.torque_on()
-    for servo in bus.bus.report(time.monotonic()):
+    for servo in bus.report():
         assert servo["torque"]
         assert servo["torque_on"]["farthest"] < 0.01
 
@@ -120,7 +118,7 @@ def test_joints_follow_their_goals(running, model, level):
     bus = running(servos={"model": model})
     bus.call(lambda: [s.table.set(reg.STATUS_RETURN_LEVEL, level) for s in bus.bus.servos])
     safety = SafetySettings(current_max=by_name(model).stall_current, current_move=0.1)
-    settings = backend_settings(bus.path, model=model).model_copy(update={"safety": safety})
+    settings = backend_settings(bus.port, model=model).model_copy(update={"safety": safety})
     backend = DynamixelServos(settings, RealClock())
     backend.connect()
     backend.torque_on()
@@ -237,7 +235,7 @@ def test_a_servo_that_stopped_by_itself_is_detected_despite_timely_writes(bus, c
     backend.write(goal)
     servo = bus.servo(1)
     if "off" in what:
-        bus.call(lambda: servo.reboot(time.monotonic()))
+        bus.call(lambda: servo.reboot(bus.now()))
     else:
         bus.call(lambda: servo.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR))
     with pytest.raises(ServoError, match=f"right.*: {what}"):

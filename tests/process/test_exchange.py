@@ -30,7 +30,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
     """Return the doctor's result for the exchange of one tick."""
-    settings = backend_settings(bus.path, **servos)
+    settings = backend_settings(bus.port, **servos)
     loop = settings.loop.model_copy(update={"rate": rate})
     settings = settings.model_copy(update={"loop": loop})
     (found,) = [each for each in devices.check_servos(settings) if each.subject == "exchange"]
@@ -134,7 +134,7 @@ def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
         bus.servo(i).silent = True
     open_port = SerialPort.openPort
     monkeypatch.setattr(SerialPort, "openPort", lambda self: opened.append(1) or open_port(self))
-    backend = DynamixelServos(backend_settings(bus.path, reply_timeout=0.2), RealClock())
+    backend = DynamixelServos(backend_settings(bus.port, reply_timeout=0.2), RealClock())
 
     def connects() -> bool:
         with contextlib.suppress(ServosSilent):
@@ -154,7 +154,7 @@ def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
 def test_doctor_waits_as_long_as_run(running):
     bus = running()
     bus.servo(1).silent = True
-    settings = backend_settings(bus.path, open_timeout=60.0)
+    settings = backend_settings(bus.port, open_timeout=60.0)
     pinged: list[int] = []
 
     def answer_the_third(data: bytes, *rest: Any) -> Any:

@@ -11,7 +11,8 @@ from tests.harness.daemon_process import python
 ROOT = Path(__file__).parents[2]
 PORTABLE = (
     "softfinger",
-    "softfinger.testing",
+    "softfinger.testing.checks",
+    "softfinger.testing.plugin",
     "softfinger.daemon.client.asynchronous",
     "softfinger.gym.environment",
     "softfinger.kinematics.estimation.estimator",

@@ -58,7 +58,7 @@ def held(bus: RunningBus, address: int, servo: int = 0) -> int:
 
 def told(bus: RunningBus, **servos: Any) -> list[Finding]:
     """Return the doctor's findings on the left servo."""
-    settings = backend_settings(bus.path, **servos)
+    settings = backend_settings(bus.port, **servos)
     return [each for each in devices.check_servos(settings) if each.subject == LEFT]
 
 
@@ -70,7 +70,7 @@ def test_changed_eeprom_registers_are_reported_and_repaired(bus, address, value,
     if status == "FAIL":
         with pytest.raises(ServoError, match=text[:20]):
             connected(bus)
-    fixed = [each for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    fixed = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert [each.status for each in fixed] == ["fixed"]
     connected(bus).close()
     assert [each.status for each in told(bus)] == ["pass"]
@@ -87,8 +87,8 @@ def test_arm_overwrites_changed_ram_registers(bus, connect, reboots):
     backend = connect(bus)
     if reboots:
         backend.torque_on()
-        bus.call(lambda: bus.servo(0).reboot(bus._now()))
-        until(lambda: bus.call(lambda: bus.servo(0).awake(bus._now())))
+        bus.call(lambda: bus.servo(0).reboot(bus.now()))
+        until(lambda: bus.call(lambda: bus.servo(0).awake(bus.now())))
         for address, value in RAM:  # another program immediately writes to it
             put(bus, address, value)
     backend.torque_on()
@@ -117,7 +117,7 @@ def test_factory_settings_of_every_model_pass_the_checks():
 
 
 def test_registers_are_saved_and_restored(bus, tmp_path):
-    path, settings = tmp_path / "servos.json", backend_settings(bus.path)
+    path, settings = tmp_path / "servos.json", backend_settings(bus.port)
     put(bus, reg.PWM_LIMIT, 300)
     put(bus, reg.PROFILE_VELOCITY, 5)
     put(bus, reg.HOMING_OFFSET, -77)
@@ -138,7 +138,7 @@ def test_registers_are_saved_and_restored(bus, tmp_path):
 
 
 def test_invalid_register_files_are_refused(bus, tmp_path):
-    path, settings = tmp_path / "servos.json", backend_settings(bus.path)
+    path, settings = tmp_path / "servos.json", backend_settings(bus.port)
     with pytest.raises(ServoError, match="No such file"):
         restore_registers(settings, path)
     strange = '{"servos": [{"id": 1, "model": "X", "firmware": 1, "registers": {"a": 1}}]}'
@@ -162,7 +162,7 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
     (found,) = [each for each in told(bus) if each.status == "FAIL"]
     assert "its servo has counted 2 turns too many" in found.text
     assert found.fix == "reboot it: switch its supply off and on, or `softfinger doctor --fix`"
-    (fixed,) = [each for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    (fixed,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert "rebooted, since its position was a turn off" in fixed.text
     assert [each.status for each in told(bus)] == ["pass"]
 
@@ -172,7 +172,7 @@ def test_a_servo_with_protocol_1_is_recognised(bus):
     text = "answers Protocol 1.0, expected 2.0"
     (found,) = told(bus, open_timeout=0.1)
     assert (found.status, found.text) == ("FAIL", text)
-    backend = DynamixelServos(backend_settings(bus.path, reply_timeout=0.3), RealClock())
+    backend = DynamixelServos(backend_settings(bus.port, reply_timeout=0.3), RealClock())
     with pytest.raises(ServoError, match=f"left\\): {text}"):
         backend.connect()
     backend.close()

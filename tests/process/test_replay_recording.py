@@ -20,26 +20,26 @@ from tests.conftest import until
 from tests.harness.daemon_process import PATIENT, softfinger, started
 from tests.harness.golden_recording import MADE_ON, RECORDING, machine_class
 from tests.harness.golden_wire import sample
-from tests.harness.recorded_hand import Messages, Script, published
+from tests.harness.recorded_hand import record_hand
+
+Messages = list[tuple[bytes, dict[str, Any]]]
 
 
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
     """Return all messages published during a grasp, a turn, a refused command and a stop."""
-    script = Script(
-        {
-            50: {"command": "arm"},
-            51: {"command": "grasp", "force": 6.0},
-            750: {"command": "move", "left": 0.1},  # refused while holding
-            800: {"command": "rotate", "angle": 0.1},
-            1100: {"command": "stop"},
-        }
-    )
-    folder = tmp_path_factory.mktemp("sockets")
-    sent = published(folder, script, 2.3, ("stream.state_rate=500",))
+    due = {
+        50: {"command": "arm"},
+        51: {"command": "grasp", "force": 6.0},
+        750: {"command": "move", "left": 0.1},  # refused while holding
+        800: {"command": "rotate", "angle": 0.1},
+        1100: {"command": "stop"},
+    }
+    path = tmp_path_factory.mktemp("recorded") / "taken.mcap"
+    assert len(record_hand(path, due, 2.3, ("stream.state_rate=500",))) == 1
+    sent = list(Recording(path).messages())
     states = [message for topic, message in sent if topic == schema.STATE]
     assert states[-1]["mode"] == "disarmed"
-    assert script.refused == 1
     return sent
 
 

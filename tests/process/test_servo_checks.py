@@ -111,14 +111,14 @@ def test_all_problems_are_listed_with_their_fixes(running, options, faults, regi
         bus.fault(fault)
     for address, value in registers.items():
         bus.call(lambda at=address, value=value: bus.servo(1).table.set(at, value))
-    lines = refusal(bus.path)
+    lines = refusal(bus.port)
     # The servo itself may already have detected the supply voltage.
     assert [line for line in lines if "input voltage" not in line] == told
 
 
 def test_a_model_without_current_control_is_refused(running):
     bus = running(servos={"model": "XL430-W250", "mode": "position"})
-    lines = refusal(bus.path, model="XL430-W250")
+    lines = refusal(bus.port, model="XL430-W250")
     assert sum("no current-based position mode" in line for line in lines) == 2
 
 
@@ -126,15 +126,15 @@ def test_a_model_without_current_control_is_refused(running):
 def test_missing_servos_are_reported(bus, silent):
     for servo in silent:
         bus.fault(f"silent={servo}")
-    (line,) = refusal(bus.path, reply_timeout=0.5)
+    (line,) = refusal(bus.port, reply_timeout=0.5)
     missing = "servo 2 (right): no answer at 2000000 baud: check its cable"
-    nothing = f"{bus.path}: no servo answers at 2000000 baud (IDs 1, 2): check power"
+    nothing = f"{bus.port}: no servo answers at 2000000 baud (IDs 1, 2): check power"
     assert line.startswith(missing if silent == (2,) else nothing)
 
 
 def test_the_wrong_baud_rate_is_reported(running):
     bus = running(baud=1_000_000)
-    (line,) = refusal(bus.path, baud=3_000_000, reply_timeout=0.05)
+    (line,) = refusal(bus.port, baud=3_000_000, reply_timeout=0.05)
     assert "no servo answers at 3000000 baud" in line
     connected(bus, baud=1_000_000).close()
 
@@ -143,7 +143,7 @@ def test_unusable_ports_are_reported(bus):
     assert "no such port: plug the adapter in" in refusal("/dev/does-not-exist")[0]
     assert "no such port: start `softfinger emulate`" in refusal("/tmp/does-not-exist/servos")[0]
     first = connected(bus)
-    assert "in use by another process" in refusal(bus.path)[0]
+    assert "in use by another process" in refusal(bus.port)[0]
     reading = Reading()
     first.read(reading)
     assert reading.valid
@@ -183,7 +183,7 @@ def test_forces_and_friction_that_overtax_a_model_are_notices(running):
 
 
 def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
-    name = Path(os.path.realpath(bus.path)).name
+    name = Path(os.path.realpath(bus.port)).name
     (tmp_path / name / "device").mkdir(parents=True)
     place = tmp_path / name / "device" / "latency_timer"
     place.write_text("16\n")
@@ -191,7 +191,7 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     # The low-latency mode is not available, as on this pseudo-terminal.
     text = "16 ms, so every read takes that long"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
-    assert refusal(bus.path, reply_timeout=0.004)[0] == f"{bus.path} latency timer: {text}: {fix}"
+    assert refusal(bus.port, reply_timeout=0.004)[0] == f"{bus.port} latency timer: {text}: {fix}"
     backend = connected(bus)  # the time-out is longer than the latency timer
     assert (backend.notices[0].text, backend.notices[0].fix) == (text, fix)
     backend.close()
@@ -208,8 +208,8 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     assert backend.notices == ()
     backend.close()
     place.write_text("nonsense")
-    assert "can't be read" in checks.check_latency_timer(bus.path, 1.0).text
-    port = SerialPort(bus.path, 2_000_000, 1.0, low_latency=False)
+    assert "can't be read" in checks.check_latency_timer(bus.port, 1.0).text
+    port = SerialPort(bus.port, 2_000_000, 1.0, low_latency=False)
     port.openPort()
     port.closePort()
     assert asked == [True]

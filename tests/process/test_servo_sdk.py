@@ -19,7 +19,7 @@ Line = tuple[SerialPort, PacketHandler]
 
 @pytest.fixture
 def line(bus: RunningBus) -> Iterator[Line]:
-    port = SerialPort(bus.path, 2_000_000, 1.0)  # the bus shares this process's interpreter lock
+    port = SerialPort(bus.port, 2_000_000, 1.0)  # the bus shares this process's interpreter lock
     port.openPort()
     yield port, PacketHandler()
     port.closePort()
@@ -60,7 +60,7 @@ def test_other_sdk_calls_work_with_our_handler(line):
 
 
 def test_the_unmodified_sdk_works(bus):
-    port = sdk.PortHandler(bus.path)
+    port = sdk.PortHandler(bus.port)
     handler = sdk.PacketHandler(2.0)
     assert port.openPort()
     assert port.setBaudRate(1_000_000)  # closes and reopens the pty

@@ -135,7 +135,7 @@ def test_protocol_1_if_configured() -> None:
 
 def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
     """Return the distance [counts] moved in this time towards a goal of 300 counts."""
-    c = client(prepared=True)
+    c = client(for_daemon=True)
     for address, value, size in writes:
         assert c.write(address, value, size) == 0
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
@@ -252,7 +252,7 @@ def test_a_mode_change_resets_goals_gains_and_profiles() -> None:
 
 
 def test_turns_are_kept_until_position_mode_or_clear() -> None:
-    c = client(prepared=True)
+    c = client(for_daemon=True)
     c.bus.plant.q[0] = 5000 * RADIAN
     assert c.read(reg.PRESENT_POSITION, 4) == 5000
     assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == 0
@@ -282,7 +282,7 @@ def test_realtime_tick_wraps() -> None:
 
 
 def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() -> None:
-    c = client(prepared=True)
+    c = client(for_daemon=True)
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.write(reg.BUS_WATCHDOG, 5, 1)
     c.write(reg.GOAL_CURRENT, 40, 2)

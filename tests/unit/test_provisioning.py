@@ -21,8 +21,8 @@ from softfinger.daemon.servos.provisioning import (
     provision,
     search,
 )
+from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from tests.harness.free_joints import FreeJoints
 from tests.harness.servos import DirectPort, put_fault
 
 MODEL = by_name("XM430-W350")

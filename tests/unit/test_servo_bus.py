@@ -9,9 +9,9 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, PacketParser, frame
+from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.fuzz.servo_bus import fuzz
-from tests.harness.free_joints import FreeJoints
 from tests.harness.servos import RADIAN, BusClient, hand_bus, make_bus, put_fault
 
 
@@ -249,7 +249,7 @@ def test_directions_and_zero_offsets_of_the_settings() -> None:
 
 
 def test_a_reading_may_lag_behind_the_plant_but_writes_and_watchdogs_may_not() -> None:
-    c = client(prepared=True)
+    c = client(for_daemon=True)
     bus = c.bus
     bus.lag = 0.0005
     c.write(reg.TORQUE_ENABLE, 1, 1)

@@ -34,7 +34,7 @@ STEPS = st.one_of(
 
 def placed(angles: tuple[float, float]) -> ServoBus:
     # The status and ID registers are protected by the check below, so the servos stay reachable.
-    return make_bus("XM430-W210", prepared=True, counts=[angle / RADIAN for angle in angles])
+    return make_bus("XM430-W210", for_daemon=True, counts=[angle / RADIAN for angle in angles])
 
 
 def out_of_reach(address: int, data: bytes) -> bool:

@@ -1,0 +1,44 @@
+"""Test kit for programs that control a hand or Dynamixel servos.
+
+The pytest fixtures `emulated_hand`, `virtual_hand` and `recorded_hand` are available in every test
+run of an environment that has softfinger. They return the classes of this package, which also work
+as context managers without pytest. The checks are for authors of backend plugins. Each name is
+imported on first access, so that other test runs do not load Numba.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from softfinger.daemon.profile.load import load
+    from softfinger.testing.checks import check_servos, check_shape, check_tactile
+    from softfinger.testing.emulated import EmulatedBus, EmulatedHand
+    from softfinger.testing.virtual import RecordedHand, VirtualHand
+
+__all__ = [
+    "EmulatedBus",
+    "EmulatedHand",
+    "RecordedHand",
+    "VirtualHand",
+    "check_servos",
+    "check_shape",
+    "check_tactile",
+    "load",
+]
+
+_MODULES = {
+    "EmulatedBus": "emulated",
+    "EmulatedHand": "emulated",
+    "RecordedHand": "virtual",
+    "VirtualHand": "virtual",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'softfinger.testing' has no attribute {name!r}")
+    module = import_module(f"softfinger.testing.{_MODULES.get(name, 'checks')}")
+    value = globals()[name] = getattr(module, name)
+    return value

@@ -1,0 +1,227 @@
+"""Emulated hardware on pseudo-terminals: a whole hand in a process, or servos alone in a thread."""
+
+from __future__ import annotations
+
+import json
+import math
+import select
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Self
+
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT, by_name
+from softfinger.daemon.servos.joint import JointScale
+from softfinger.daemon.simulation.emulator.folder import NoEmulator, carry_out, find_ports
+from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
+from softfinger.daemon.simulation.faults import ALL, SERVOS, FaultError, parse_faults
+from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+
+_SERVOS_MAX = 8
+_LOOK = 0.005  # s between checks for changes made by another thread
+_STALL = 0.5  # s; the part of a pause of this process beyond this does not count as servo time
+
+
+class EmulatedHand:
+    """Emulated hand: the process `softfinger emulate`, which ends with this context.
+
+    The first start on a machine compiles kernels, which takes minutes.
+
+    Parameters
+    ----------
+    profile : name or file of a profile; None for the default hand
+    changes : settings to change, in the form of ``--set``
+    options : other options of `softfinger emulate`: ``model="XL330-M288"``, ``ids="1,7"``,
+        ``baud=57600``, ``factory=True``
+
+    Attributes
+    ----------
+    folder : folder of the ports, the ``--dir`` of `softfinger run --config hil`
+    ports : paths of the serial ports ``servos``, ``tactile-left`` and ``tactile-right``
+
+    Raises
+    ------
+    NoEmulator
+        The emulator has not started. Its message is on standard error.
+    """
+
+    def __init__(
+        self, profile: Path | str | None = None, changes: Sequence[str] = (), **options: object
+    ) -> None:
+        self._temporary = TemporaryDirectory(prefix="softfinger-")
+        self.folder = Path(self._temporary.name)
+        words = [f"--dir={self.folder}", *(f"--set={change}" for change in changes)]
+        words += [] if profile is None else [f"--config={profile}"]
+        words += [f"--{name}" if on is True else f"--{name}={on}" for name, on in options.items()]
+        command = [sys.executable, "-P", "-m", "softfinger", "emulate", *words]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        if self._process.stdout.readline() != "ready\n":
+            self.close()
+            text = f"emulate {' '.join(words)}: it has ended: see its message on standard error"
+            raise NoEmulator(text)
+        self.ports = {name: str(path) for name, path in find_ports(self.folder).items()}
+
+    def send(self, words: str) -> str:
+        """Send requests or faults as `softfinger emulate --send` does, and return the reply.
+
+        Examples: ``"place"`` puts the object back, ``"press depth=3mm"`` presses a plate on the
+        tips and waits until it has arrived. Raises Refused if the words are not understood.
+        """
+        return carry_out(self.folder, words)
+
+    def fault(self, *words: str) -> None:
+        """Begin faults such as ``"left:silent"`` or ``"drop=0.01@2"``; ``"well"`` ends all faults.
+
+        `softfinger help emulate` lists them. Raises Refused if a word is not understood.
+        """
+        self.send(" ".join(words))
+
+    def report(self, forget: bool = False) -> dict[str, Any]:
+        """Return the traffic on the servo bus and the true state of the hand.
+
+        `softfinger help emulate` lists the fields. With ``forget`` the record begins again.
+        """
+        report: dict[str, Any] = json.loads(self.send("report forget" if forget else "report"))
+        return report
+
+    def close(self) -> None:
+        """End the process and remove its ports."""
+        self._process.terminate()
+        self._process.communicate()
+        self._temporary.cleanup()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def free_servos(
+    model: str = "XM430-W350",
+    ids: Sequence[int] = (1, 2),
+    *,
+    baud: int = 0,
+    counts: Sequence[int] = (),
+    firmware: int | None = None,
+    for_daemon: bool = False,
+    t: float = 0.0,
+    **options: Any,
+) -> ServoBus:
+    """Create factory-new servos on free joints, which stand at ``counts``, at time ``t`` [s].
+
+    With ``for_daemon`` they have the return delay and the mode that `softfinger run` expects.
+    """
+    plant, chosen = FreeJoints(len(ids), t), by_name(model)
+    radian = 2.0 * math.pi / COUNTS_PER_TURN
+    eeprom = prepared(chosen, reg.CURRENT_BASED_POSITION_MODE) if for_daemon else {}
+    if baud:
+        eeprom |= {reg.BAUD_RATE: chosen.baud_rates.index(baud)}
+    for joint, count in enumerate(counts):
+        plant.q[joint] = count * radian
+    scale = JointScale(1, 0, radian, VELOCITY_UNIT, chosen.current_unit)
+    servos = [
+        EmulatedServo(chosen, plant, k, scale, eeprom | {reg.ID: each}, firmware=firmware, t=t)
+        for k, each in enumerate(ids)
+    ]
+    return ServoBus(servos, plant, **options)
+
+
+class EmulatedBus:
+    """One to eight emulated Dynamixel servos on a serial port, without a hand.
+
+    The servos are factory-new, stand in the middle of their range and turn without a load. A thread
+    serves them in real time until the context ends.
+
+    Parameters
+    ----------
+    model, ids : model and IDs of the servos
+    baud : with 0, the servos answer at any rate and at once; otherwise only at this rate, with its
+        transmission time
+    bus : servos of your own instead, for example on another plant
+
+    Attributes
+    ----------
+    bus : the servos; use `call` to access them while the thread runs
+    """
+
+    def __init__(
+        self,
+        model: str = "XM430-W350",
+        ids: Sequence[int] = (1, 2),
+        *,
+        baud: int = 0,
+        bus: ServoBus | None = None,
+    ) -> None:
+        if not 1 <= len(ids) <= _SERVOS_MAX:
+            raise ValueError(f"ids: found {len(ids)} servos, expected 1 to {_SERVOS_MAX}")
+        middle = [COUNTS_PER_TURN // 2] * len(ids)
+        self.bus = bus or free_servos(model, ids, baud=baud, counts=middle)
+        self._seen, self._origin = time.monotonic(), time.monotonic() - max(self.bus.now, 0.0)
+        self._terminal = PtyServoBus(self.bus, baud=baud, clock=self.now)
+        self._between_packets = threading.Lock()
+        self._running = True
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> str:
+        """Path of the serial port; it changes when the port is unplugged and plugged again."""
+        return self._terminal.path
+
+    def call(self, job: Callable[[], Any]) -> Any:
+        """Run ``job`` between two packets and return its result."""
+        with self._between_packets:
+            return job()
+
+    def fault(self, *words: str) -> None:
+        """Begin faults such as ``"silent=2"`` or ``"drop=0.1"``; ``"well"`` ends all faults.
+
+        Raises FaultError for other words, and for faults that need a hand or begin later.
+        """
+        events = parse_faults(words, tuple(servo.id for servo in self.bus.servos))
+        for event in events:
+            if event.part not in (SERVOS, ALL) or event.after:
+                raise FaultError(f"{event}: expected a fault of servos that begins at once")
+        with self._between_packets:
+            for event in events:
+                self._terminal.apply_fault(event.kind, event.value, self.now())
+
+    def report(self) -> list[dict[str, Any]]:
+        """Return the state and the traffic of each servo, as in `EmulatedHand.report`."""
+        report: list[dict[str, Any]] = self.call(lambda: self.bus.report(self.now()))
+        return report
+
+    def close(self) -> None:
+        """End the thread and remove the port."""
+        self._running = False
+        self._thread.join()
+        self._terminal.unplug()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _serve(self) -> None:
+        while self._running:
+            wait = min(max(0.0, self._terminal.next_event() - self.now()), _LOOK)
+            ports = [self._terminal] if self._terminal.plugged else []
+            select.select(ports, [], [], wait)
+            with self._between_packets:
+                self._terminal.service(self.now())
+
+    def now(self) -> float:
+        """Return the time of the servos [s]: real time without long stalls of this process."""
+        seen, self._seen = self._seen, time.monotonic()
+        self._origin += max(self._seen - seen - _STALL, 0.0)
+        return self._seen - self._origin

@@ -1,0 +1,422 @@
+"""Hands without hardware in virtual time: the simulated hand with its daemon, and a recording."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgpack
+
+from softfinger.daemon.client.hand import Hand, Subscription
+from softfinger.daemon.client.stream import no_stream, read
+from softfinger.daemon.errors import NoStream, Reason, Refused, SettingsError
+from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.supervisor import Gateway
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.faults import FaultError, FaultEvent, parse_faults
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.command_server import CommandServer
+from softfinger.daemon.wire.loop_link import Ask, Link
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, KEPT, bit, pack
+from softfinger.daemon.wire.schema import HandState
+from softfinger.tools.processes.compile import build_kernels, print_event
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.record import RecordingWriter
+
+Controller = Callable[[HandState], Mapping[str, Any] | None]
+
+_QUEUE = 10_000  # messages queued for a subscription; older ones are dropped
+_ROUNDING = 1e-9  # s
+_OWN = b"this process"  # route of own requests
+_EVERYTHING = -1  # all topics, as bits
+
+
+class RecordingOver(NoStream):
+    """The recording has no further message."""
+
+
+class Tap(Link):
+    """Link that also passes published messages to ``take``, and carries requests of its owner."""
+
+    def __init__(self, take: Callable[[bytes, dict[str, Any]], None]) -> None:
+        super().__init__()
+        self._take = take
+        self.tapped = 0  # topics for `take`, as bits
+        self.answer: dict[str, Any] = {}  # to the last request of the owner
+
+    def request(self, request: dict[str, Any], t: float) -> None:
+        """Add a request that arrives at time ``t`` [s]; the next tick sets its `answer`."""
+        urgent = request["command"] == "stop"
+        self.asked.append(Ask(t, self._fence, urgent, "", [_OWN], msgpack.packb(request)))
+
+    def look(self) -> None:
+        super().look()
+        self.wanted |= self.tapped
+
+    def reply(self, ask: Ask, reply: bytes) -> None:
+        if ask.route == [_OWN]:
+            self.answer = msgpack.unpackb(reply)
+        else:
+            super().reply(ask, reply)
+
+    def publish(self, topic: int, message: bytes, keep: int = 0) -> None:
+        super().publish(topic, message, keep)
+        if self.tapped >> topic & 1:
+            self._take(GATEWAY_TOPICS[topic].encode(), msgpack.unpackb(message))
+
+    def kept(self) -> Iterator[tuple[bytes, dict[str, Any]]]:
+        """Yield the stored messages: the settings and the last events."""
+        for topic, messages in self._kept.items():
+            for message in messages:
+                yield GATEWAY_TOPICS[topic].encode(), msgpack.unpackb(message)
+
+
+class VirtualSubscription(Subscription[Any]):
+    """Iterator over the records of one topic; waiting for a record advances the virtual time."""
+
+    def __init__(self, hand: VirtualTimeHand, topic: bytes, timeout: float | None) -> None:
+        # The base would open a socket.
+        self.topic = topic
+        self.waiting: deque[Any] = deque(maxlen=_QUEUE)
+        self.is_open = True
+        self._hand = hand
+        self._timeout = timeout
+
+    def next(self, timeout: float | None) -> Any:
+        """Return the next record. Raises NoStream after ``timeout`` s of virtual time."""
+        begin = self._hand.t
+        while not self.waiting:
+            if timeout is not None and self._hand.t - begin >= timeout:
+                raise no_stream(self._hand.stream_address, self.topic, timeout)
+            self._hand.step()
+        return self.waiting.popleft()
+
+    def __next__(self) -> Any:
+        try:
+            return self.next(self._timeout)
+        except RecordingOver:
+            raise StopIteration from None
+
+    def skip(self) -> None:
+        """Drop queued records."""
+        self.waiting.clear()
+
+    def close(self) -> None:
+        """End the subscription."""
+        self.is_open = False
+        self._hand.select_topics()
+
+
+class VirtualTimeHand(Hand):
+    """Base of the hands in virtual time, which advances only during calls.
+
+    All methods of `softfinger.Hand` work, so a program that takes a `Hand` runs unchanged and
+    waits in virtual time. `run` is for a controller that is a function of the state.
+    """
+
+    def __init__(self) -> None:
+        self._temporary = TemporaryDirectory(prefix="softfinger-")
+        folder = self._temporary.name
+        super().__init__(f"ipc://{folder}/stream", f"ipc://{folder}/commands")
+        self._link = Tap(self._take)
+        self._subscriptions: list[VirtualSubscription] = []
+        self._writer: RecordingWriter | None = None
+        self._serving = False
+
+    @property
+    def t(self) -> float:
+        """Virtual time [s]."""
+        raise NotImplementedError
+
+    def _now(self) -> float:
+        return self.t
+
+    @property
+    def address(self) -> str:
+        """Address for `Hand` or the variable SOFTFINGER_ADDRESS while `serve` is active."""
+        return f"{self.stream_address},{self.command_address}"
+
+    def step(self) -> None:
+        """Advance by the smallest step: a tick, or a recorded message."""
+        if self._serving:
+            raise RuntimeError(
+                "found a call that advances the time within serve(), which does that: use a "
+                "client, such as Hand(hand.address)"
+            )
+        self._step()
+
+    def _step(self) -> None:
+        raise NotImplementedError
+
+    def run(self, seconds: float, controller: Controller | None = None) -> list[Refused]:
+        """Advance by ``seconds``, under a controller.
+
+        Parameters
+        ----------
+        controller : function that is called with each published state, ``stream.state_rate`` times
+            a second, and returns the next command as a map, or None:
+            ``{"command": "hold", "force": 5.0}``
+
+        Returns
+        -------
+        list[Refused]
+            Refusals of the controller's commands, which may be due to an event after its state.
+
+        Raises
+        ------
+        Refused
+            A command that the daemon does not know, or with wrong parameters.
+        """
+        end, refusals = self.t + seconds - _ROUNDING, []
+        states = self._subscription(schema.STATE, None)
+        with states, contextlib.suppress(RecordingOver):
+            while self.t < end:
+                self.step()
+                while controller is not None and states.waiting:
+                    try:
+                        self._command_map(controller(states.waiting.popleft()))
+                    except Refused as refusal:
+                        if refusal.reason == Reason.REQUEST:
+                            raise
+                        refusals.append(refusal)
+        return refusals
+
+    def _command_map(self, request: Mapping[str, Any] | None) -> None:
+        if request is not None:
+            if not (isinstance(request, Mapping) and "command" in request):
+                raise TypeError(
+                    f"controller: found {request!r}, expected None or a map such as "
+                    '{"command": "hold", "force": 5.0}'
+                )
+            numbers = dict(request)
+            self.command(numbers.pop("command"), **numbers)
+
+    @contextlib.contextmanager
+    def serve(self, speed: float = 1.0) -> Iterator[str]:
+        """Serve clients over ZeroMQ; the context is `address`.
+
+        Meanwhile a thread advances the virtual time, ``speed`` times as fast as real time if the
+        machine is fast enough. Clients in this process are created with ``Hand(hand.address)``.
+        """
+        config = Config(self.stream_address, self.command_address, GATEWAY_TOPICS, _QUEUE)
+        over = threading.Event()
+
+        def advance() -> None:
+            begin, first = time.monotonic(), self.t
+            with contextlib.suppress(RecordingOver):
+                while not over.is_set():
+                    self._step()
+                    due = begin + (self.t - first) / speed
+                    begin += max(time.monotonic() - due, 0.0)  # a late machine pauses the hand
+                    over.wait(max(due - time.monotonic(), 0.0))
+
+        with contextlib.closing(Gateway(config, self._link)) as gateway:
+            gateway.wait()
+            with ThreadPoolExecutor(1) as pool:
+                advancing = pool.submit(advance)
+                self._serving = True
+                try:
+                    yield self.address
+                finally:
+                    over.set()
+                    self._serving = False
+                advancing.result()
+
+    def _subscription(self, topic: bytes, timeout: float | None) -> VirtualSubscription:
+        self._require_open()
+        made = VirtualSubscription(self, topic, timeout)
+        self._subscriptions.append(made)
+        self.select_topics()
+        return made
+
+    def select_topics(self) -> None:
+        """Tap the topics of the open subscriptions, or all during a recording."""
+        self._subscriptions = [each for each in self._subscriptions if each.is_open]
+        self._link.tapped = 0 if self._writer is None else _EVERYTHING
+        for each in self._subscriptions:
+            self._link.tapped |= bit(each.topic)
+
+    def _take(self, topic: bytes, message: dict[str, Any]) -> None:
+        for each in self._subscriptions:
+            if each.topic == topic:
+                each.waiting.append(read(schema.TOPICS[topic].record, message))
+        if self._writer is not None:
+            self._writer.add(topic, message)
+
+    def close(self) -> None:
+        """Switch the torque off and discard the hand."""
+        super().close()
+        self._temporary.cleanup()
+
+
+class VirtualHand(VirtualTimeHand):
+    """Simulated hand and its daemon in virtual time, as fast as this machine computes.
+
+    The same calls give the same states bit for bit.
+
+    Parameters
+    ----------
+    profile : name or file of a profile with a simulated hand; None for the default settings
+    changes : settings to change, in the form of ``--set``
+    plant : settings that only the simulated hand has, unknown to the daemon, in the same form
+
+    Attributes
+    ----------
+    plant : true state of the simulated hand: ``force``, ``d``, ``theta``, ``q`` of both fingers,
+        ``object_pose`` and others; see `SimulatedHand`
+    settings : settings of the daemon
+
+    Raises
+    ------
+    SettingsError
+        The settings are invalid, or not those of a simulated hand.
+    """
+
+    def __init__(
+        self,
+        profile: Path | str | None = None,
+        changes: Sequence[str] = (),
+        plant: Sequence[str] = (),
+    ) -> None:
+        self.settings = _virtual(profile, changes)
+        hand = _virtual(profile, (*changes, *plant)) if plant else None
+        build_kernels(self.settings, print_event)
+        super().__init__()
+        self._daemon = Daemon(self.settings, wire=self._link, hand=hand)
+        assert self._daemon.hand is not None
+        self.plant: SimulatedHand = self._daemon.hand
+        self._faults: list[FaultEvent] = []
+
+    @property
+    def t(self) -> float:
+        """Virtual time [s]."""
+        return self._daemon.clock.now()
+
+    def _step(self) -> None:
+        self._apply_faults()
+        self._daemon.loop.advance(self._daemon.loop.period)
+
+    def _send(self, request: dict[str, Any]) -> dict[str, Any]:
+        self._link.request(request, self.t)
+        self.step()
+        return self._link.answer
+
+    def fault(self, *words: str) -> None:
+        """Begin loads and measurement faults such as ``"push=3@0.5"`` or ``"left:gain=0.8"``.
+
+        `softfinger help emulate` lists them; times count from now. ``"well"`` ends the faults.
+
+        Raises
+        ------
+        FaultError
+            The words are not understood, or need servos and boards, as `EmulatedHand` has them.
+        """
+        for event in parse_faults(words, ()):
+            self._faults.append(event._replace(after=event.after + self.t))
+        self._faults.sort(key=lambda event: event.after)
+        self._apply_faults()
+
+    def _apply_faults(self) -> None:
+        while self._faults and self._faults[0].after <= self.t:
+            event = self._faults.pop(0)
+            if not self.plant.apply_fault(event):
+                raise FaultError(
+                    f"{event}: found a fault of servos or boards, expected one of measurements or "
+                    "a load: use emulated_hand"
+                )
+
+    @contextlib.contextmanager
+    def record(self, path: Path | str) -> Iterator[None]:
+        """Record all topics in a new file within the context (extra ``record``)."""
+        self._writer = RecordingWriter(Path(path))
+        for topic, message in self._link.kept():
+            self._writer.add(topic, message)
+        self.select_topics()
+        try:
+            yield
+        finally:
+            writer, self._writer = self._writer, None
+            self.select_topics()
+            writer.close()
+
+    def close(self) -> None:
+        """Switch the torque off and discard the hand."""
+        self._daemon.close()
+        super().close()
+
+
+def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
+    """Load the settings of a simulated hand and select the virtual clock."""
+    settings = load(None if profile is None else Path(profile), Path(), changes)
+    if not settings.simulated:
+        raise SettingsError(
+            f"{profile or 'changes'}: found backends of hardware, expected a simulated hand: use "
+            "emulated_hand, which emulates the hardware"
+        )
+    loop = settings.loop.model_copy(update={"clock": "virtual"})
+    return settings.model_copy(update={"loop": loop})
+
+
+class RecordedHand(VirtualTimeHand):
+    """Recording as a `Hand`: its messages arrive in virtual time, and commands have no effect.
+
+    Iterating over a stream ends with the recording, and so does `run`.
+
+    Parameters
+    ----------
+    path : a recording (extra ``record``)
+
+    Attributes
+    ----------
+    sent : time [s] and map of each command that was sent
+
+    Raises
+    ------
+    RecordingError
+        The file is not a recording.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self._recording = Recording(Path(path))
+        self._messages = self._recording.messages()
+        self._mode: dict[str, Any] = {}
+        self._t = 0.0
+        super().__init__()
+        self._commands = CommandServer(self._link, clock=lambda: self.t)
+        self.sent: list[tuple[float, dict[str, Any]]] = []
+
+    @property
+    def t(self) -> float:
+        """Time since the first message of the recording [s]."""
+        return self._t
+
+    def _step(self) -> None:
+        found = next(self._messages, None)
+        if found is None:
+            raise RecordingOver(f"{self._recording.path}: over after {self.t:.3f} s")
+        topic, message = found
+        stamp = message.get("timestamp")
+        if isinstance(stamp, float) and message.get("again") is not True:
+            self._t = max(self._t, stamp - self._recording.start)
+        if topic == schema.STATE:
+            self._mode = {name: message.get(name) for name in ("mode", "fault", "torque")}
+        self._link.publish(GATEWAY_TOPICS.index(topic.decode()), pack(message), KEPT.get(topic, 0))
+        self._commands.serve(self._note)
+
+    def _send(self, request: dict[str, Any]) -> dict[str, Any]:
+        return {"ok": True, **self._note(request)}
+
+    def _note(self, request: dict[str, Any], _age: float = 0.0) -> dict[str, Any]:
+        if request["command"] != "status":
+            self.sent.append((self.t, request))
+        return dict(self._mode)
