@@ -328,7 +328,14 @@ _SECTIONS = (
         "Fingertip Material ContactTable ContactForces Certificate SensorGrid ContactEstimator "
         "ContactEstimate Invalid Readings Uncertainty",
     ),
-    ("Checks for plugin authors", "", "testing"),
+    (
+        "Test kit",
+        "[Test your own controller](test-your-controller.md) shows how to use it. Import these "
+        "names from `softfinger.testing`.",
+        "testing.virtual.VirtualHand testing.virtual.RecordedHand testing.emulated.EmulatedHand "
+        "testing.emulated.EmulatedBus",
+    ),
+    ("Checks for plugin authors", "", "testing.checks"),
 )
 
 

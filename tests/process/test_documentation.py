@@ -1,8 +1,8 @@
 """Run every code block of README and docs unchanged: shell, Python, profiles.
 
 Each page runs from its top in its own folder, with one simulated hand. `harness.documented` is its
-`softfinger` command and describes which commands are only parsed. A mark above a block makes an
-exception:
+`softfinger` command and describes which commands are only parsed. A block with a title is saved as
+that file, for later blocks. A mark above a block makes an exception:
 
     <!-- not run: why -->                  the block cannot be run, with the reason
     <!-- not run without gymnasium -->     the block needs a package that is not installed here
@@ -19,6 +19,7 @@ import re
 import select
 import shlex
 import subprocess
+import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +33,7 @@ from softfinger.daemon.profile.load import find, load
 from tests.conftest import own_addresses
 from tests.harness.daemon_process import Running
 from tests.harness.documented import Softfinger, parse
+from tests.harness.installed_plugin import plugin_path
 
 ROOT = Path(__file__).parents[2]
 SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
@@ -40,19 +42,23 @@ USUAL = ("tcp://127.0.0.1:9872", "tcp://127.0.0.1:9873")
 LONG = ("tutorial.md", "recordings.md")  # pages that wait for most of a minute
 MARK = re.compile(r"^ *<!-- (?:not run|exits)\b.*-->$", re.M)
 REASON = re.compile(r"not run: \S.*|not run without \w+|exits 1: \S.*")
-FENCE = re.compile(r"(?ms)^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$")
+FENCE = re.compile(
+    r'(?ms)^(?P<indent> *)```(?P<language>\w*)(?: title="(?P<title>[^"\n]+)")?[^\n]*\n'
+    r"(?P<text>.*?)^(?P=indent)```$"
+)
 STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")  # with the expected status
 PRINTS = 20  # lines printed by a program without an end
 PATIENCE = 300.0  # s for one block
 
 
 class Block(NamedTuple):
-    """A code block with its first line and the mark above it."""
+    """A code block with its first line, the mark above it, and the file it is saved as."""
 
     line: int
     language: str
     text: str
     mark: str
+    title: str
 
 
 def blocks(page: Path) -> list[Block]:
@@ -70,7 +76,7 @@ def blocks(page: Path) -> list[Block]:
                 assert (ROOT / other).exists(), f"{page.name}:{line}: {other}"
         if fence["language"]:
             code = textwrap.dedent(fence["text"])
-            found.append(Block(line, fence["language"], code, mark))
+            found.append(Block(line, fence["language"], code, mark, fence["title"] or ""))
     assert not marks, f"{page.name}: marks above no block: {[*marks.values()]}"
     return found
 
@@ -131,7 +137,11 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
         patch.setenv("XDG_RUNTIME_DIR", str(place))
         patch.setenv("SOFTFINGER_ADDRESS", ",".join(addresses))
         patch.setenv("PATH", f"{place / 'bin'}:{os.environ['PATH']}")
-        patch.setenv("PYTHONPATH", str(ROOT))
+        patch.setenv("PYTHONPATH", plugin_path(place / "site"))
+        (place / "bin" / "pytest").write_text(
+            f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m pytest "$@"\n'
+        )
+        (place / "bin" / "pytest").chmod(0o755)
         words = (f"stream.address={stream}", f"commands.address={commands}", "loop.rate=100")
         daemon = Running(*[word for each in words for word in ("--set", each)])
         yield Shared(addresses, softfinger)
@@ -179,6 +189,9 @@ def test_code_blocks_run(page, shared, tmp_path, monkeypatch):
                 missing and importlib.util.find_spec(missing[1])
             ):
                 parse_only(block, at)
+            elif block.title:
+                Path(block.title).parent.mkdir(parents=True, exist_ok=True)
+                Path(block.title).write_text(block.text)
             elif block.language in ("sh", "bash"):
                 failed = shell.run(STATUS.sub(lambda line: f"{line[1]} '{line[2]}'", block.text))
                 status = 1 if block.mark else 0

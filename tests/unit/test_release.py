@@ -88,6 +88,10 @@ def test_workflows_pin_actions_by_commit_and_hooks_use_the_ruff_of_make_lint():
     ]
     assert len(used) >= len(workflows) > 0
     assert [each for each in used if not re.fullmatch(r"\S+@[0-9a-f]{40} # v[\d.]+", each)] == []
+    page = (ROOT / "docs" / "test-your-controller.md").read_text(encoding="utf-8")
+    advised = re.findall(r"(?m)uses: (.*)$", page)
+    assert len(advised) == 2
+    assert set(advised) <= set(used)
     hooks = (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
     pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8")
     assert re.findall(r"rev: v(\S+)", hooks) == re.findall(r"(?m)^ruff==(\S+)", pinned)
