@@ -114,7 +114,7 @@ class VirtualSubscription(Subscription[Any]):
     def close(self) -> None:
         """End the subscription."""
         self.is_open = False
-        self._hand.select_topics()
+        self._hand._select_topics()
 
 
 class VirtualTimeHand(Hand):
@@ -236,10 +236,10 @@ class VirtualTimeHand(Hand):
         self._require_open()
         made = VirtualSubscription(self, topic, timeout)
         self._subscriptions.append(made)
-        self.select_topics()
+        self._select_topics()
         return made
 
-    def select_topics(self) -> None:
+    def _select_topics(self) -> None:
         """Tap the topics of the open subscriptions, or all during a recording."""
         self._subscriptions = [each for each in self._subscriptions if each.is_open]
         self._link.tapped = 0 if self._writer is None else _EVERYTHING
@@ -341,12 +341,12 @@ class VirtualHand(VirtualTimeHand):
         self._writer = RecordingWriter(Path(path))
         for topic, message in self._link.kept():
             self._writer.add(topic, message)
-        self.select_topics()
+        self._select_topics()
         try:
             yield
         finally:
             writer, self._writer = self._writer, None
-            self.select_topics()
+            self._select_topics()
             writer.close()
 
     def close(self) -> None:

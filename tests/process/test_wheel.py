@@ -26,6 +26,10 @@ from softfinger import ContactEstimator, ContactTable, Fingertip, Material, Sens
 tip, material = Fingertip(radius=0.020), Material.constant(0.304e6)
 assert SensorGrid(rows=8, cols=8, pitch=0.005).pressure(tip, material, 0.004, 0.1, 0.0).max() > 1e3
 """
+_FIXTURE = f"""
+def test_it(recorded_hand):
+    assert recorded_hand({str(ROOT / "tests" / "golden" / "grasp_and_turn.mcap")!r}).state().seq > 0
+"""
 
 
 _SOURCES = ("MANIFEST.in", "Makefile", "README.md", "constraints.txt", "pyproject.toml", "setup.py")
@@ -148,6 +152,8 @@ def test_folders_with_the_names_of_subpackages_do_not_interfere(wheel, tmp_path)
     assert run("-m", "softfinger", "config", "reference", "tip.radius").endswith(
         "= 0.02 # m, 0.0001 to 1\n"
     )
+    (here / "test_it.py").write_text(_FIXTURE, encoding="utf-8")
+    assert "1 passed" in run("-m", "pytest", "-q", "-p", "no:cacheprovider")
 
 
 def test_pinned_versions_support_the_oldest_supported_python():
