@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import math
 import select
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Self
@@ -17,12 +16,13 @@ from typing import Any, Self
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT, by_name
 from softfinger.daemon.servos.joint import JointScale
-from softfinger.daemon.simulation.emulator.folder import NoEmulator, carry_out, find_ports
+from softfinger.daemon.simulation.emulator.folder import carry_out, find_ports
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.faults import ALL, SERVOS, FaultError, parse_faults
 from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.tools.processes.emulate import emulator_process
 
 _SERVOS_MAX = 8
 _LOOK = 0.005  # s between checks for changes made by another thread
@@ -49,24 +49,19 @@ class EmulatedHand:
     Raises
     ------
     NoEmulator
-        The emulator has not started. Its message is on standard error.
+        The emulator has ended. Its message is on standard error.
     """
 
     def __init__(
         self, profile: Path | str | None = None, changes: Sequence[str] = (), **options: object
     ) -> None:
-        self._temporary = TemporaryDirectory(prefix="softfinger-")
-        self.folder = Path(self._temporary.name)
-        words = [f"--dir={self.folder}", *(f"--set={change}" for change in changes)]
+        words = [f"--set={change}" for change in changes]
         words += [] if profile is None else [f"--config={profile}"]
         words += [f"--{name}" if on is True else f"--{name}={on}" for name, on in options.items()]
-        command = [sys.executable, "-P", "-m", "softfinger", "emulate", *words]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert self._process.stdout is not None
-        if self._process.stdout.readline() != "ready\n":
-            self.close()
-            text = f"emulate {' '.join(words)}: it has ended: see its message on standard error"
-            raise NoEmulator(text)
+        with ExitStack() as running:
+            self.folder = Path(running.enter_context(TemporaryDirectory(prefix="softfinger-")))
+            running.enter_context(emulator_process(f"--dir={self.folder}", *words))
+            self.close = running.pop_all().close  # ends the process and removes its ports
         self.ports = {name: str(path) for name, path in find_ports(self.folder).items()}
 
     def send(self, words: str) -> str:
@@ -91,12 +86,6 @@ class EmulatedHand:
         """
         report: dict[str, Any] = json.loads(self.send("report forget" if forget else "report"))
         return report
-
-    def close(self) -> None:
-        """End the process and remove its ports."""
-        self._process.terminate()
-        self._process.communicate()
-        self._temporary.cleanup()
 
     def __enter__(self) -> Self:
         return self

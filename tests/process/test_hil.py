@@ -291,8 +291,9 @@ def test_swapped_ids_are_a_fault_during_the_approach(tmp_path, addresses):
     with EmulatorProcess("--dir", hand, "--config", HIL, "--set", off).ready() as emulator:
         swapped = ("--set", "servos.ids=[2, 1]", "--set", "servos.direction=[-1, 1]")
         daemon = Running("--config", str(config), "--dir", str(hand), *swapped, *WAITING)
-        ask(addresses[1], "arm")
-        ask(addresses[1], "grasp", force=6.0)
+        for command, numbers in (("arm", {}), ("grasp", {"force": 6.0})):
+            reply = ask(addresses[1], command, **numbers)
+            assert reply["ok"], reply
         until(lambda: ask(addresses[1], "status")["fault"])
         status = ask(addresses[1], "status")
         assert status["fault_name"] == "joint.swapped"

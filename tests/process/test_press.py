@@ -1,16 +1,14 @@
 """Calibration without hardware: `emulate --send press` and `calibrate` on a solid rubber tip."""
 
-import json
 import math
 import re
 import sys
-import threading
 
 import pytest
 
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.simulation.emulator.folder import send_words
+from softfinger.daemon.simulation.emulator.folder import carry_out
 from softfinger.tools.cli import main
 from tests.harness.emulated import HIL, emulated
 
@@ -25,10 +23,7 @@ class Stage:
         self._folder, self._presses = folder, list(presses)
 
     def readline(self):
-        reply = send_words(self._folder, f"press {self._presses.pop(0)} speed=100mm/s")
-        while json.loads(reply)["wait"] > 0.0:
-            threading.Event().wait(0.01)
-            reply = send_words(self._folder, "press")
+        carry_out(self._folder, f"press {self._presses.pop(0)} speed=100mm/s")
         return "\n"
 
 

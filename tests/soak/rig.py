@@ -20,10 +20,12 @@ import msgpack
 import zmq
 
 from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.simulation.emulator.folder import NoEmulator, send_words
+from softfinger.daemon.simulation.emulator.folder import carry_out
 from softfinger.daemon.wire.schema import STATE
-from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError, emulator
+from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError
+from softfinger.tools.processes.emulate import emulator_process
 
 _PATIENCE = 300.0  # s to wait for a process to become ready, including kernel compilation
 _STATE_RATE = 250.0  # Hz
@@ -68,7 +70,7 @@ class Rig:
         """Start stopped processes, the daemon with ``words``; may raise RigError."""
         if self.hand is None or self.hand.poll() is not None:
             self.hand = self._running.enter_context(
-                emulator(self.ports, self.config, *self.hand_words)
+                emulator_process("--dir", self.ports, "--config", self.config, *self.hand_words)
             )
         if not self.alive:
             self.start_daemon(*words)
@@ -130,12 +132,9 @@ class Rig:
     def send(self, words: str) -> str:
         """Send words to the emulated hand's control socket; may raise RigError."""
         try:
-            reply = send_words(self.ports, words)
-        except NoEmulator as error:
+            return carry_out(self.ports, words)
+        except SoftfingerError as error:
             raise RigError(str(error)) from None
-        if reply.startswith("error: "):
-            raise RigError(reply)
-        return reply
 
     def report(self, more: str = "") -> dict[str, Any]:
         """Return the record of the servo bus; ``forget`` in ``more`` starts a new record."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import random
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -40,20 +39,6 @@ _FRAME_COUNT = 16  # number of frames that take turns
 
 class RigError(SoftfingerError):
     """The set-up does not work, so nothing was measured."""
-
-
-@contextlib.contextmanager
-def emulator(folder: Path, config: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """Yield the process of an emulated hand on ptys in ``folder`` once it answers."""
-    command = [*SOFTFINGER, "emulate", "--dir", str(folder), "--config", str(config), *words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            if process.stdout.readline().strip() != "ready":
-                raise RigError("the emulated hand did not start")
-            yield process
-        finally:
-            process.terminate()
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:

@@ -24,7 +24,8 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, attempt, figure, timed
-from softfinger.tools.benchmarks.rigs import HIL, can, emulator, hold, must_hold, virtual_daemon
+from softfinger.tools.benchmarks.rigs import HIL, can, hold, must_hold, virtual_daemon
+from softfinger.tools.processes.emulate import emulator_process
 
 _PRIORITY = 40  # SCHED_FIFO priority
 # Bits on the line: fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6 bytes.
@@ -126,7 +127,7 @@ def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) 
     back_to_back: list[float] = []
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        stack.enter_context(emulator(folder, HIL, "--baud", str(baud)))
+        stack.enter_context(emulator_process("--dir", folder, "--config", HIL, "--baud", baud))
         daemon = stack.enter_context(Daemon(load(HIL, folder, changes), wire=False))
         stack.enter_context(RealTime(daemon.settings))
         loop, clock, state = daemon.loop, daemon.clock, daemon.loop.state

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
+import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -178,6 +180,26 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
         with RealTime(_unhurried(settings, arguments.baud > 0)):
             emulator.run(lambda: print(_ready(emulator.ports), flush=True))
     return 0
+
+
+@contextlib.contextmanager
+def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
+    """Run `softfinger emulate` with the arguments ``words`` in a process; yield it once it answers.
+
+    Raises NoEmulator if it has ended instead. Its message is on standard error.
+    """
+    from softfinger.daemon.simulation.emulator.folder import NoEmulator
+
+    # -P keeps a folder named softfinger in the working directory from being imported.
+    command = [sys.executable, "-P", "-m", "softfinger", "emulate", *map(str, words)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            if process.stdout.readline() != "ready\n":
+                raise NoEmulator(f"{' '.join(command[3:])}: ended, see its message above")
+            yield process
+        finally:
+            process.terminate()
 
 
 def _ready(ports: dict[str, Path]) -> str:
