@@ -61,7 +61,7 @@ class EmulatedHand:
         with ExitStack() as running:
             self.folder = Path(running.enter_context(TemporaryDirectory(prefix="softfinger-")))
             running.enter_context(emulator_process(f"--dir={self.folder}", *words))
-            self.close = running.pop_all().close  # ends the process and removes its ports
+            self._running = running.pop_all()
         self.ports = {name: str(path) for name, path in find_ports(self.folder).items()}
 
     def send(self, words: str) -> str:
@@ -86,6 +86,10 @@ class EmulatedHand:
         """
         report: dict[str, Any] = json.loads(self.send("report forget" if forget else "report"))
         return report
+
+    def close(self) -> None:
+        """End the process and remove its ports."""
+        self._running.close()
 
     def __enter__(self) -> Self:
         return self

@@ -27,7 +27,7 @@ from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.loop_link import Ask, Link
-from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, KEPT, bit, pack
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, REPEATED_COUNTS, bit, pack
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.recordings.reader import Recording
@@ -262,7 +262,7 @@ class VirtualTimeHand(Hand):
 class VirtualHand(VirtualTimeHand):
     """Simulated hand and its daemon in virtual time, as fast as this machine computes.
 
-    The same calls give the same states bit for bit.
+    On one machine, the same calls give the same states bit for bit.
 
     Parameters
     ----------
@@ -410,7 +410,9 @@ class RecordedHand(VirtualTimeHand):
             self._t = max(self._t, stamp - self._recording.start)
         if topic == schema.STATE:
             self._mode = {name: message.get(name) for name in ("mode", "fault", "torque")}
-        self._link.publish(GATEWAY_TOPICS.index(topic.decode()), pack(message), KEPT.get(topic, 0))
+        self._link.publish(
+            GATEWAY_TOPICS.index(topic.decode()), pack(message), REPEATED_COUNTS.get(topic, 0)
+        )
         self._commands.serve(self._note)
 
     def _send(self, request: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The test kit as its users see it: their tests run in a pytest of their own, in their folder."""
+"""The test kit, used by test files of their own in a separate pytest process."""
 
 import os
 from pathlib import Path
@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.simulation.emulator.folder import NoEmulator
 from softfinger.daemon.simulation.faults import FaultError
-from softfinger.testing import EmulatedBus, VirtualHand
+from softfinger.testing import EmulatedBus, EmulatedHand, VirtualHand
 from tests.harness.daemon_process import python
 from tests.harness.installed_plugin import plugin_path
 
@@ -210,9 +211,15 @@ def test_a_controller_that_asks_for_nonsense(virtual_hand):
     assert "not while disarmed" in str(refusals[0])
 
 
-@pytest.mark.softfinger(mass=1.0)
+@pytest.mark.parametrize(
+    "_",
+    [
+        pytest.param(0, marks=pytest.mark.softfinger(mass=1.0)),
+        pytest.param(1, marks=pytest.mark.softfinger("velostat")),
+    ],
+)
 @pytest.mark.xfail(strict=True, raises=TypeError)
-def test_an_unknown_option(virtual_hand):
+def test_an_unknown_option(virtual_hand, _):
     pass
 '''
 
@@ -229,7 +236,7 @@ def test_little_is_loaded():
 @pytest.mark.parametrize(
     ("text", "count"), [(SERVOS, 3), (HANDS, 9), (IMPORTS, 1)], ids=["servos", "hands", "imports"]
 )
-def test_tests_of_others_pass(tmp_path, text, count):
+def test_user_tests_pass(tmp_path, text, count):
     folder = tmp_path / "theirs"
     folder.mkdir()
     (folder / "test_it.py").write_text(text, encoding="utf-8")
@@ -241,7 +248,10 @@ def test_tests_of_others_pass(tmp_path, text, count):
     assert f"{count} passed" in done.stdout
 
 
-def test_what_a_kit_cannot_make_is_told():
+def test_unusable_hands_and_faults_are_refused(capfd):
+    with pytest.raises(NoEmulator, match=r"--model=AX-12: ended, see its message above"):
+        EmulatedHand(model="AX-12")
+    assert "XM430-W350" in capfd.readouterr().err
     with pytest.raises(SettingsError, match="hil: found backends of hardware, expected a simulat"):
         VirtualHand("hil")
     for count in (0, 9):
