@@ -23,7 +23,6 @@ from softfinger.tools.cli import main
 from tests.harness.daemon_process import SOFTFINGER
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
-_PORTS = re.compile(r"^(servos|tactile-\w+): .*\n", re.MULTILINE)
 _COMPILED = re.compile(r"^(compil(ing|ed) .*|.*: \d+ of about \d+, .*)\n", re.MULTILINE)
 READY_WITHIN = 200.0  # s, includes kernel compilation
 
@@ -65,10 +64,10 @@ class EmulatorProcess:
         return self
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Send a signal; return exit status and remaining output, without ports and kernels."""
+        """Send a signal; return exit status and remaining output without kernel messages."""
         self.popen.send_signal(number)
         out, err = self.popen.communicate(timeout=300)
-        return self.popen.returncode, _PORTS.sub("", out), _COMPILED.sub("", err)
+        return self.popen.returncode, out, _COMPILED.sub("", err)
 
     def __enter__(self) -> EmulatorProcess:
         return self

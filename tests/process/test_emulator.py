@@ -96,6 +96,8 @@ def test_a_signal_during_start_up_ends_the_emulator_cleanly(tmp_path, number):
 def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues(tmp_path):
     with EmulatorProcess("--dir", tmp_path, "--model", "XL330-M288", "--factory") as process:
         process.ready()
+        told = [process.popen.stdout.readline() for _ in LINKS]
+        assert told == [f"{name}: {tmp_path / name}\n" for name in LINKS]
         servos = SdkServos(tmp_path)
         assert servos.read(1, OPERATING_MODE, 1) == 3
         assert servos.read(2, RETURN_DELAY, 1) == 250

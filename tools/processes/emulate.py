@@ -178,7 +178,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
             made.callback(emulator.close)
         signals.hand_over(emulator.end)
         with RealTime(_unhurried(settings, arguments.baud > 0)):
-            emulator.run(lambda: print(_ready(emulator.ports), flush=True))
+            emulator.run(lambda: print(_ready(emulator.ports), end="", flush=True))
     return 0
 
 
@@ -203,7 +203,8 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def _ready(ports: dict[str, Path]) -> str:
-    return "\n".join(["ready", *(f"{name}: {path}" for name, path in ports.items())])
+    """Return the lines for an emulator that answers, as one text, since readers may wait for it."""
+    return "".join(["ready\n", *(f"{name}: {path}\n" for name, path in ports.items())])
 
 
 def _unhurried(settings: Settings, paced: bool) -> Settings:
