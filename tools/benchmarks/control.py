@@ -162,8 +162,8 @@ LATE_LIMITS = {
     for name, (control, law) in _STEERED_LAWS.items()
     for delay in DELAYS
 }
-# Relaxed tips without coupling have four times the curvature of the springs' minimum of energy, and
-# tips below three quarters of the stiffness along the face have a maximum.
+# Relaxed tips without coupling have four times the curvature of spring tips at the energy minimum.
+# Tips with less than three quarters of the tangential stiffness have an energy maximum instead.
 _TIPS: dict[str, Sections] = {
     "solid": SOLID,
     "without tangential coupling": {"simulation": {"tip_law": "bristles"}},
