@@ -1,14 +1,15 @@
-# make run: the simulated hand with its live page.
-# make test: the first tier of the tests, on every processor.  make test-extended: the second tier, the tests marked
-# `extended`.  make test-all: both.  ARGS=tests/unit selects tests or gives pytest options; ARGS=-n0: in one process.
-# A test file that ARGS names runs with its extended tests.
-# make test-arithmetic: the tests that compare computed numbers, under another arithmetic.
-# make lowest: the tests of servos, settings and wire with the oldest packages that pyproject.toml allows.
-# make docs: the documentation site, in build/site.
-# make newest: a fast part of the tests with the newest Python on this machine.
-# make release VERSION=1.2.3: sets version and changelog, checks, builds the packages, and prints the commands that publish.
-# Each sets up in .venv what it needs and no more. PYTHON=python3.13 chooses the interpreter (3.11 or later), which then
-# has an environment of its own, as .venv-3.13.
+# make run: run the simulated hand with its live page.
+# make test: run the first test tier on all processors.  make test-extended: run the second tier (tests marked
+# `extended`).  make test-all: run both tiers.  ARGS selects tests (ARGS=tests/unit) or adds pytest options (ARGS=-n0
+# uses one process). Test files named in ARGS run with their extended tests.
+# make test-arithmetic: run the tests that compare computed numbers, with different arithmetic.
+# make lowest: run servo, settings and wire tests with the oldest packages that pyproject.toml allows.
+# make docs: build the documentation site in build/site.
+# make newest: run a fast subset of the tests with the newest Python on this machine.
+# make release VERSION=1.2.3: set version and changelog, run all checks, build the packages, and print the publishing
+# commands.
+# Each target installs only its own requirements in .venv. PYTHON=python3.13 selects an interpreter (3.11 or later) with
+# a separate environment, e.g. .venv-3.13.
 
 PYTHON ?= python3
 ifeq ($(origin PYTHON),command line)
@@ -17,24 +18,24 @@ else
 VENV := .venv
 endif
 BIN := $(VENV)/bin
-# Byte code is then made of what is imported; most of the packages' modules never are.
+# Without this, pip compiles all modules, although most are never imported.
 PIP_INSTALL := -m pip --disable-pip-version-check install --no-compile
-# CONSTRAINTS= takes the newest dependencies in place of the tested ones.
+# CONSTRAINTS= selects the newest dependencies instead of the tested ones.
 CONSTRAINTS := --constraint constraints.txt
 INSTALL := $(BIN)/python $(PIP_INSTALL) $(CONSTRAINTS)
-WORKERS := $(shell expr $$(nproc) + 2) # some wait for something while the others compute
-# Which lines no test ran is told where Python can count them for next to nothing (3.12 and later).
+WORKERS := $(shell expr $$(nproc) + 2) # some tests wait while others compute
+# Coverage is measured on Python 3.12 and later, where it is nearly free.
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
 PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
-# Otherwise each test process compiles the kernels of both kinds of tips at the same time.
+# Otherwise, all test processes compile the kernels for both kinds of tips at the same time.
 COMPILE = $(BIN)/softfinger compile --all && $(BIN)/softfinger compile --all --config solid
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 NEWEST_PIP := build/newest/bin/python $(PIP_INSTALL) --quiet $(CONSTRAINTS)
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
 NEWEST_TESTS := tests/unit/test_stream.py tests/process/test_client.py
-# The tests that compare what BLAS, NumPy's loops and compiled kernels compute: no processes, no
-# pictures, and of the whole hand's work hardly more than the recorded one.
+# Tests that compare results of BLAS, NumPy loops and compiled kernels. Tests with processes or figures, and most tests
+# of the whole hand, are excluded.
 NUMERICAL := blur calibrate calibrated_hand calibration hand_estimator error_budget estimator \
 	estimator_bad_frames estimator_kernels figure_runs grasp_state hand material measured \
 	measurement_faults plant plant_agreement plant_shapes press_fit pressure_grid quadrature \
@@ -46,7 +47,7 @@ TO_TEST := $(VENV)/.ready-test
 TO_DOCUMENT := $(VENV)/.ready-docs
 TO_RELEASE := $(VENV)/.ready-release
 
-# Byte code is kept whatever the environment says: a test run starts hundreds of processes.
+# Always write byte code, because a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: run test test-extended test-all test-arithmetic warm docs lowest newest lint format release clean
@@ -71,7 +72,7 @@ test-arithmetic: $(TO_TEST)
 	$(BIN)/python -m tests.harness.arithmetic pytest --numprocesses $$(nproc) --dist worksteal \
 		-m 'not extended' $(NUMERICAL_TESTS) $(ARGS)
 
-# Otherwise each test process makes its own byte code at the same time.
+# Otherwise, all test processes compile byte code at the same time.
 warm: $(TO_TEST)
 	-@$(BIN)/python -m pytest --collect-only --quiet >/dev/null
 
@@ -113,7 +114,7 @@ $(TO_RUN): pyproject.toml constraints.txt
 		|| { echo "softfinger needs Python 3.11 or later; say which with PYTHON=…"; exit 1; }
 	@echo "Setting up $(VENV) once: numpy, numba and seven small packages, about 100 MB to fetch."
 	@$(PYTHON) -m venv $(VENV)
-	@$(INSTALL) --quiet 'pip>=25.1' # the first that installs dependency groups
+	@$(INSTALL) --quiet 'pip>=25.1' # first version that installs dependency groups
 	@$(INSTALL) --editable .
 	@$(BIN)/softfinger compile --config demo
 	@touch $@

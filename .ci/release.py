@@ -1,7 +1,7 @@
-"""Prepare a release: set the version, date the changelog, build the packages and check them.
+"""Prepare a release: set the version, date the changelog, and build and check the packages.
 
 `make release VERSION=X.Y.Z` runs ``prepare``, then lint, tests and documentation, then ``build``.
-Both steps may be repeated. Committing, tagging and uploading stay with the person who releases.
+Both steps may be repeated. The maintainer then commits, tags and uploads the release.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 CHANGELOG = "CHANGELOG.md"
-# Each file that states the version, and the pattern of the line that does.
+# Files that contain the version, with the pattern of the version line.
 VERSION_LINES = {
     "softfinger/__init__.py": r'(?m)^(__version__ = ")(.*)(")$',
     "lerobot_robot_softfinger/pyproject.toml": r'(?m)^(version = ")(.*)(")$',
     "CITATION.cff": r"(?m)^(version: )(.*)()$",
 }
-MAX_LINES = 40  # of a release in the changelog, without blank lines
+MAX_LINES = 40  # lines per release in the changelog, without blank lines
 _UNRELEASED = "## [Unreleased]\n"
 
 
 class ReleaseError(Exception):
-    """The release cannot be made as asked."""
+    """The release cannot be prepared."""
 
 
 def sections(changelog: str) -> dict[str, str]:
-    """Map each version in the changelog, and ``Unreleased``, to the text below its heading."""
+    """Map each changelog version, and ``Unreleased``, to the text below its heading."""
     parts = re.split(r"(?m)^## \[(.+?)\].*\n", changelog)
     return dict(zip(parts[1::2], (text.strip() for text in parts[2::2]), strict=True))
 
 
 def dated(changelog: str, version: str, today: datetime.date) -> str:
-    """Move the unreleased entries below a heading for ``version``.
+    """Move the unreleased entries to a heading for ``version``.
 
-    A changelog that already has this version, and no other entries, is returned as it is.
+    A changelog that already has this version and no unreleased entries is not changed.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def _parts(version: str) -> tuple[int, ...]:
 
 
 def prepare(version: str) -> None:
-    """Write the version and the changelog's date into the tree."""
+    """Write the version and the changelog date to the project files."""
     _parts(version)
     ours = {CHANGELOG, *VERSION_LINES}
     changed = {line[3:] for line in _git("status", "--porcelain").splitlines()}
@@ -96,7 +96,7 @@ def prepare(version: str) -> None:
 
 
 def build(version: str) -> None:
-    """Build sdist and wheel into ``dist/``, check them, and print the commands that release."""
+    """Build sdist and wheel in ``dist/``, check them, and print the commands for publishing."""
     dist = ROOT / "dist"
     shutil.rmtree(dist, ignore_errors=True)
     _run(sys.executable, "-m", "build", "--outdir", dist)

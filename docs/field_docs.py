@@ -1,7 +1,7 @@
-"""Extension of mkdocstrings: document the fields of records and the results of commands.
+"""Extend mkdocstrings to document record fields, enumeration members and command results.
 
-mkdocstrings reads the sources without importing them. It would miss the fields that the decorator
-`softfinger.daemon.wire.fields.record` adds to the docstring of a record.
+mkdocstrings reads the sources without importing them. It therefore misses the fields that the
+`softfinger.daemon.wire.fields.record` decorator adds to a record's docstring.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import griffe
 
 
 class FieldDocs(griffe.Extension):
-    """Add the fields of records and the members of enumerations to their docstrings."""
+    """Extension that adds record fields and enumeration members to docstrings."""
 
     def on_class(self, *, cls: griffe.Class, **_: Any) -> None:
-        """Complete the docstring of a record or of an enumeration."""
+        """Complete the docstring of a record or enumeration."""
         is_record = any(str(each.value) == "record" for each in cls.decorators)
         is_enumeration = any(str(each) in ("IntEnum", "StrEnum") for each in cls.bases)
         if cls.docstring and (is_record or is_enumeration):
@@ -28,13 +28,13 @@ class FieldDocs(griffe.Extension):
                 cls.docstring.value += _members(found)
 
     def on_function(self, *, func: griffe.Function, **_: Any) -> None:
-        """Replace the type variable that stands for a command's result in `Hand`: None."""
+        """Replace the type variable for command results with None, the result in `Hand`."""
         if str(func.returns) == "_Done":
             func.returns = "None"
 
 
 def _members(enumeration: type[Enum]) -> str:
-    """Return a section with the members of an enumeration that explain themselves."""
+    """Return a docstring section with all enumeration members that have a description."""
     meanings = {
         each.name: getattr(each, "meaning", "") or getattr(each, "text", "") for each in enumeration
     }

@@ -1,8 +1,7 @@
 """Generate documentation pages and tables from the code and from project files.
 
-MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` contains complete
-pages, and `TABLES` contains tables within pages. All numbers that the code can compute are
-generated here.
+MkDocs calls the ``on_…`` functions (``hooks`` in mkdocs.yml). `PAGES` contains complete pages, and
+`TABLES` contains tables within pages. All numbers that the code can compute are generated here.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def _from(name: str) -> Callable[[], str]:
-    """Return a function that reads a page from a project file."""
+    """Return a function that reads a page from the project file ``name``."""
     return lambda: (ROOT / name).read_text(encoding="utf-8")
 
 
 def _program(name: str) -> Callable[[], str]:
-    """Return a function that shows a program's source as a page."""
+    """Return a function that makes a page from a program's source."""
     return lambda: f"# {Path(name).stem}\n\n```python\n{_from(name)()}```\n"
 
 
@@ -46,7 +45,7 @@ def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _signed(value: float, form: str) -> str:
-    """Format a number with a typographic minus sign, and zero without a sign."""
+    """Format a number with a typographic minus sign; zero has no sign."""
     return f"{value:{form}}".replace("-", "−") if float(f"{value:{form}}") else f"{0.0:{form}}"
 
 
@@ -88,7 +87,7 @@ select your own profile by its path.
 
 
 def configuration() -> str:
-    """List all sections and keys of a profile from their declarations."""
+    """List all profile sections and keys from their declarations."""
     from softfinger.daemon.profile import reference
 
     parts = [_SETTINGS, _head("profile", "description"), *_profiles()]
@@ -105,7 +104,7 @@ def configuration() -> str:
 
 
 def _profiles() -> list[str]:
-    """Return a table row for each packaged profile."""
+    """Return one table row for each packaged profile."""
     from softfinger.daemon.profile.load import names
     from softfinger.tools.setup.config import subject
 
@@ -150,7 +149,7 @@ are those of the built-in hand.
 
 
 def commands() -> str:
-    """Describe each command of the hand, from the table of commands."""
+    """Describe all hand commands from the command table."""
     from softfinger.daemon.control.modes import COMMANDS, REPLY, Mode
     from softfinger.daemon.loop.requests import bounds
     from softfinger.daemon.profile.settings import Settings
@@ -188,10 +187,10 @@ def commands() -> str:
 
 
 def command_line() -> str:
-    """Show the help of every subcommand."""
+    """Show the help text of each subcommand."""
     from softfinger.tools.cli import SUBCOMMANDS, make_parser
 
-    os.environ["COLUMNS"] = "100"  # width at which argparse wraps
+    os.environ["COLUMNS"] = "100"  # line width for argparse
     parser, _ = make_parser(SUBCOMMANDS)
     parts = [f"# The command line\n\n```text\n{parser.format_help()}```\n"]
     for name, subparser in _children(parser).items():
@@ -232,7 +231,7 @@ an age, add it to the reaction time.
 
 
 def limits() -> str:
-    """List all limits with their quantities, levels, reaction times and settings."""
+    """List all limits with quantity, level, reaction time and settings."""
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.safety.limits import LIMITS
     from softfinger.tools.setup.limits import _values
@@ -276,7 +275,7 @@ its cause, then send `clear`.
 
 
 def events() -> str:
-    """List all kinds of events from the table that explains them."""
+    """List all event kinds from the table that explains them."""
     from softfinger.daemon.wire.event_kinds import KINDS
 
     parts = [_EVENTS, _head("kind", "level", "cause", "what to do")]
@@ -295,7 +294,7 @@ Import these names from `softfinger`. [Programs](programs.md) shows how to use t
 m, forces in N, pressures in Pa, angles in rad and times in s, unless another unit is given.
 """
 
-# Sections of the page: title, introduction, and the names in it.
+# Page sections: title, introduction and public names.
 _SECTIONS = (
     (
         "Control a hand",
@@ -340,7 +339,7 @@ _SECTIONS = (
 
 
 def api() -> str:
-    """List the public names of the package with their docstrings."""
+    """List the package's public names with their docstrings."""
     parts = [_API]
     for title, introduction, names in _SECTIONS:
         parts.append(f"\n## {title}\n\n{introduction}\n")
@@ -364,7 +363,7 @@ def checkpoints() -> str:
 
 
 def rates() -> str:
-    """Tabulate the slopes of force and energy versus tilt at 25° from the paper's integrals."""
+    """Tabulate ∂F/∂θ and ∂U/∂θ at 25° from the paper's integrals."""
     from softfinger.tools.paper.model_pages import DEPTHS, ENERGY, FORCE
 
     heads = ("d [mm]", *(f"d = {d}" for d in DEPTHS))
@@ -377,7 +376,7 @@ def rates() -> str:
 
 
 def exponents() -> str:
-    """Tabulate the exponent of d for both material laws, fitted from 1 to 8 mm."""
+    """Tabulate the exponent of d, fitted from 1 to 8 mm, for both material laws."""
     from softfinger.tools.paper.model_pages import ENERGY, FORCE, over_depth
 
     force, energy = (over_depth("", each)[1] for each in (FORCE, ENERGY))
@@ -409,7 +408,7 @@ def early_minimum() -> str:
 
 
 def upright_forces() -> str:
-    """Tabulate the forces of upright tips for several contact laws."""
+    """Tabulate the force on upright tips for several contact laws."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -433,7 +432,7 @@ def upright_forces() -> str:
 
 
 def minimum_strength() -> str:
-    """Tabulate c, the increase of the energy with tilt near upright, for each kind of tip."""
+    """Tabulate c, the energy increase with tilt near upright, for each kind of tip."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -456,7 +455,7 @@ def minimum_strength() -> str:
 
 
 def _grips() -> list[tuple[str, float, float, float, float]]:
-    """Compute name, d [m], q [rad], c and upright spring [N·m/rad] for 10 N grips on 40 mm."""
+    """Compute name, d [m], q [rad], c and upright spring [N·m/rad] of 10 N grips on 40 mm."""
     from softfinger.daemon.profile.factory import make_material, make_table
     from softfinger.daemon.profile.settings import Settings
     from softfinger.kinematics.hand.upright import upright_spring
@@ -484,11 +483,11 @@ def _grips() -> list[tuple[str, float, float, float, float]]:
     return found
 
 
-_FORCE, _WIDTH = 10.0, 0.040  # force [N] and object width [m] of the grips in the pages
+_FORCE, _WIDTH = 10.0, 0.040  # N, m; grip force and object width on the pages
 
 
 def upright_grips() -> str:
-    """Tabulate displacement, joint angle and spring of a grip, and the remaining angle φ/φ0."""
+    """Tabulate displacement, joint angle, upright spring and residual angle φ/φ0 of a grip."""
     rows = []
     for name, d, q, c, spring in _grips():
         angles = (_signed(_left_of(k, d, q, c), ".3f") for k in (0.0, spring, 1e9))
@@ -498,7 +497,7 @@ def upright_grips() -> str:
 
 
 def _left_of(spring: float, d: float, q: float, c: float) -> float:
-    """Return φ/φ0 of the built-in hand from the closed form in `kinematics.hand.upright`.
+    """Return φ/φ0 for the built-in hand from the closed form in `kinematics.hand.upright`.
 
     ``spring`` is in N·m/rad and ``d`` in m.
     """
@@ -510,7 +509,7 @@ def _left_of(spring: float, d: float, q: float, c: float) -> float:
 
 
 def symmetric_grips() -> str:
-    """Tabulate joint angle, normal force and torque of symmetric grips without shear."""
+    """Tabulate joint angle, normal force and joint torque for symmetric grips without shear."""
     rows = []
     for d in (2, 4, 6, 8):
         q = math.asin((50.0 - 20.0 + d - 20.0) / 80.0)
@@ -521,9 +520,9 @@ def symmetric_grips() -> str:
 
 
 def torsion() -> str:
-    """Tabulate the largest friction moment about the normal of an upright tip of springs.
+    """Tabulate the maximum friction moment about the normal of an upright spring tip.
 
-    It is the integral of μ p r over the footprint, for a = 20 mm and E = 0.304 MPa.
+    The moment is the integral of μ p r over the footprint, for a = 20 mm and E = 0.304 MPa.
     """
     rows, a = [], 20.0
     for d in (2, 4, 6, 8):
@@ -538,7 +537,7 @@ def torsion() -> str:
 
 
 def relaxations() -> str:
-    """Tabulate the relative force after a sudden press for three relaxation models."""
+    """Tabulate the relative force after sudden compression for three relaxation models."""
     times = (0.001, 0.01, 0.1, 1.0, 10.0)
     prony = list(zip((0.1, 0.2, 0.2), (0.004, 0.07, 1.4), strict=True))
     laws: dict[str, Callable[[float], float]] = {
@@ -553,7 +552,7 @@ def relaxations() -> str:
 
 
 def errata() -> str:
-    """List the errata that `softfinger figures` marks, each one once."""
+    """List the errata that `softfinger figures` marks, without duplicates."""
     from softfinger.tools.paper.figures import pages
 
     found = dict.fromkeys(each for page in pages().values() for each in page.errata)
@@ -563,7 +562,7 @@ def errata() -> str:
 
 
 def servos() -> str:
-    """List the supported servo models, their tip forces, and the limits to set for them."""
+    """List the supported servo models with their tip forces and recommended limits."""
     from softfinger.daemon.servos.control_table import MODELS
 
     columns = ("V", "stall [N·m at A]", "N·m/A", "force [N]", "current_max [A]", "force_max [N]")
@@ -583,7 +582,7 @@ def servos() -> str:
 
 
 def _stored(name: str) -> tuple[str, list[dict[str, Any]]]:
-    """Read the machine and the rows from the output of `softfinger bench --json` in docs/."""
+    """Read `softfinger bench --json` output in docs/; return a machine description and the rows."""
     content = json.loads((ROOT / "docs" / name).read_text(encoding="utf-8"))
     load = " to ".join(f"{each:.1f}" for each in content["load"])
     about = f"{content['machine']}, {content['cores']} cores, load {load}.\n"
@@ -598,7 +597,7 @@ def _shown(rows: Iterable[dict[str, Any]], keys: Sequence[str]) -> Iterable[list
 
 
 def measured() -> str:
-    """Tabulate docs/benchmarks.json, the results of all default benchmarks."""
+    """Tabulate the results of all default benchmarks (docs/benchmarks.json)."""
     about, rows = _stored("benchmarks.json")
     keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
     parts = [about]
@@ -610,7 +609,7 @@ def measured() -> str:
 
 
 def _control(table: int) -> str:
-    """Return one of the tables in docs/control.json, the results of `softfinger bench control`."""
+    """Tabulate one table from the `softfinger bench control` results (docs/control.json)."""
     _, rows = _stored("control.json")
     titles = list(dict.fromkeys(row["table"] for row in rows))
     shown = (row for row in rows if row["table"] == titles[table])
@@ -619,7 +618,7 @@ def _control(table: int) -> str:
 
 
 def _control_late(ending: str) -> str:
-    """Tabulate the remaining angle for delayed measurements, from the table with this ending."""
+    """Tabulate the residual angle with delayed measurements; ``ending`` selects the tables."""
     _, rows = _stored("control.json")
     found: dict[str, dict[str, str]] = {}
     for row in rows:
@@ -635,7 +634,7 @@ def _control_late(ending: str) -> str:
 
 
 def held_loads() -> str:
-    """Tabulate the fraction of sudden loads that each simulated hand held (docs/reflex.json)."""
+    """Tabulate how many sudden loads each simulated hand held (docs/reflex.json)."""
     _, rows = _stored("reflex.json")
     found: dict[str, dict[str, list[int]]] = {}
     for row in rows:
@@ -674,7 +673,7 @@ _SHAPES = {"rectangle": "block", "disc": "disc"}
 
 
 def published() -> str:
-    """Compute the rows of `softfinger validate`."""
+    """Tabulate the rows from `softfinger validate`."""
     from softfinger.tools.paper.validate import FIGURES, comparisons
 
     heads = ("", "quantity", "published", "here", "source", "remarks")
@@ -721,7 +720,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "events.md": events,
     "api.md": api,
 }
-# Pages that replace links to project files.
+# Links to these project files are replaced with links to pages.
 _LINKS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -738,7 +737,7 @@ _LINKS = {
 
 
 def on_config(config: Any) -> Any:
-    """Show the version and the licence in the footer of each page."""
+    """Show version and licence in the footer of each page."""
     from softfinger import __version__
 
     config.copyright = f"softfinger {__version__}, MIT licence"
@@ -746,7 +745,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the generated pages."""
+    """Add all generated pages."""
     from mkdocs.structure.files import File
 
     for name, make in PAGES.items():
@@ -755,7 +754,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Insert generated tables, and convert links to repository files to links to pages."""
+    """Insert generated tables, and replace links to repository files with links to pages."""
     markdown = re.sub(
         r"\s*<!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
     )
@@ -768,10 +767,10 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Insert formulas and drawings into the page, so that they use the colours of its theme.
+    """Insert formulas and drawings inline, so that they use the colours of the page's theme.
 
-    The extension arithmatex marks formulas. They become MathML, which browsers draw without scripts
-    or fonts. Drawings use `currentColor`, which an image would not inherit.
+    The arithmatex extension marks formulas. They are converted to MathML, which browsers render
+    without scripts or fonts. Drawings use `currentColor`, which an image would not inherit.
     """
     content = re.sub(
         r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', _formula, content, flags=re.S
@@ -783,7 +782,7 @@ def _formula(found: re.Match[str]) -> str:
     from latex2mathml.converter import convert
 
     tex, display = html.unescape(found[2]).strip(), "block" if found[1] == "div" else "inline"
-    # TeX sets a function apart from its factors and its argument; MathML needs explicit spaces.
+    # TeX adds space around function names; MathML needs explicit spaces.
     function = r"\\(?:arcsin|cos|ln|sin|tan)(?:\^\d)?(?![a-z])"
     tex = re.sub(rf"(?<=[\w)}}])\s*(?={function})", r" \, ", tex)
     tex = re.sub(rf"({function})\s*(?=[\\\w])", r"\1 \, ", tex)
@@ -791,7 +790,7 @@ def _formula(found: re.Match[str]) -> str:
 
 
 def _drawing(found: re.Match[str]) -> str:
-    """Return the drawing as SVG, with its styles restricted to itself."""
+    """Return the drawing as inline SVG whose styles apply only to this drawing."""
     name = found[1]
     text = (ROOT / "docs" / "pictures" / f"{name}.svg").read_text(encoding="utf-8")
 

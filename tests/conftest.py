@@ -1,7 +1,7 @@
 """Provide shared fixtures: private addresses, complete daemons, and waiting for conditions.
 
-Each test process has its own loopback addresses and folders, so test processes can run in parallel.
-All processes that a test starts, directly or indirectly, end with the test.
+Each test process has its own loopback addresses and folders, so that tests can run in parallel. All
+processes that a test starts, directly or indirectly, are ended with the test.
 """
 
 from __future__ import annotations
@@ -32,33 +32,33 @@ from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
 from tests.harness.perturbed import Perturbation
 
-# All machines use the same examples without a deadline; --hypothesis-profile=search tries new ones.
+# All machines test the same examples, without a deadline. --hypothesis-profile=search tries others.
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("same")
 
 _PORTS = itertools.count(9872)
-_OUR_OWN: set[int] = set()  # children of this process that no test started
+_OUR_OWN: set[int] = set()  # child processes not started by a test
 PERTURBATION = pytest.StashKey[Perturbation]()
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option that enables `tests.harness.perturbed`."""
+    """Add the ``--perturb`` option, which enables `tests.harness.perturbed`."""
     help_text = "move results by a unit in the last place, to find tests that depend on rounding"
     parser.addoption("--perturb", type=int, metavar="SEED", help=help_text)
 
 
 def pytest_report_header() -> str:
-    """Show the arithmetic in the header, to help with tests that fail on only one machine."""
+    """Show the arithmetic in the header, to help diagnose tests that fail on only one machine."""
     return f"arithmetic: {arithmetic.described()}"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Treat SIGTERM like Ctrl-C, and adopt orphaned descendants of tests."""
+    """Handle SIGTERM like Ctrl-C, and adopt orphaned descendants of tests."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     descendants.adopt_orphans()
-    # If a test started it, semaphores would be lost when that test ends.
+    # If a test started the tracker, semaphores would be lost at the end of that test.
     resource_tracker.ensure_running()
     _OUR_OWN.update(descendants.running())
     if not hasattr(config, "workerinput"):
@@ -72,7 +72,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Skip extended tests, unless ``-m`` selects tests or the command line names their file.
 
-    Tests that mostly wait run first, in parallel with the tests that compute.
+    Tests that mostly wait run first, in parallel with tests that compute.
     """
     if not config.option.markexpr:
         named = {Path(each.partition("::")[0]).resolve() for each in config.args}
@@ -85,7 +85,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Exclude the million permanent objects of all modules from garbage collection."""
+    """Exclude the modules' million permanent objects from garbage collection."""
     if session.config.stash.get(PERTURBATION, None) is not None:
         session.config.stash[PERTURBATION].enter_modules()
     gc.collect()
@@ -93,7 +93,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_unconfigure() -> None:
-    """End processes left by a crashed test process, which this process has adopted."""
+    """End processes that a crashed test process left and this process has adopted."""
     descendants.end(descendants.running() - _OUR_OWN)
 
 
@@ -105,20 +105,20 @@ def ended_with_the_test() -> Iterator[None]:
     yield
     for each, handler in handlers.items():
         signal.signal(each, handler)
-    gc.enable()  # a daemon running in this process disables it
+    gc.enable()  # disabled by daemons that run in this process
     descendants.end(descendants.running() - before)
 
 
 @pytest.fixture
 def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
-    """Yield a ZeroMQ context; unsent messages are dropped when the test ends."""
+    """Yield a ZeroMQ context that drops unsent messages when the test ends."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     yield context
     context.destroy(linger=0)
 
 
 def own_addresses() -> tuple[str, str]:
-    """Return two unused TCP addresses, for the stream and for commands.
+    """Return two unused TCP addresses, one for the stream and one for commands.
 
     The loopback host is derived from the process ID, and each call uses new ports.
     """
@@ -129,12 +129,12 @@ def own_addresses() -> tuple[str, str]:
 
 @pytest.fixture
 def addresses() -> tuple[str, str]:
-    """Return TCP addresses used only by this test."""
+    """Return TCP addresses that only this test uses."""
     return own_addresses()
 
 
 def write_profile(path: Path, addresses: tuple[str, str], text: str = "") -> Path:
-    """Write a profile with these addresses and ``text``.
+    """Write a profile that contains ``addresses`` and ``text``.
 
     The loop rate is 100 Hz unless ``text`` sets it, because the daemons of several tests share the
     processors.
@@ -154,7 +154,7 @@ def profile(tmp_path: Path, addresses: tuple[str, str]) -> Profile:
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Return a function that starts daemons, which are killed at the latest when the test ends."""
+    """Return a function that starts daemons; when the test ends, running daemons are killed."""
 
     def run(*words: str) -> Running:
         running = Running(*words)
@@ -166,7 +166,7 @@ def start() -> Iterator[Start]:
 
 
 class Told(NamedTuple):
-    """Result of a subcommand: exit status, standard output and error."""
+    """Result of a subcommand: exit status, standard output and standard error."""
 
     returncode: int
     stdout: str
@@ -182,8 +182,8 @@ Start = Callable[..., Running]
 @pytest.fixture
 def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Inline:
     """Return a function that runs a subcommand in this process."""
-    monkeypatch.setattr(os, "nice", lambda _: 0)  # keep the priority of the test process
-    # Suppress messages about compiling kernels, which only the first test on a machine prints.
+    monkeypatch.setattr(os, "nice", lambda _: 0)  # keep the test process priority
+    # Suppress messages about kernel compilation, which only the first test on a machine prints.
     monkeypatch.setattr(kernels, "print_event", lambda *_: None)
 
     def run(*words: object) -> Told:
@@ -198,13 +198,13 @@ def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
 
 
 def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
-    """Poll ``condition`` at increasing intervals; the time-out only catches hangs."""
+    """Poll ``condition`` at increasing intervals; the timeout only detects hangs."""
     begin = time.monotonic()
     while not condition():
         waited = time.monotonic() - begin
         if waited > seconds:
             raise TimeoutError(f"not within {seconds:g} s: {condition}")
-        # Sleep, so that the awaited process gets the processor.
+        # Sleep to leave the processor to the awaited process.
         select.select([], [], [], min(0.002 + 0.01 * waited, 0.02))
 
 
@@ -228,7 +228,7 @@ def make() -> Iterator[Make]:
 
 @pytest.fixture
 def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set the errors of the solid tip's data to zero, for frames generated from the same data."""
+    """Set the solid tip's data errors to zero, for frames that are generated from the same data."""
     from softfinger.kinematics.estimation import error_budget, estimator
 
     data = estimator.solid_data

@@ -1,1 +1,1 @@
-"""User tools: the command line `cli` and its subcommands, grouped into packages by subject."""
+"""User tools: the command line in `cli`, and its subcommands in one package per topic."""

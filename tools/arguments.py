@@ -1,6 +1,7 @@
-"""Define command-line arguments that several subcommands share.
+"""Command-line arguments shared by several subcommands.
 
-The settings are imported only when a profile is loaded; clients of a running hand do not need them.
+Settings are imported only when a profile is loaded, because clients of a running hand do not need
+them.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.wire.keys import ClientKeys
 
-WAIT_MAX = 5.0  # s, how long `--no-wait` waits for the first message
+WAIT_MAX = 5.0  # s, maximum wait for the first message with `--no-wait`
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config``, ``--set`` and ``--dir``, which select the hand; `profile` loads it."""
+    """Add ``--config``, ``--set`` and ``--dir``, which select the hand for `profile`."""
     add_settings(parser)
     add_directory(parser)
 
@@ -39,7 +40,7 @@ def add_directory(parser: argparse.ArgumentParser) -> None:
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config`` and ``--set``, for a subcommand that defines its own ``--dir``."""
+    """Add ``--config`` and ``--set`` to a subcommand that defines its own ``--dir``."""
     parser.add_argument(
         "--config",
         type=Path,
@@ -61,12 +62,12 @@ def add_changes(parser: argparse.ArgumentParser) -> None:
 
 
 def profile(arguments: argparse.Namespace) -> Settings:
-    """Load the settings selected by the arguments of `add_profile`.
+    """Load the settings selected with the `add_profile` arguments.
 
     Raises
     ------
     SettingsError
-        With the report of all errors.
+        If the settings are invalid; the message lists all errors.
     """
     from softfinger.daemon.profile.load import load
 
@@ -80,12 +81,12 @@ def profile(arguments: argparse.Namespace) -> Settings:
 
 
 def own_runtime_folder() -> Path | None:
-    """Return the default port folder of an emulated hand; None without a runtime folder."""
+    """Return the default port folder for an emulated hand, or None without a runtime folder."""
     return None if runtime_fault() else runtime_folder()
 
 
 def client_keys(folder: Path | None) -> ClientKeys | None:
-    """Load the client keys given by ``--keys``, to be applied to a socket before it connects.
+    """Load the client keys from ``--keys``, to be applied to a socket before it connects.
 
     Raises
     ------
@@ -99,9 +100,9 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
 
 
 def stream_address(text: str) -> str:
-    """Return the stream's address from a socket address, ``tcp://HOST`` or ``STREAM,COMMANDS``.
+    """Parse the stream address from a socket address, ``tcp://HOST`` or ``STREAM,COMMANDS``.
 
-    An empty text selects SOFTFINGER_ADDRESS, or the default address on this machine.
+    An empty string selects SOFTFINGER_ADDRESS, or else the default address on this machine.
 
     Raises
     ------
@@ -111,12 +112,12 @@ def stream_address(text: str) -> str:
 
 
 def command_address(text: str) -> str:
-    """Return the command socket's address; see `stream_address`."""
+    """Parse the command address; see `stream_address`."""
     return addresses(text)[1]
 
 
 def addresses(text: str) -> tuple[str, str]:
-    """Return the addresses of stream and commands; a single socket address is used for both.
+    """Parse the stream and command addresses; a single socket address is used for both.
 
     Raises
     ------
@@ -144,15 +145,15 @@ def addresses(text: str) -> tuple[str, str]:
 
 
 def waiting(address: str, folder: Path | None) -> str:
-    """Return the message shown while no stream arrives, with a hint if no keys were given.
+    """Return the message shown while waiting for the stream, with a hint if there are no keys.
 
-    A daemon that requires keys looks unreachable to a client without keys.
+    A daemon that requires keys appears unreachable to a client without keys.
     """
     return f"waiting for a stream from {address}{_hint(folder)}"
 
 
 def no_stream(address: str, folder: Path | None) -> str:
-    """Return the message for a stream that did not arrive in time."""
+    """Return the error message for a stream that has not arrived in time."""
     return f"no stream from {address} within {WAIT_MAX:g} s; is softfinger running?{_hint(folder)}"
 
 
@@ -161,19 +162,19 @@ def _hint(folder: Path | None) -> str:
 
 
 def to_stderr(subcommand: str) -> Callable[[str], None]:
-    """Return a function that prints a line on standard error, prefixed by the subcommand."""
+    """Return a function that prints a line to standard error, prefixed with the subcommand."""
     return lambda line: print(f"{subcommand}: {line}", file=sys.stderr, flush=True)
 
 
 def number(
     text: str, what: str, low: float, high: float = 1e9, *, includes_low: bool = False
 ) -> float:
-    """Parse a number between two bounds.
+    """Parse a number within bounds.
 
     Raises
     ------
     ArgumentTypeError
-        With ``what``, the description of the expected number, and the text found.
+        The message contains ``text`` and ``what``, the description of a valid number.
     """
     try:
         value = float(text)
@@ -185,17 +186,17 @@ def number(
 
 
 def seconds(text: str) -> float:
-    """Parse a time above 0 s; raise ArgumentTypeError otherwise."""
+    """Parse a time above 0 s; raise ArgumentTypeError if it is invalid."""
     return number(text, "a time above 0 s", 0.0)
 
 
 def megabytes(text: str) -> float:
-    """Parse a size above 0 MB; raise ArgumentTypeError otherwise."""
+    """Parse a size above 0 MB; raise ArgumentTypeError if it is invalid."""
     return number(text, "a size above 0 MB", 0.0)
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:
-    """Add ``--from`` and ``--to``, stored as ``start`` and ``end`` [s after the first message]."""
+    """Add ``--from`` and ``--to``, stored as ``start`` and ``end`` [s] after the first message."""
 
     def moment(text: str) -> float:
         return number(text, "a time of 0 s or more", 0.0, includes_low=True)
@@ -217,7 +218,7 @@ def add_range(parser: argparse.ArgumentParser) -> None:
 def add_daemon(
     parser: argparse.ArgumentParser, kind: Callable[[str], Any], client: bool = False
 ) -> None:
-    """Add ``--address`` and ``--keys``, and ``--client`` for a program that sends commands."""
+    """Add ``--address`` and ``--keys``, and ``--client`` to a program that sends commands."""
     where = "the daemon's address: tcp://HOST, STREAM,COMMANDS, or one socket"
     parser.add_argument("--address", type=kind, default="", help=where)
     parser.add_argument(
@@ -233,7 +234,7 @@ def add_stream(
     kind: Callable[[str], Any] = stream_address,
     client: bool = False,
 ) -> None:
-    """Add a subscriber's arguments: `add_daemon`'s, ``--no-wait`` and ``--duration``."""
+    """Add the `add_daemon` arguments, ``--no-wait`` and ``--duration`` to a subscriber."""
     add_daemon(parser, kind, client)
     parser.add_argument(
         "--no-wait",
@@ -249,7 +250,7 @@ def add_duration(parser: argparse.ArgumentParser) -> None:
 
 
 def add_split(parser: argparse.ArgumentParser) -> None:
-    """Add ``--split-size`` and ``--split-time``: a recorder's memory use grows with its file."""
+    """Add ``--split-size`` and ``--split-time``; a recorder's memory use grows with its file."""
     parser.add_argument(
         "--split-size", type=megabytes, metavar="MB", help="start a new file after this size"
     )
@@ -262,12 +263,12 @@ ALL = b"all"
 
 
 def topic(text: str) -> bytes:
-    """Parse a topic name of the stream, with or without ``hand/``, or ``all``.
+    """Parse ``all`` or the name of a stream topic, with or without ``hand/``.
 
     Raises
     ------
     ArgumentTypeError
-        With the text found.
+        The message contains ``text``.
     """
     from softfinger.daemon.wire import schema
 

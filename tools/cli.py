@@ -1,9 +1,9 @@
 """Parse the command line and run the selected subcommand.
 
-Each subcommand is a module in a package of ``tools/`` and is imported only when it is called. It
-defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user
-can correct it raises a SettingsError (exit status 2), or another SoftfingerError or an OSError
-about a file (exit status 1).
+Each subcommand is a module in a ``tools/`` package and is imported only when called. It defines
+``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user can
+correct, it raises SettingsError (exit status 2), another SoftfingerError, or OSError for a file
+(exit status 1).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from softfinger.daemon.errors import SettingsError, SoftfingerError, nearest
 _OPTIONS = ("-h", "--help", "--version")
 _UNKNOWN = re.compile(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)")
 
-GROUPS = {  # for each subcommand: its package in tools/, and its description
+GROUPS = {  # package in tools/ and description of each subcommand
     "run": {
         "run": ("processes", "run the daemon; without --config, on the built-in simulated hand"),
         "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),
@@ -77,14 +77,14 @@ The help of a subcommand lists its additional exit statuses."""
 
 
 def _open_standard_streams() -> None:
-    """Open /dev/null for closed standard streams, so that no other file takes their descriptors.
+    """Open /dev/null for closed standard streams, so that no other file gets their descriptors.
 
-    Characters that a terminal or pipe cannot encode, such as θ, are replaced.
+    Also replace characters that a terminal or pipe cannot encode, such as θ.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
-            os.set_inheritable(descriptor, True)  # child processes inherit it too
+            os.set_inheritable(descriptor, True)  # let child processes inherit it
             setattr(sys, name, os.fdopen(descriptor, mode))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -92,7 +92,7 @@ def _open_standard_streams() -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that suggests the nearest known word for an unknown one."""
+    """Argument parser that suggests the closest known word for an unknown one."""
 
     def error(self, message: str) -> NoReturn:
         unknown = _UNKNOWN.search(message)
@@ -106,7 +106,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class TopParser(Parser):
-    """Parser whose help lists the subcommands in groups."""
+    """Argument parser whose help lists the subcommands in groups."""
 
     def format_help(self) -> str:
         lines = [f"usage: {self.prog} SUBCOMMAND …\n\n{self.description}"]
@@ -117,12 +117,12 @@ class TopParser(Parser):
 
 
 def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any, Parser]]]:
-    """Make the parser with all subcommands.
+    """Make a parser for all subcommands.
 
     Returns
     -------
-    The parser, and the module and parser of each subcommand in ``imported``. The other subcommands
-    have no arguments.
+    The parser, and the module and parser of each subcommand in ``imported``. Parsers for all other
+    subcommands have no arguments.
     """
     parser = TopParser(
         prog="softfinger",
@@ -148,7 +148,7 @@ def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any,
     return parser, made
 
 
-# Parts of the messages that the shared-library loader gives when memory is exhausted.
+# Parts of the shared-library loader's messages when memory is exhausted.
 _NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "libllvmlite")
 
 
@@ -176,7 +176,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(argv: Sequence[str] | None) -> int:
-    # Until the subcommand installs its own handler, Ctrl-C ends the process without a traceback.
+    # Let Ctrl-C end the process without a traceback until the subcommand installs its own handler.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _open_standard_streams()
     words = list(sys.argv[1:] if argv is None else argv)
@@ -185,7 +185,7 @@ def _main(argv: Sequence[str] | None) -> int:
         return 0
     if words[:1] == ["help"]:
         words = [*words[1:2], "--help"]
-    # Import only the subcommand that is called, both for its arguments and for its work.
+    # Import only the called subcommand.
     called = next((word for word in words if word in SUBCOMMANDS), "")
     if called in _LINUX and sys.platform != "linux":
         print(
@@ -212,12 +212,12 @@ def _main(argv: Sequence[str] | None) -> int:
         status: int = module.run(arguments)
         sys.stdout.flush()
     except KeyboardInterrupt:
-        return 130  # exit status that shells use for Ctrl-C
+        return 130  # shell convention for Ctrl-C
     except BrokenPipeError:
-        # The reader has closed the pipe, as in `| head`; discard the remaining output.
+        # The reader has closed the pipe, e.g. `| head`. Discard the remaining output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except SettingsError as error:  # contains one line for each key
+    except SettingsError as error:  # one line per key
         print(error, file=sys.stderr)
         return 2
     except SoftfingerError as error:

@@ -1,4 +1,4 @@
-"""Import optional packages, by the extra that installs them."""
+"""Import optional packages, grouped by the extra that installs them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _EXTRAS = {  # extra: (reason in the error message, modules)
 
 
 class MissingExtra(SoftfingerError, ImportError):
-    """A package of an optional extra is missing; the message gives the command that installs it."""
+    """A package from an optional extra is missing; the message contains the install command."""
 
 
 def require(extra: str) -> None:
-    """Import the packages of an extra; raise MissingExtra if one is missing."""
+    """Import an extra's packages; raise MissingExtra if one is missing."""
     needs, modules = _EXTRAS[extra]
     try:
         for module in modules:
@@ -34,9 +34,9 @@ def require(extra: str) -> None:
 
 
 def _install() -> str:
-    """Return the command that installs packages in this environment."""
+    """Return the command for installing packages in this environment."""
     if (Path(sys.prefix) / "pipx_metadata.json").exists():
         return "pipx runpip softfinger install"
-    if importlib.util.find_spec("pip") is None:  # an environment made by uv
+    if importlib.util.find_spec("pip") is None:  # environment created by uv
         return f"uv pip install --python {sys.executable}"
     return f"{sys.executable} -m pip install"

@@ -1,6 +1,6 @@
 """Run a daemon on virtual time and record the simulated hand's true state.
 
-Used by ``envelope``, ``bench`` and the tests.
+``envelope``, ``bench`` and the tests use this module.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ __all__ = ["SimulatedDaemon"]
 
 @dataclass(frozen=True)
 class TrueStates:
-    """True state of the simulated hand at each tick."""
+    """True states of the simulated hand, one per tick."""
 
     t: NDArray[np.float64]  # s
-    force: NDArray[np.float64]  # N [n, 2]
+    force: NDArray[np.float64]  # N, [n, 2]
     angle: NDArray[np.float64]  # rad
-    slip: NDArray[np.float64]  # |T|/μN, the larger of both tips
+    slip: NDArray[np.float64]  # 1, larger |T|/μN of both tips
 
     def since(self, index: int) -> TrueStates:
-        """Return the part of the record from this tick on."""
+        """Return the record from tick ``index`` on."""
         return TrueStates(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
 
     def settled(self, off: NDArray[np.bool_]) -> float:
-        """Return the time of the last tick at which ``off`` is True [s]."""
+        """Return the time [s] of the last tick for which ``off`` is True."""
         where = np.flatnonzero(off)
         return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
 
 
 class SimulatedDaemon:
-    """Daemon on virtual time whose simulated hand can be observed; raises SettingsError."""
+    """Daemon on virtual time with an observable simulated hand; raises SettingsError."""
 
     def __init__(
         self,
         sections: dict[str, dict[str, Any]],
         hand: dict[str, dict[str, Any]] | None = None,
     ) -> None:
-        """Build the daemon; ``hand`` gives the hand's settings if they differ from the daemon's."""
+        """Build the daemon; ``hand`` contains the hand's settings if they differ."""
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self.events: list[Event] = []
         real = None if hand is None else checked(hand | {"loop": {"clock": "virtual"}})
@@ -71,7 +71,7 @@ class SimulatedDaemon:
 
     @property
     def now(self) -> float:
-        """Current time of the virtual clock [s]."""
+        """Current virtual time [s]."""
         return self._daemon.clock.now()
 
     @property
@@ -82,7 +82,7 @@ class SimulatedDaemon:
         return self.loop.command({"command": name, **numbers})
 
     def grasp(self, force: float) -> None:
-        """Arm the hand and start a grasp."""
+        """Arm the hand and start grasping."""
         self.loop.advance(0.3)
         self.command("arm")
         self.loop.advance(0.2)
@@ -93,7 +93,7 @@ class SimulatedDaemon:
         self.loop.advance(seconds)
 
     def watch(self, seconds: float) -> TrueStates:
-        """Advance by ``seconds``; return the true state at each tick."""
+        """Advance by ``seconds`` and return the true state for each tick."""
         return TrueStates(*(np.array(column) for column in zip(*self._ticks(seconds), strict=True)))
 
     def _ticks(self, seconds: float) -> Iterator[tuple[float, tuple[float, ...], float, float]]:

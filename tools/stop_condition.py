@@ -1,4 +1,4 @@
-"""End a subcommand by a signal, after a duration, or with its parent process."""
+"""End a subcommand on a signal, after a time limit, or together with its parent process."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import Any, Self
 
 
 def available_signals(*names: str) -> tuple[signal.Signals, ...]:
-    """Return those of the named signals that exist on this system."""
+    """Return the named signals that exist on this system."""
     return tuple(each for each in signal.Signals if each.name in names)
 
 
 class StopCondition:
-    """Context in which a signal, a time limit or a closed pipe requests the end of a subcommand.
+    """Context manager in which a signal, time limit or closed pipe requests a subcommand's end.
 
     Parameters
     ----------
     duration
         Time limit [s], counted from `begin`.
     lifeline
-        Read end of a pipe that the parent process holds; its closing requests the end.
+        Read end of a pipe from the parent process. When the pipe closes, the end is requested.
     """
 
     signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
@@ -37,12 +37,12 @@ class StopCondition:
         self._lifeline = [] if lifeline is None else [lifeline]
 
     def begin(self) -> None:
-        """Start counting the duration."""
+        """Start the time limit."""
         self._deadline = time.monotonic() + self._duration
 
     @property
     def is_requested(self) -> bool:
-        """True if a signal has come or the lifeline was closed."""
+        """True if a signal has arrived or the lifeline has closed."""
         return self._is_requested
 
     @property
@@ -51,15 +51,14 @@ class StopCondition:
         return self.is_requested or time.monotonic() >= self._deadline
 
     def wait(self, seconds: float) -> bool:
-        """Wait at most ``seconds`` for the end; return True if it has come."""
+        """Wait up to ``seconds`` for the end; return True if the subcommand should end."""
         self.wait_readable(seconds)
         return self.is_met
 
     def wait_readable(self, seconds: float, *others: int) -> list[int]:
-        """Wait at most ``seconds`` for the end, a signal or readable descriptors among ``others``.
+        """Wait up to ``seconds`` and return the readable descriptors among ``others``.
 
-        Returns the readable descriptors. A signal that does not request the end also interrupts the
-        wait.
+        An end request or any other signal also interrupts the wait.
         """
         left = min(seconds, self._deadline - time.monotonic())
         watched = [self._wakes.fileno(), *self._lifeline, *others]
@@ -76,12 +75,12 @@ class StopCondition:
 
     def wake(self, *_: object) -> None:
         """Interrupt a wait."""
-        # Do not use an Event: its lock may be held by the thread that the signal interrupts.
-        with contextlib.suppress(BlockingIOError):  # a full buffer also wakes the waiting thread
+        # Do not use an Event: the interrupted thread may hold its lock.
+        with contextlib.suppress(BlockingIOError):  # a full buffer wakes the thread as well
             self._wake.send(b"!")
 
     def __enter__(self) -> Self:
-        self._wakes, self._wake = socket.socketpair()  # on Windows, select does not accept pipes
+        self._wakes, self._wake = socket.socketpair()  # select needs sockets on Windows
         self._wake.setblocking(False)
         self._before = {number: signal.signal(number, self.end) for number in self.signals}
         return self
@@ -94,16 +93,16 @@ class StopCondition:
 
 
 class Interrupted(BaseException):
-    """A signal requested the end before the daemon ran; ``except Exception`` does not catch it."""
+    """A signal requested the end before the daemon was running; not an `Exception` subclass."""
 
 
-# Signals whose default action would end the process at once, leaving the torque to the servo
-# watchdog. SIGHUP means that the terminal was closed.
+# The default action of these signals ends the process immediately, so that only the servo watchdog
+# would switch torque off. SIGHUP means that the terminal was closed.
 _TERMINATING = available_signals("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
 
 
 class Signals:
-    """Handle every signal that would end the process, for a clean shutdown at any stage."""
+    """Handle all terminating signals, so that shutdown is clean at any stage."""
 
     def __init__(self) -> None:
         self._end_running: Callable[[], None] | None = None
@@ -112,14 +111,14 @@ class Signals:
             signal.signal(number, self._end)
 
     def hand_over(self, end: Callable[[], None]) -> None:
-        """Let signals call ``end`` from now on; raise Interrupted if one has already come."""
+        """Let signals call ``end`` from now on; raise Interrupted if one has already arrived."""
         self._end_running = end
         if self._has_ended:
             raise Interrupted
 
     @contextlib.contextmanager
     def deferred(self) -> Iterator[None]:
-        """Defer signals within this context; raise Interrupted at its end if one came."""
+        """Defer signals within this context; raise Interrupted on exit if one has arrived."""
         self._deferred = True
         try:
             yield

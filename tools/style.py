@@ -1,7 +1,7 @@
-"""Plot style: sizes for print, and lines that can be told apart without colour.
+"""Plot style: sizes for print, and lines that can be distinguished without colour.
 
-Ordered families of lines (by displacement or angle) use colours of decreasing lightness, which keep
-their order in greyscale and for colour-blind readers; each line also has its own dash pattern.
+Ordered families of lines (by displacement or angle) use colours of decreasing lightness. The order
+remains visible in greyscale and to colour-blind readers. Each line also has its own dash pattern.
 Unordered categories use the colours of Okabe and Ito.
 """
 
@@ -54,7 +54,7 @@ _SETTINGS: dict[Any, Any] = {
 
 
 def settings() -> AbstractContextManager[None]:
-    """Return a context that applies this style; raise MissingExtra without matplotlib."""
+    """Return a context manager that applies this style; raise MissingExtra without matplotlib."""
     require("plot")
     import matplotlib
 
@@ -62,14 +62,14 @@ def settings() -> AbstractContextManager[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of this size [inch], independent of any window system."""
+    """Return an empty figure of the given size [inch], independent of any window system."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write the figure in the format given by the path's suffix."""
+    """Write the figure in the format that the path suffix gives."""
     picture = io.BytesIO()
     figure.savefig(picture, dpi=DPI, format=path.suffix.removeprefix(".") or None)
     with write_bytes(path) as file:
@@ -77,7 +77,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def ordered(count: int) -> list[dict[str, Any]]:
-    """Return colour and dash of each line in an ordered family, light to dark, solid first."""
+    """Return colours and dashes for an ordered family of lines, from light to dark, solid first."""
     import matplotlib
 
     shades = matplotlib.colormaps["viridis"](np.linspace(0.72, 0.0, count))
@@ -85,7 +85,7 @@ def ordered(count: int) -> list[dict[str, Any]]:
 
 
 def caption(figure: Figure, lines: Sequence[str]) -> None:
-    """Write notes below the panels, wrapped to the figure's width."""
+    """Write notes below the panels, wrapped to the figure width."""
     import textwrap
 
     columns = int(figure.get_figwidth() * 17.5)

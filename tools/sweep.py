@@ -1,8 +1,8 @@
 """Run sweeps of independent cases on several processors or a Dask cluster, with a progress bar.
 
-The results are identical to the bit for any number of workers, because the cases are independent.
-If a worker dies, its cases are run again. With a journal, an interrupted sweep continues from the
-cases already done.
+The cases are independent, so the results are bit-identical for any number of workers. If a worker
+dies, its cases are run again. With a journal, an interrupted sweep resumes after the completed
+cases.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-_CONNECT_TIMEOUT = 10.0  # s to wait for the scheduler to answer
-_REDRAW_INTERVAL = 0.1  # s between redraws of a bar
+_CONNECT_TIMEOUT = 10.0  # s, time limit for the scheduler connection
+_REDRAW_INTERVAL = 0.1  # s, between two redraws of a bar
 _BAR_WIDTH = 20  # columns
 
 
 class SweepError(SoftfingerError):
-    """A sweep cannot continue; the message gives the reason."""
+    """The sweep cannot continue; the message gives the reason."""
 
 
 class Progress:
@@ -51,7 +51,7 @@ class Progress:
         self.on = on and sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
-        """Show ``done`` of the total, with ``note`` in place of the percentage."""
+        """Show ``done`` of the total, with ``note`` instead of the percentage."""
         if not self.on or time.monotonic() - self._shown < _REDRAW_INTERVAL:
             return
         self._shown = time.monotonic()
@@ -92,11 +92,11 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
 
 
 class Sweep(Generic[Case, Result]):
-    """Run ``work`` once for each of ``cases``; iterating yields the results in their order.
+    """Run ``work`` once for each of ``cases``; iterating yields the results in the same order.
 
-    ``work``, cases and results must be picklable; with a ``journal``, results must be
-    JSON-serialisable. ``name`` is the label of the progress bar. The caller removes the journal
-    once the results are stored.
+    ``work``, cases and results must be picklable. With a ``journal``, results must also be
+    JSON-serialisable; the caller removes the journal after storing the results. ``name`` labels the
+    progress bar.
     """
 
     def __init__(
@@ -111,15 +111,15 @@ class Sweep(Generic[Case, Result]):
         self._digest = hashlib.sha256(pickle.dumps((work, list(cases)))).hexdigest()
 
     def run(self, processes: int | None = None, scheduler: str | None = None) -> Iterator[Result]:
-        """Yield the results as they arrive, in the order of the cases.
+        """Run the sweep and yield each result as soon as possible, in the order of the cases.
 
         Raises
         ------
         SweepError
-            If the scheduler does not answer, workers die repeatedly, or the journal belongs to
+            If the scheduler does not respond, workers die repeatedly, or the journal belongs to
             another sweep.
         MissingExtra
-            Without Dask.
+            If a scheduler is given and Dask is not installed.
         """
         self._take_up()
         processes = processes or processors()
@@ -135,7 +135,7 @@ class Sweep(Generic[Case, Result]):
             yield from (self._results[k] for k in range(yielded, len(self._cases)))
 
     def _done(self, processes: int, scheduler: str | None) -> Iterator[int]:
-        """Run the remaining cases; yield the number of finished ones."""
+        """Run the remaining cases and yield the number of completed cases."""
         yield len(self._results)
         if scheduler is None and processes == 1:
             for k in self._left():
@@ -150,7 +150,7 @@ class Sweep(Generic[Case, Result]):
                 if len(self._results) > before:
                     before, workers = len(self._results), processes
                 elif workers > 1:
-                    workers = 1  # one case at a time, to identify the one that crashes the worker
+                    workers = 1  # one case at a time, to identify the case that crashes its worker
                 else:
                     case = self._cases[self._left()[0]]
                     raise SweepError(f"{self._name}: each worker dies at {case}") from None
@@ -182,7 +182,7 @@ class Sweep(Generic[Case, Result]):
                 file.write(json.dumps([k, result]) + "\n")
 
     def _take_up(self) -> None:
-        """Read the journal of an interrupted sweep, or start a new one."""
+        """Read the journal from an interrupted sweep, or start a new journal."""
         if self._journal is None:
             return
         if not self._journal.exists():
@@ -196,7 +196,7 @@ class Sweep(Generic[Case, Result]):
             try:
                 k, result = json.loads(line)
             except ValueError:
-                break  # the last line is incomplete
+                break  # incomplete last line
             self._results[int(k)] = result
 
 
@@ -206,7 +206,7 @@ def _pool(processes: int) -> Iterator[Executor]:
         processes,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),  # the parent process handles Ctrl-C
+        initargs=(signal.SIGINT, signal.SIG_IGN),  # only the parent process handles Ctrl-C
     )
     try:
         yield executor

@@ -60,7 +60,7 @@ def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
 def until_it_says(words: Sequence[str | Path], text: str) -> None:
     """Run a tool until it prints a line with ``text``, then end it; it must end without error."""
     process = started(*words, stderr=None)
-    assert any(text in line for line in process.stdout), f"{text!r} never came"
+    assert any(text in line for line in process.stdout), f"{text!r} was not printed"
     process.terminate()
     process.communicate(timeout=300)
     assert process.returncode == 0

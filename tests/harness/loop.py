@@ -25,7 +25,7 @@ def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
     """Advance until the hand is in ``mode``; fail after ``seconds``."""
     finish = daemon.clock.now() + seconds
     while daemon.loop.state.mode != mode:
-        assert daemon.clock.now() < finish, f"{daemon.loop.state.mode}, not {mode}"
+        assert daemon.clock.now() < finish, f"mode is {daemon.loop.state.mode}, expected {mode}"
         daemon.loop.advance(0.01)
 
 

@@ -72,7 +72,7 @@ def test_torque_on_far_from_the_goal_is_recorded():
     hand = Hand()
     hand.write(reg.GOAL_POSITION, 2048 + 10, 4)
     hand.write(reg.GOAL_CURRENT, 20, 2)
-    assert hand.report(1)["goal_q"] is None, "the angle that a limp joint has is no way to go"
+    assert hand.report(1)["goal_q"] is None, "without torque, the position is not a goal"
     hand.write(reg.TORQUE_ENABLE, 1, 1)
     hand.write(reg.TORQUE_ENABLE, 1, 1)  # already on
     on = hand.report(1)["torque_on"]

@@ -126,8 +126,8 @@ def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path, names):
         told[scene["scene"]] = scene
     assert set(told) == set(names)
     for name, scene in told.items():
-        assert scene["before"] >= 5, f"{name}: the watch heard nothing of the warm-up"
-        assert scene["in no part"] == [], f"{name}: the daemon itself would compile these"
+        assert scene["before"] >= 5, f"{name}: the warm-up compilation was not observed"
+        assert scene["in no part"] == [], f"{name}: the daemon would compile these itself"
         assert scene["after"] == [], name
         servos = name != "sensors without servos"
         blind = name in ("servos without sensors", "position mode")

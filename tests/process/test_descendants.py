@@ -27,7 +27,7 @@ def test_all_descendants_of_a_test_are_ended(parent):
     process.stdout.close()
     if parent == "ends":
         assert process.wait(300.0) == 0
-        assert child.is_running(), "the orphan is this process's child by now"
+        assert child.is_running(), "this process must adopt the orphan"
     descendants.end(descendants.running() - before)
     assert not child.is_running()
     assert not descendants.running() - before

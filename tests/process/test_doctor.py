@@ -284,7 +284,7 @@ def test_the_process_using_a_port_is_named(terminal, locked):
     assert found.status == "FAIL"
     assert f"in use by process {other.pid} (python" in found.text
     assert found.fix == f"kill {other.pid}"
-    assert well.status == "warn", "a daemon that answers is well, and not to be killed"
+    assert well.status == "warn", "a responding daemon must not be killed"
     assert (
         f"the softfinger daemon that runs here has it (holding, process {other.pid})" in well.text
     )

@@ -71,13 +71,13 @@ def blocks(page: Path) -> list[Block]:
         line = text.count("\n", 0, fence.start()) + 1
         if mark:
             assert REASON.fullmatch(mark), f"{page.name}:{line}: {mark!r}"
-            assert fence["language"], f"{page.name}:{line}: a mark on a block that isn't run"
+            assert fence["language"], f"{page.name}:{line}: mark on a block that is not run"
             for other in re.findall(r"tests/\S+", mark):
                 assert (ROOT / other).exists(), f"{page.name}:{line}: {other}"
         if fence["language"]:
             code = textwrap.dedent(fence["text"])
             found.append(Block(line, fence["language"], code, mark, fence["title"] or ""))
-    assert not marks, f"{page.name}: marks above no block: {[*marks.values()]}"
+    assert not marks, f"{page.name}: marks without a block: {[*marks.values()]}"
     return found
 
 
@@ -105,7 +105,7 @@ class Shell:
         )
         while True:
             ready = select.select([self._told, self._softfinger.socket], [], [], PATIENCE)[0]
-            assert ready, f"too long: {text}"
+            assert ready, f"timeout: {text}"
             if self._told in ready:
                 return os.read(self._told, 4096).decode().strip()
             self._softfinger.serve()
@@ -184,7 +184,9 @@ def test_code_blocks_run(page, shared, tmp_path, monkeypatch):
             at = f"{page.name}:{block.line}"
             missing = re.fullmatch(r"not run without (\w+)", block.mark)
             if missing:
-                assert missing[1] in block.text, f"{at}: {block.mark}: doesn't need it"
+                assert missing[1] in block.text, (
+                    f"{at}: {block.mark}: the block does not use this module"
+                )
             if block.mark.startswith("not run") and not (
                 missing and importlib.util.find_spec(missing[1])
             ):
@@ -201,7 +203,7 @@ def test_code_blocks_run(page, shared, tmp_path, monkeypatch):
             elif block.language == "python":
                 run_python(block.text, shared.addresses)
             else:
-                assert block.language == "toml", f"{at}: {block.language}: nothing runs this"
+                assert block.language == "toml", f"{at}: {block.language}: unsupported language"
                 Path("block.toml").write_text(block.text)
                 load(Path("block.toml"))
     finally:

@@ -153,8 +153,8 @@ def test_a_missing_reply_takes_no_longer_than_the_deadline(bus, connect):
     assert reading.seq == 2
     assert reading.q == kept
     assert spent >= 1.0
-    assert busy < 0.1 * spent, "it must sleep"
-    assert backend.counters()["timeouts"] == 1, "it must not ask again"
+    assert busy < 0.1 * spent, "read must sleep while it waits"
+    assert backend.counters()["timeouts"] == 1, "read must not repeat the request"
     bus.fault("answer=1")
     backend.read(reading)
     assert reading.valid
@@ -278,7 +278,7 @@ def test_lost_goals_are_detected(running, mode, connect):
     bus.fault("lose-writes=1")
     before = sent
     until(lambda: tick().lost == 0b11)
-    assert sent - before >= 17, "a single goal that was lost is no cause"
+    assert sent - before >= 17, "a single lost goal must not be reported"
     bus.fault("lose-writes=0")
     until(lambda: tick().lost == 0)
 

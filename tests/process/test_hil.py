@@ -91,7 +91,7 @@ class Rig:
             assert angles == pytest.approx([target, target], abs=0.05)
         for servo in self.report()["servos"]:
             assert not servo["stopped_by_watchdog"]
-            assert servo["torque_on"]["far"] == 0, "torque went on with a goal elsewhere"
+            assert servo["torque_on"]["far"] == 0, "torque was switched on far from the goal"
         self.does("disarm")
         until(lambda: not any(servo["torque"] for servo in self.report()["servos"]))
 
@@ -205,7 +205,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     daemon = rig.start()
     status = rig.status()
     assert (status["mode"], status["torque"], status["fault"]) == ("disarmed", False, "")
-    assert rig.stopped(), "starting touches nothing"
+    assert rig.stopped(), "starting the daemon must not move the servos"
     send_words(rig.folder, "forget")
     rig.works()
 
@@ -222,7 +222,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     stops_in_time(rig, lambda: send_words(rig.folder, "unplug"))
     until(lambda: rig.status()["mode"] == "fault")
     assert rig.status()["fault_name"] == "servos.bus"
-    assert not rig.send("clear")["ok"], "nothing is there to be cleared"
+    assert not rig.send("clear")["ok"], "clear must fail while the port is missing"
     send_words(rig.folder, "plug")
     until((rig.folder / "servos").exists)
     rig.does("clear")
@@ -250,7 +250,7 @@ def test_lost_packets_do_not_keep_torque_on(rig):
     assert json.loads(told.stdout)["torque_off"] == "unconfirmed"
     assert "have not confirmed torque off" in told.stderr
     until(rig.stopped)
-    assert rig.status()["torque"], "they are stopped, and it is not confirmed to be off"
+    assert rig.status()["torque"], "torque off is not confirmed yet"
     send_words(rig.folder, "lose-writes=0")
     until(lambda: not rig.status()["torque"])
     assert not any(servo["torque"] for servo in rig.report()["servos"])

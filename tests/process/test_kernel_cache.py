@@ -111,7 +111,7 @@ def test_a_changed_callee_or_constant_is_recompiled(package, first):
     assert package.run()[0] == ["12.0", "0"]
     package.write("softfinger/kinematics/layout.py", "OFFSET = 1.0\n")
     found = package.run()
-    assert found == (["6.0", "1"], ""), "the folder of these sources is still there"
+    assert found == (["6.0", "1"], ""), "the cache folder of these sources must still exist"
 
 
 @pytest.mark.extended
@@ -164,7 +164,7 @@ def test_the_folder_is_private_and_the_least_recently_used_ones_are_removed(pack
     assert (base / new).stat().st_mode & 0o777 == 0o700
     (base / new).chmod(0o777)
     found, told = package.run()
-    assert found == ["3.0", "0"], "compiled, but not taken from it"
+    assert found == ["3.0", "0"], "the kernel must be compiled, not loaded from the cache"
     assert f"{base / new}: may be written by others (0777): chmod go-w" in told
     (base / new).chmod(0o700)
     package.cache.chmod(0o777)  # a parent folder

@@ -265,7 +265,9 @@ def test_a_full_disk_ends_the_recording_with_a_message_and_keeps_earlier_data(fa
     assert "--recover" in error
     total = Recording(path).total
     assert total > 10
-    assert f"{total} messages written of " in out, "what is in the file counts"
+    assert f"{total} messages written of " in out, (
+        "the message must state the number of messages in the file"
+    )
 
 
 def test_messages_sent_before_the_end_are_written(addresses, tmp_path):

@@ -182,7 +182,7 @@ def test_the_golden_recording_gives_the_same_states() -> None:
     assert (result.ticks, result.states) == (1000, 1000)
     assert (result.missing_ticks, result.missing_frames) == (0, 0)
     if json.loads(MADE_ON.read_text(encoding="utf-8")) == machine_class():
-        assert result.differences == {}, "not identical to the last bit"
+        assert result.differences == {}, "states are not bit-identical"
     for name, difference in result.differences.items():
         assert isinstance(difference.recorded, float), f"{name}: {difference}"
         assert difference.worst < 1e-9, f"{name}: {difference}"

@@ -107,12 +107,14 @@ def test_the_daemon_reports_ready_alive_and_stopping_but_not_while_suspended(
     with ending(process):
         assert manager.next() == b"READY=1\nWATCHDOG=1"
         status = ask(addresses[1], "status")
-        assert (status["mode"], status["torque"]) == ("disarmed", False), "ready, and no task"
+        assert (status["mode"], status["torque"]) == ("disarmed", False), (
+            "the daemon must start without a task"
+        )
         for _ in range(5):
             assert manager.next() == b"WATCHDOG=1"
         process.send_signal(signal.SIGSTOP)
         manager.drain()
-        assert manager.quiet_for(0.5), "a loop that stands still feeds no watchdog"
+        assert manager.quiet_for(0.5), "a stalled loop must not notify the watchdog"
         process.send_signal(signal.SIGCONT)
         assert manager.next() == b"WATCHDOG=1"
         process.terminate()
@@ -120,7 +122,7 @@ def test_the_daemon_reports_ready_alive_and_stopping_but_not_while_suspended(
         while told != b"STOPPING=1":
             told = manager.next()
         assert process.wait(timeout=300) == 0
-        assert process.stderr.read() == "", "all of it went into the file"
+        assert process.stderr.read() == "", "all output must be in the log file"
     records = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     assert all({"timestamp", "level", "kind", "text"} <= set(record) for record in records)
     texts = [record["text"] for record in records]
@@ -143,7 +145,7 @@ def test_an_abstract_socket_and_a_watchdog_of_another_process():
         for t in range(10):
             service.alive(float(t))
         assert manager.recv(100) == b"READY=1\nWATCHDOG=1"
-        assert not select.select([manager], [], [], 0.0)[0], "another process is watched"
+        assert not select.select([manager], [], [], 0.0)[0], "systemd watches another process"
         service.close()
 
 
@@ -163,7 +165,7 @@ def test_the_unit_has_the_settings_of_a_control_daemon(tmp_path, inline):
     assert service["DeviceAllow"] == "/dev/cpu_dma_latency rw"
     words = shlex.split(service["ExecStart"].replace("%%", "%"))
     assert words[0] == sys.executable
-    assert words[4:6] == ["run", "--no-task"], "comes back disarmed"
+    assert words[4:6] == ["run", "--no-task"], "the service must restart disarmed"
     assert words[6:] == ["--log", "json", "--config", str(config)]
     # The started program exists: the same words print its help.
     shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=300, check=False)

@@ -71,7 +71,7 @@ def test_results_are_stored(canned, tmp_path, capsys):
         ("tick", "pipeline alone, nobody subscribed"),
     ]
     assert cli.main(["bench"]) == 0
-    assert "tick: pipeline alone" in capsys.readouterr().out, "the page"
+    assert "tick: pipeline alone" in capsys.readouterr().out, "results must be printed"
 
 
 def test_a_failed_measurement_does_not_affect_the_others(canned, monkeypatch, capsys):

@@ -84,7 +84,7 @@ def test_profiles_and_keys_are_shown_from_any_folder(inline, tmp_path, monkeypat
     (tmp_path / "hil").mkdir()  # a project may have such a folder
     listed = inline("config", "list").stdout.splitlines()
     assert [line.split()[0] for line in listed] == names()
-    assert all(len(line.split()) > 2 for line in listed), "each says what it is"
+    assert all(len(line.split()) > 2 for line in listed), "each profile must have a description"
     assert inline("config", "show", "hil").stdout == find(Path("hil")).read_text("utf-8")
     every = tomllib.loads(inline("config", "reference").stdout)
     assert (

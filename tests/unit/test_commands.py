@@ -119,7 +119,9 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
         until(lambda: [served.settle(1), len(served.link.asked) + queue.count == 2][1])
         served.server.raise_fence()
         assert early.told()["reason"] == "stopped"
-        assert asking.told() == {"ok": True, "heard": "status"}, "it harms nobody"
+        assert asking.told() == {"ok": True, "heard": "status"}, (
+            "other requests must not be affected"
+        )
         early.send("arm")
         assert early.told() == {"ok": True, "heard": "arm"}
 
@@ -381,9 +383,9 @@ def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
         commands = served.service.commands
         until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
         until(lambda: [served.serve(note), collected()][1])
-        assert {19, 119} <= set(forces), "the newest of each connection"
+        assert {19, 119} <= set(forces), "each connection's newest setpoint must be executed"
         assert len(forces) <= 2 * -(-40 // bounds.UNANSWERED_MAX), (
-            "of those that the loop has at a time"
+            "older setpoints that wait at the same time must be superseded"
         )
         refused = {each["reason"] for found in replies for each in found if not each["ok"]}
         assert refused == {"superseded"}
@@ -525,7 +527,7 @@ def test_flooding_clients_leave_room_for_others(context, addresses):
         until(lambda: [served.serve(note), other.poll(0)][1])
         assert msgpack.unpackb(other.recv())["ok"]
         assert flood.sockets
-        assert len(heard) < 1100, "it waited for more than those that were before it"
+        assert len(heard) < 1100, "the request waited for later requests"
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o660])

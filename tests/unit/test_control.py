@@ -272,7 +272,9 @@ def test_the_small_hand_grasps_and_turns():
     with SimulatedDaemon(load(profile).model_dump()) as hand:
         seen = grasped(hand, force=1.0)
         assert seen.force.max() < 1.1
-        assert seen.force[-250:].mean() == pytest.approx(1.0, rel=0.08), "gears hold some of it"
+        assert seen.force[-250:].mean() == pytest.approx(1.0, rel=0.08), (
+            "gear friction carries part of the force"
+        )
         hand.command("rotate", angle=ANGLE)
         seen = hand.watch(1.5)
         assert np.abs(seen.angle - ANGLE)[-250:].max() < math.radians(0.2)
@@ -297,7 +299,9 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
                 off.append(seen.angle[-1] - angle)
                 forces.append(seen.force[-1].mean() / force)
         assert set(modes) == {"holding"}
-        assert np.abs(off).max() < math.radians(1.5), "the setpoint's smoothing: 0.06 s"
+        assert np.abs(off).max() < math.radians(1.5), (
+            "setpoint smoothing delays the angle by 0.06 s"
+        )
         assert np.abs(np.array(forces) - 1.0).max() < 0.04 + KNOWN
         for k in range(int(rate)):  # constant except for small fluctuations
             hand.command("hold", force=10.0 + 0.05 * (k % 2), angle=1e-3 * (k % 2))
@@ -306,7 +310,7 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
         hand.plant.apply_load(0.0, 13.0)
         hand.watch(0.5)
         assert hand.mode == "holding"
-        assert hand.plant.force.mean() > 15.0, "a sudden load is answered as ever"
+        assert hand.plant.force.mean() > 15.0, "the grip must still react to a sudden load"
 
 
 def test_force_and_angle_setpoints_may_be_sent_separately_and_are_bounded():

@@ -127,7 +127,7 @@ def test_every_formula_is_typeset(site):
             marked = f'<{tag} class="arithmatex">\\{ends[0]}{tex}\\{ends[1]}</{tag}>'
             shown = module.on_page_content(marked)
             assert shown.startswith("<math"), f"{name}: {block or inline}"
-            assert "\\" not in shown, f"{name}: {shown}: a command that is not known"
+            assert "\\" not in shown, f"{name}: {shown}: unknown command"
             found += 1
     assert found > 150
 

@@ -35,7 +35,7 @@ def test_compression_is_estimated_accurately(compression):
     errors = compression[-1]
     assert (errors["d at the first estimate"] < 0.45).all()
     assert (errors["RMS error of d"] < 20.0).all()  # µm
-    assert (errors["RMS error of d"] > 1.0).all(), "a sensor without noise was asked"
+    assert (errors["RMS error of d"] > 1.0).all(), "the sensor has no noise"
     assert (errors["RMS error of theta"] < 0.15).all()
     assert (np.abs(errors["mean error of F"]) < 0.15).all()
     assert (errors["RMS error of F"] < 1.2).all()

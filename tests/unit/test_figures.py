@@ -127,7 +127,7 @@ def test_exponents_of_both_material_laws(folder: Path, tilt: int, name: str, row
     )
     assert local > upright + 0.04
     power = fitted["fitted exponent of d, Table I's law [1]"]
-    assert (np.diff(power) > 0.0).all(), f"{symbol} rises with a higher power, the more tilted"
+    assert (np.diff(power) > 0.0).all(), f"{symbol}: the exponent must increase with tilt"
 
 
 def test_derivative_by_tilt(folder: Path) -> None:
@@ -154,7 +154,9 @@ def test_with_shear_the_minimum_is_before_upright(folder: Path) -> None:
             for each in (at - near, at, at + near)
         )
         assert here < min(below, above)
-        assert below == pytest.approx(above, rel=2e-6), "symmetric about the minimum"
+        assert below == pytest.approx(above, rel=2e-6), (
+            "energy or force must be symmetric about the minimum"
+        )
         assert minima[column][minima["share [%]"] == 0.0] == pytest.approx(0.0, abs=1e-6)
     assert felt["least U [deg]"] == pytest.approx(
         minima["least U [deg]"][minima["share [%]"] == 5.0], abs=0.01

@@ -13,7 +13,7 @@ def test_random_commands_are_refused_or_executed_without_other_errors(name, coun
     counts = fuzz(name, count, seed=11)
     assert set(counts) == {"done", "refused"}
     assert sum(counts.values()) == count
-    assert counts["done"] > 0.01 * count, "some of it must be sound, or nothing is tried"
+    assert counts["done"] > 0.01 * count, "too few valid inputs"
 
 
 @pytest.mark.parametrize("target", tactile.TARGETS)

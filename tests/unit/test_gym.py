@@ -154,7 +154,7 @@ def test_images_have_8_bits_and_the_channel_first():
     assert env.observation_space.contains(observation)
     pressure = observation["pressure"]
     assert (pressure.dtype, pressure.shape) == (np.uint8, (2, 44, 44))
-    assert 100 < pressure.max() <= 255, "the hand holds"
+    assert 100 < pressure.max() <= 255, "the hand must be holding"
     env.close()
 
 

@@ -140,9 +140,11 @@ def test_a_friction_level_that_changes_at_standstill_adds_no_torque():
 
     bent = 0.6 * FRICTION
     assert torque(0.0) == pytest.approx(bent, rel=1e-6)
-    assert torque(1.0) == pytest.approx(bent, rel=1e-6), "those that join are not bent"
+    assert torque(1.0) == pytest.approx(bent, rel=1e-6), "new bristles must start undeflected"
     parted = FRICTION / (FRICTION + share)
-    assert torque(0.0) == pytest.approx(bent * parted, rel=1e-6), "those that leave take theirs"
+    assert torque(0.0) == pytest.approx(bent * parted, rel=1e-6), (
+        "removed bristles must release their torque"
+    )
 
 
 # Adaptive solver.

@@ -61,7 +61,7 @@ def test_an_angle_jump_is_detected_immediately(jump):
         joint.tick(0.3)
     joint.q += jump
     assert joint.tick(0.3) == 1
-    assert not joint.tick(0.3), "it is a matter of that reading alone"
+    assert not joint.tick(0.3), "only the reading with the jump must be rejected"
 
 
 def test_an_encoder_that_drifts_at_zero_velocity_is_detected():

@@ -212,7 +212,7 @@ def test_the_time_of_a_hand_excludes_stalls_of_the_machine():
     clock = HandClock(machine)
     machine.late_by = [5.0]  # the machine was suspended
     assert clock.sleep_until(100.002) == pytest.approx(5.0)
-    assert clock.sleep_until(100.004) == 0.0, "a deadline that was missed is now"
+    assert clock.sleep_until(100.004) == 0.0, "a missed deadline must not cause a sleep"
     assert clock.now() == 100.004
     assert clock.behind == pytest.approx(4.998)
     machine.work(1.0)
@@ -221,7 +221,7 @@ def test_the_time_of_a_hand_excludes_stalls_of_the_machine():
     clock.sleep_until(100.008)
     assert clock.host() == pytest.approx(100.008 + clock.behind)
     clock.sleep_until(50.0)
-    assert clock.now() == 100.008, "never back"
+    assert clock.now() == 100.008, "the clock must not run backwards"
 
 
 @pytest.mark.parametrize(

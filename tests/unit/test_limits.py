@@ -83,7 +83,7 @@ def test_each_fault_is_detected_and_named(fault):
     found = judged(judge, state, 2.5)
     assert found[0] == name
     assert text in found[1]
-    assert judge.cause(state), "and it refuses a command while it stands"
+    assert judge.cause(state), "commands must be refused during the fault"
 
 
 def test_limits_of_missing_servos_or_sensors_are_ignored():
@@ -106,7 +106,7 @@ def test_a_short_spike_of_a_condition_that_must_last_is_not_a_fault():
     state.reading.current = [0.0, 0.0]
     judge.judge(state)
     put(state, FAULTS["current"][0])
-    assert judge.judge(state) is None, "it lasts anew"
+    assert judge.judge(state) is None, "the duration must restart"
 
 
 @pytest.mark.parametrize(
@@ -244,11 +244,11 @@ def test_each_faulty_channel_is_named():
     judge, state = safety(grasp=grasp), sound(Mode.RELEASING)
     grasp.gain_change[1], grasp.gain_std[1] = math.log(0.5), 0.1
     judged(judge, state, 0.5)
-    assert judge.warnings == [], "cells follow more slowly than a tip is let go"
+    assert judge.warnings == [], "must not warn during a release"
     state = sound()
     grasp.gain_std[1] = 0.4
     judged(judge, state, 0.5)
-    assert judge.warnings == [], "that is not known well"
+    assert judge.warnings == [], "must not warn about an uncertain gain"
     grasp.gain_std[1] = 0.1
     grasp.rejected_count[0], grasp.angle_innovation[0] = 3.0, -0.2
     grasp.current_off_time[1] = 0.2
@@ -348,7 +348,7 @@ def test_every_row_is_unique_per_level_and_its_settings_exist():
             assert hasattr(getattr(SETTINGS, section), name), key
     told = {key for row in LIMITS for key in row.keys}
     missing = {f"safety.{name}" for name in Limits.model_fields} - told
-    assert missing == {"safety.current_move"}, "every limit that can be set stands in the table"
+    assert missing == {"safety.current_move"}, "the table must contain all configurable limits"
 
 
 def test_a_sensor_without_valid_estimates_is_reported_with_reason_and_noise():

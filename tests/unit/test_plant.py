@@ -201,4 +201,6 @@ def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
     (*_, left) = sheared(pressed(tip_micro_slip=True), fading)
     assert abs(left) < 0.05 * out
     (whole,) = sheared(pressed(), [0.6 * 0.5 * MU * DEPTH])
-    assert whole == pytest.approx(0.6, rel=0.01), "without it a tip sticks until it slips as one"
+    assert whole == pytest.approx(0.6, rel=0.01), (
+        "without micro-slip, the tip must stick until it slips as a whole"
+    )

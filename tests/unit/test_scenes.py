@@ -40,7 +40,7 @@ def test_the_demo_of_a_simulated_hand_continues_after_a_fault_and_reports_it(mak
     assert daemon.loop.state.fault == ""
     daemon.loop.stop()
     daemon.loop.advance(5.0)
-    assert daemon.loop.state.mode == "disarmed", "a person ends it for good"
+    assert daemon.loop.state.mode == "disarmed", "a manual stop must end the task"
 
 
 def test_a_demo_that_cannot_clear_its_fault_tries_again(make):

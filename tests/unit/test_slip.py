@@ -36,9 +36,7 @@ def test_a_push_beyond_the_margin_is_held_with_more_force(sections):
             seen[raised] = hand.mode, hand.plant.force.mean()
     assert seen[10.0][0] == "holding"
     assert FORCE * 1.2 < seen[10.0][1] < (FORCE + 10.0) * (1.0 + KNOWN)
-    assert moved[10.0] < 4e-3, (
-        "the tips' own shear, and what slides before joints that stick show it"
-    )
+    assert moved[10.0] < 4e-3, "tip shear, plus sliding before the stuck joints move"
     assert moved[0.0] > 10e-3
 
 
@@ -159,7 +157,7 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     watched = at_rest()
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
-    assert state.grip_force > 1.15 * (FORCE + 10.0), "at the same tick"
+    assert state.grip_force > 1.15 * (FORCE + 10.0), "must take effect on the same tick"
     # At most the sum of torque constant error, friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9

@@ -89,8 +89,8 @@ class Scene:
             return {}
         if self.busy:
             raise Refused("the loop stood still", Reason.LATE)
-        assert request["force"] > self.stopped_at, "it was first sent before a stop"
-        assert request["force"] not in self.carried_out, "it was carried out before"
+        assert request["force"] > self.stopped_at, "a request from before a stop was executed"
+        assert request["force"] not in self.carried_out, "a request was executed twice"
         self.carried_out.add(request["force"])
         return {}
 
@@ -117,7 +117,7 @@ def test_no_request_from_before_a_stop_is_executed(actions):
             scene.act("gateway")
             scene.act("loop")
         asked = scene.asked
-        assert len(scene.replies) == asked, "every request is answered, and once"
+        assert len(scene.replies) == asked, "each request must have exactly one reply"
         # Later requests are executed.
         scene.ask(0, command="arm", force=1e9)
         for _ in range(3):

@@ -91,7 +91,7 @@ def test_invalid_subscriptions_do_not_affect_others(context, addresses, served):
     until(lambda: [served.settle(), other.poll(0)][1])
     listener.close()
     until(lambda: not wanted(served))
-    assert wanted(served, EVENT), "the other's own"
+    assert wanted(served, EVENT), "the other subscription must remain"
     other.close()
     until(lambda: not wanted(served, EVENT))
 
@@ -117,7 +117,7 @@ def test_a_stuck_subscriber_blocks_no_others_and_its_queue_is_bounded(context, a
         while stuck.poll(200):
             stuck.recv_multipart()
             kept += 1
-        assert kept < 10_000, "the stuck subscriber's queue has no bound"
+        assert kept < 10_000, "the stuck subscriber's queue is unbounded"
 
 
 def test_a_subscriber_of_only_the_latest_state_gets_it_in_one_frame(
@@ -142,7 +142,7 @@ def test_a_subscriber_of_only_the_latest_state_gets_it_in_one_frame(
         for _ in range(50):
             served.publisher.event(0.0, 0.0, "info", "test", "goes out on the other address alone")
         until(lambda: published().get("seq") == state.seq)
-        assert published().keys() <= receive(both, served)[1].keys(), "the whole map, or nothing"
+        assert published().keys() <= receive(both, served)[1].keys(), "state maps must be complete"
         topics = set()
         while both.poll(0):
             topics.add(receive(both)[0])

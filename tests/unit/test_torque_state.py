@@ -49,16 +49,18 @@ def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
     assert command(daemon, "stop")["torque_off"] == "unconfirmed"
     assert daemon.loop.state.torque
     daemon.loop.advance(0.17)
-    assert not torque_of(daemon).any(), "1.5 times the watchdog's time, and 20 ms of its own"
+    assert not torque_of(daemon).any(), (
+        "torque must be off after 1.5 times the watchdog time plus 20 ms"
+    )
     assert daemon.loop.state.fault_name == "torque.off"
-    assert daemon.loop.state.torque, "it is not confirmed yet"
+    assert daemon.loop.state.torque, "torque off is not confirmed yet"
     assert "clear: the servos have not confirmed torque off yet" in refusal(daemon, "clear")
     daemon.loop.advance(1.0)
     lost.mend()
     daemon.loop.advance(0.2)
     assert not daemon.loop.state.torque
     told = [text for _, kind, text in events if kind == "torque.off"]
-    assert len(told) == 2, "once when it goes wrong and once when it is well, however long it lasts"
+    assert len(told) == 2, "must be reported once at the beginning and once at the end"
     assert "the bus is kept silent" in told[0]
     assert "torque off confirmed" in told[1]
     command(daemon, "clear")
@@ -73,7 +75,7 @@ def test_without_a_watchdog_the_bus_is_not_silenced(make):
     command(daemon, "stop")
     daemon.loop.advance(0.3)
     assert "cut their power" in daemon.loop.state.fault
-    assert lost.tries > 140, "at every tick"
+    assert lost.tries > 140, "torque off must be requested on every tick"
     lost.mend()
     daemon.loop.advance(2 * daemon.loop.period)
     assert not torque_of(daemon).any()

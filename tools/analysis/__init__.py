@@ -1,4 +1,4 @@
-"""Analysis of recordings: `analyse` computes contacts from frames, `plot` compares with the model.
+"""Analyse recordings: `analyse` computes contacts from frames, and `plot` compares with the model.
 
-Both use the daemon's estimator.
+Both commands use the daemon's estimator.
 """

@@ -1,9 +1,9 @@
-"""Run ``softfinger analyse FILE``: compute d, θ, force and energy over time from frames.
+"""Run ``softfinger analyse FILE``: compute d, θ, force and energy versus time from frames.
 
-The frames are processed by the daemon's perception code. A recording of the stream (.mcap) contains
-its own settings and calibrations. A file with frames only (.npz, .npy, a folder of these, or a
-Tekscan-style export) is treated as the profile's left sensor; it determines the number of cells,
-and the pitch if the file contains it.
+The frames are processed with the daemon's perception code. A stream recording (.mcap) contains its
+own settings and calibrations. A file that contains only frames (.npz, .npy, a folder of these, or a
+Tekscan-style export) is analysed with the profile's left sensor. The number of cells, and the pitch
+if given, are taken from the file.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Analyse and write the results; for a single file, may raise SoftfingerError or OSError."""
+    """Analyse files and write the results; a single file may raise SoftfingerError or OSError."""
     settings, files = profile(arguments), arguments.files
     if len(files) == 1:
         print(_analysed(arguments, settings, files[0]), end="")
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _one_of_many(arguments: argparse.Namespace, settings: Settings, path: Path) -> tuple[str, str]:
-    """Analyse one of several files; return the text to print and the error, if any."""
+    """Analyse one of several files; return the text to print and any error message."""
     try:
         return _analysed(arguments, settings, path), ""
     except (SoftfingerError, OSError) as error:
@@ -112,7 +112,7 @@ _EIGHT_BITS = 255
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
-    """Explain frames without any contact: largest reading, threshold and likely cause."""
+    """Explain why no frame contains a contact: maximum reading, threshold and likely cause."""
     from softfinger.kinematics.estimation.estimator import PEAK_LEVEL
 
     scale = tactile.pascal_per_count if recording.whole else 1.0
@@ -153,11 +153,12 @@ OnProgress = Callable[[int], None]
 
 @dataclass(frozen=True)
 class Source:
-    """Frames of the sensors in one file: ``frames(progress)`` yields (finger, t [s], counts).
+    """Frames from all sensors in one file; ``frames(progress)`` yields (finger, t [s], counts).
 
-    ``t`` counts from the recording's first message, or from the first frame of a file with frames
-    only. ``total`` is the final value of ``progress``. ``recording`` is set for a file with frames
-    only. Kernels are loaded when ``models`` is called, so that an unreadable file fails quickly.
+    ``t`` is relative to the recording's first message, or to the first frame in files that contain
+    only frames. ``total`` is the final value of ``progress``. ``recording`` is set for files that
+    contain only frames. Kernels are loaded when ``models`` is called, so that an unreadable file
+    fails quickly.
     """
 
     settings: Settings
@@ -169,23 +170,23 @@ class Source:
 
     @property
     def truths(self) -> dict[str, NDArray[np.float64]]:
-        """True contact at each frame, by name, if a file of one sensor contains it."""
+        """True contact per frame, by name, if a single-sensor file contains it."""
         return {} if self.recording is None else self.recording.truths
 
 
 def open_source(path: Path, settings: Settings, own: bool) -> Source:
-    """Open a file of frames.
+    """Open a file that contains frames.
 
     Parameters
     ----------
     own
-        For a recording of the stream, use its own settings instead of ``settings``. A file with
-        frames only always needs ``settings``, and has their pitch unless it contains one.
+        For stream recordings, use the recorded settings instead of ``settings``. Files with only
+        frames always use ``settings``, including the pitch unless the file contains one.
 
     Raises
     ------
     RecordingError
-        With the file's name.
+        If the file is invalid; the message contains its name.
     SettingsError, TactileError
     """
     if path.suffix == ".mcap":
@@ -255,7 +256,7 @@ def _models_of(settings: Settings) -> tuple[FingerModel, FingerModel]:
     return make_models(settings)
 
 
-# Fields of a contact and their units; the CSV header has the form name_unit.
+# Contact fields and their units. CSV column names have the form name_unit.
 COLUMNS = (
     ("d", "m"),
     ("d_std", "m"),
@@ -270,27 +271,27 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Contacts:
-    """Contacts of one sensor, a row per frame; ``values`` by the names in COLUMNS, in SI units."""
+    """Contacts of one sensor, one row per frame; the keys of ``values`` [SI] are in COLUMNS."""
 
     finger: str
     t: FloatArray
-    invalid: NDArray[np.int64]  # an `Invalid` per frame
+    invalid: NDArray[np.int64]  # one `Invalid` per frame
     contact: NDArray[np.bool_]
     values: dict[str, FloatArray]
     truths: dict[str, FloatArray]
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Frames with a valid estimate."""
+        """Mask of the frames with a valid estimate."""
         return np.equal(self.invalid, Invalid.NONE)
 
     def reasons(self) -> Counter[str]:
-        """Count the reasons for invalid frames."""
+        """Count the invalid frames for each reason."""
         return Counter(REASONS[k].text for k in self.invalid[~self.valid])
 
 
 class _Pass:
-    """Perception of one sensor and the rows computed so far."""
+    """Perception for one sensor, with the rows computed so far."""
 
     def __init__(
         self, source: Source, models: tuple[FingerModel, FingerModel], finger: int
@@ -321,7 +322,7 @@ class _Pass:
 
 
 def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
-    """Return the contacts of each sensor; may raise the errors of the source's frames."""
+    """Compute the contacts of each sensor; may raise the errors of ``source.frames``."""
     models = source.models()
     passes = {finger: _Pass(source, models, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):
@@ -330,7 +331,7 @@ def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
 
 
 def write_csv(path: Path, contacts: list[Contacts]) -> None:
-    """Write one line per frame, one sensor after the other, with units in the header.
+    """Write one line per frame, sensor by sensor, with units in the header.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Run ``softfinger plot FILE.mcap``: compare a recording with the model over θ and in U(d, θ).
+"""Run ``softfinger plot FILE.mcap``: compare a recording with the model versus θ and in U(d, θ).
 
-The model uses the recording's own settings and calibrations. Force and energy are those of the
-recorded states, which include the modulus factor estimated from grips. For plots over time, open
-the file in Foxglove or PlotJuggler.
+The model uses the recorded settings and calibrations. Force and energy are taken from the recorded
+states, which include the modulus factor estimated in grips. To plot values versus time, open the
+file in Foxglove or PlotJuggler.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ LINES: dict[str, dict[str, Any]] = {
     "left": {"color": style.KINDS[0], "linestyle": "-"},
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
-_POINTS = 700  # points per finger and panel; more points would hide each other
+_POINTS = 700  # points per finger and panel; more would overlap
 _CURVES = 5
-_GRID = 241  # nodes of the landscape along each axis
+_GRID = 241  # landscape nodes per axis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,11 +73,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw the figures; may raise RecordingError, Missing, MissingExtra or OSError."""
-    require("plot")  # before a long recording is read
+    """Plot a recording; may raise RecordingError, Missing, MissingExtra or OSError."""
+    require("plot")  # fail before reading a long recording
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
-    # This fails for other files before kernels are loaded.
+    # Reject other files before loading kernels.
     recording = Recording(path, to_stderr("plot"))
     from softfinger.daemon.loop.warm_up import FRAMES
     from softfinger.tools.processes.compile import build_kernels, print_event
@@ -96,40 +96,41 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Missing(SoftfingerError):
-    """The recording lacks data for a figure; the message names them."""
+    """The recording lacks data for a figure; the message says which."""
 
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """A recording or a part of it, in SI units; ``t`` counts from the recording's first message.
+    """A recording or part of it in SI units, with ``t`` relative to the recording's first message.
 
-    ``states`` has one array per field, with the names of the stream; nested names contain a dot.
+    ``states`` contains one array per field. The field names are those in the stream; nested names
+    contain a dot.
     """
 
     name: str
     models: tuple[FingerModel, FingerModel] | None
     why_no_model: str
     states: dict[str, NDArray[Any]]
-    zero: int  # daemon's clock at t = 0 [ns]
+    zero: int  # ns, daemon clock at t = 0
 
     @cached_property
     def t(self) -> FloatArray:
-        """Time of each state [s], from the daemon's monotonic clock."""
+        """Time [s] of each state according to the daemon's monotonic clock."""
         t: FloatArray = (self.states["mono_ns"] - self.zero) * 1e-9
         return t
 
     @cached_property
     def fingers(self) -> tuple[str, ...]:
-        """The fingers in the recording."""
+        """Recorded fingers."""
         return tuple(name for name in FINGERS if self.states[f"{name}.valid"].any())
 
     def touching(self, finger: str) -> NDArray[np.bool_]:
-        """Return a mask of the states in which the finger is valid and in contact."""
+        """Return a mask of the states in which the finger has a valid contact."""
         of = {name: self.states[f"{finger}.{name}"] for name in ("valid", "contact", "d")}
         return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
 
     def contacts(self) -> dict[str, ContactTable]:
-        """Return the contact table of each finger that touched; raise Missing if no finger did."""
+        """Return the contact table of each finger that touched; raise Missing if none did."""
         if not self.t.size:
             raise Missing("no hand/state in it")
         touched = [name for name in self.fingers if self.touching(name).any()]
@@ -146,7 +147,7 @@ def load_run(
     end: float,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedRun:
-    """Read the data for the figures from ``start`` to ``end`` [s]; may raise RecordingError."""
+    """Read the figure data from ``start`` to ``end`` [s]; may raise RecordingError."""
     messages = recording.messages([schema.STATE], start, end, progress)
     record = schema.TOPICS[schema.STATE].record
     states = to_columns([read(record, message) for _, message in messages])
@@ -163,12 +164,12 @@ def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None
 
 
 def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
-    """Write the recording's name and ``text`` above a figure."""
+    """Add a title with the recording's name and ``text``."""
     figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
 
 
 def draw_angle(run: RecordedRun) -> Figure:
-    """Draw F and U against θ with curves of constant d, and measured over modelled pressure."""
+    """Plot F and U versus θ with curves of constant d, and measured over model pressure."""
     tables = run.contacts()
     rows = len(tables)
     figure = style.new_figure(7.2, 1.9 + 3.0 * rows)
@@ -204,12 +205,12 @@ def draw_angle(run: RecordedRun) -> Figure:
 def _against_angle(
     panel: Axes, seen: dict[str, FloatArray], table: ContactTable, field: str, factor: float
 ) -> Any:
-    """Draw points coloured by d over the model's curves; return the mappable for the colour bar."""
+    """Draw points coloured by d and the model curves; return the mappable for the colour bar."""
     from matplotlib.colors import Normalize
 
     depths = _depths(seen["d"])
     widest = max(1.1 * float(np.abs(seen["theta"]).max()), 5.0 / DEGREES)
-    # The yellow end of the colour map is too faint in print.
+    # Omit the yellow end of the colour map, which is too faint in print.
     scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)
     for depth in depths:
         limit = float(table.tip.theta_limit(depth))
@@ -230,7 +231,7 @@ def _against_angle(
 
 
 def _depths(d: FloatArray) -> FloatArray:
-    """Return round displacements [m] that span the measured ones, at least one."""
+    """Return one or more round displacements [m] that span the measured range."""
     from matplotlib.ticker import MaxNLocator
 
     largest = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3
@@ -238,7 +239,7 @@ def _depths(d: FloatArray) -> FloatArray:
 
 
 def draw_landscape(run: RecordedRun) -> Figure:
-    """Draw paths on U(d, θ) with its minimum over θ, and their height above θ = 0 over time."""
+    """Draw paths on U(d, θ) with its minimum over θ, and their height above U(d, 0) versus time."""
     tables = run.contacts()
     figure = style.new_figure(7.0, 2.2 + 4.0 * len(tables))
     panels = figure.subplots(len(tables) + 1, 1, height_ratios=[*[1.0] * len(tables), 0.4])
@@ -289,11 +290,11 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     lines = panel.contour(
         theta * DEGREES, d * 1e3, energy, levels[1:-1], colors=style.GREY, linewidths=0.5
     )
-    # Labels of higher levels would leave the frame.
+    # Labels at higher levels would extend beyond the axes.
     low = [level for level in levels[1:-1] if level < 0.65 * largest]
     panel.clabel(lines, low, fmt=lambda level: f"{level:.3g} mJ", fontsize=6.5)
     minima = theta[np.argmin(energy, axis=1)]
-    # The energy of a bonded solid tip falls towards the sides.
+    # The energy of a bonded solid tip decreases towards the sides.
     local = np.abs(minima) < 0.99 * widest
     if local.any():
         panel.plot(

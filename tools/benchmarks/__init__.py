@@ -1,4 +1,4 @@
-"""The command ``softfinger bench``: one module for each measurement, and shared modules.
+"""The ``softfinger bench`` command, with one module for each measurement.
 
-The shared modules are `measuring`, `rigs` and `virtual_grip`.
+`measuring`, `rigs` and `virtual_grip` are shared by several measurements.
 """

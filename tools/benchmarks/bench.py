@@ -1,4 +1,4 @@
-"""Run ``softfinger bench``: measure this machine, print tables and write JSON."""
+"""Run ``softfinger bench``: run benchmarks, print tables and write JSON."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ MEASUREMENTS = {
     "faults": "true force of grips with faulty measurements, a quarter of an hour",
     "robustness": "true force of grips by hands that differ from their settings",
 }
-# These run on virtual time, so other load on the machine does not affect them.
+# These benchmarks run on virtual time, so other load on the machine does not affect them.
 SWEPT = ("reflex", "faults", "robustness")
 PAGE = ("estimator", "tick")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
 _CASES = ("faults", "robustness")
-# Options that apply to some measurements only.
+# Options that apply only to some measurements.
 _OWN = {"full": ("reflex",), "trials": _CASES, "only": _CASES}
 FAILED = 1  # exit status; 2 is for invalid arguments
 
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print and write the requested files; return the exit status."""
+    """Run the measurements, print and write the results, and return the exit status."""
     from softfinger.tools.benchmarks.measuring import Report
 
     names = arguments.names or list(PAGE)
@@ -108,7 +108,7 @@ def _journal(file: Path, name: str) -> Path:
 
 
 def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
-    """Return the tables of a measurement; an empty list if it failed."""
+    """Run a measurement and return its tables, or an empty list if it failed."""
     tables: list[Report] = []
     more = {key: getattr(arguments, key) for key, of in _OWN.items() if name in of}
     if name in SWEPT:
@@ -120,7 +120,7 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
         more["sweep"] = sweep
     try:
         tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
-    except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may lose its grip
+    except (RuntimeError, SoftfingerError) as error:  # for example, a grip lost on a busy machine
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
         for note in table.notes if table.failed else ():
@@ -129,7 +129,7 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
 
 
 def _kept(name: str, tables: list[Report]) -> list[Row]:
-    """Convert rows for JSON, which has no NaN."""
+    """Convert rows for JSON: replace NaN by null."""
     return [
         {"measurement": name, "table": table.title}
         | {key: None if value != value else value for key, value in row.items()}
@@ -147,7 +147,7 @@ def _page(tables: list[Report]) -> list[Row]:
 
 
 def _processor() -> str:
-    """Return the processor's name if Linux reports it."""
+    """Return the processor name from Linux, or else the machine type."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
@@ -164,7 +164,7 @@ def _module(name: str) -> ModuleType:
 
 
 def _check(names: list[str], arguments: argparse.Namespace) -> None:
-    """Check the arguments before measuring; raise ValueError if they are invalid."""
+    """Raise ValueError if the arguments are invalid."""
     for key, of in _OWN.items():
         if getattr(arguments, key) and (len(names) != 1 or names[0] not in of):
             raise ValueError(f"--{key}: for {' or '.join(of)} alone")

@@ -1,14 +1,15 @@
-"""Measure the error of the object's angle that remains with each grip law.
+"""Measure the residual object angle error for each grip control law.
 
-An object is placed askew between the fingers and grasped. The error is that of the simulated hand,
-not of the daemon's estimates, for plants that differ from the settings. The sensor is either ideal
-or has defects. Everything runs on virtual time, so the results do not depend on the machine's
-speed.
+An object is placed askew between the fingers and grasped. The error is computed from the simulated
+hand's true angle, not from the daemon's estimate. The plants differ from the settings, and the
+sensor is either ideal or has defects. All runs use virtual time, so the results do not depend on
+the machine's speed.
 
-Two laws of the literature are compared with the daemon's laws. *Equal torques* is the law upright
-without its spring and dither. *Two-phased* is the serial two-phased controller of soft-fingered
-manipulation, :class:`TwoPhased`. It was published with a camera that delivers the object's angle
-late, so both this law and the daemon's law are also tested with an angle that is up to 0.3 s old.
+The daemon's control laws are compared with two laws from the literature. *Equal torques* is the
+`upright` law without its spring and dither. *Two-phased* is the serial two-phased controller for
+soft-fingered manipulation, :class:`TwoPhased`. It was published with a camera that measures the
+object angle with a delay. Both this controller and the daemon's law are therefore also tested with
+angles that are up to 0.3 s old.
 """
 
 from __future__ import annotations
@@ -31,18 +32,18 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 _FORCE = 10.0  # N
 _ANGLE_STD = math.radians(5.0)
 _DRAW_COUNT = 12
-_READ_TIME = 5.0  # s from the grasp command until the object's angle is read
-_STEERING_TIME = 2.0  # s before that, during which the angle is steered to 0
+_READ_TIME = 5.0  # s, from the grasp command to the final angle measurement
+_STEERING_TIME = 2.0  # s, final part of this time, with the angle controlled to 0
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
-# Hz, bandwidths of the integral of the angle. The slow one is stable for all these delays, since ω
-# times the delay is below π/2; the fast one is the default of `control.rotate_bandwidth`.
+# Hz, bandwidths of the angle integral. The slow one is stable for all these delays, because
+# ω × delay < π/2. The fast one is the default of `control.rotate_bandwidth`.
 _SLOW_BANDWIDTH, _FAST_BANDWIDTH = 0.5, 4.0
 
 
 class Altered(Grip):
-    """The daemon's law with an object's angle that is ``delay`` [s] old.
+    """The daemon's control law, with the object angle delayed by ``delay`` [s].
 
-    The torque constants of the two joints differ by the fraction ``apart`` of their mean.
+    The torque constants of the two joints differ by ``apart``, as a fraction of their mean.
     """
 
     def __init__(self, hand: SimulatedDaemon, delay: float = 0.0, apart: float = 0.0) -> None:
@@ -53,7 +54,7 @@ class Altered(Grip):
         self._apart = apart
 
     def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
-        """Return the joints' torques [N·m]."""
+        """Return the joint torques [N·m]."""
         self._poses.append(replace(pose))
         torque1, torque2 = self._law(reading, self._poses[0], holding)
         return torque1 * (1.0 + 0.5 * self._apart), torque2 * (1.0 - 0.5 * self._apart)
@@ -63,12 +64,12 @@ class Altered(Grip):
 
 
 class TwoPhased(Altered):
-    """Published serial two-phased controller.
+    """Serial two-phased controller from the literature.
 
-    Phase one integrates the error of the object's angle with ``bandwidth`` [Hz] into an
-    antisymmetric goal for the joints. Phase two is a PD law of the joints for that goal, in
-    addition to equal bias torques for the grip. It does not use the measured force: the bias
-    follows from the requested force.
+    Phase one integrates the object angle error with ``bandwidth`` [Hz] into an antisymmetric joint
+    goal. Phase two is a PD law that moves the joints to this goal, in addition to equal bias
+    torques for the grip. The measured force is not used: the bias is computed from the requested
+    force.
     """
 
     def __init__(
@@ -94,15 +95,15 @@ _DEFAULT: Sections = {}
 
 
 class Way(NamedTuple):
-    """Law to test: settings of `control`, the plant's tips and sensors, and the aim [°]."""
+    """Control law to test: `control` settings, the plant's tips and sensors, and the aim [°]."""
 
     control: Mapping[str, Any] = _DEFAULT
     tips: Sections = _DEFAULT
     aim: float | None = None
-    is_steered: bool = False  # to 0, with the measured angle
-    law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's law
+    is_steered: bool = False  # the measured angle is controlled to 0
+    law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's control law
     force: float = _FORCE
-    weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, applied once the grip is firm
+    weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, applied to the established grip
 
 
 EQUAL_TORQUES = {"law": "upright", "dither_time": 0.0, "joint_stiffness": 1e-9}
@@ -131,7 +132,7 @@ def _upright(
     weight: tuple[float, float] = (0.0, 0.0),
     **simulation: Any,
 ) -> Way:
-    """Return the law without angle feedback on a plant that differs from the law's assumptions."""
+    """Return an `upright` law without angle feedback, on a plant that violates its assumptions."""
     tips: Sections = {"simulation": simulation}
     if width:
         tips = {"object": {"width": width}, "simulation": {"object_width": width}}
@@ -161,8 +162,8 @@ LATE_LIMITS = {
     for name, (control, law) in _STEERED_LAWS.items()
     for delay in DELAYS
 }
-# Relaxed tips without coupling have four times the curvature of the springs' minimum of energy, and
-# tips below three quarters of the stiffness along the face have a maximum.
+# Relaxed tips without coupling have four times the curvature of spring tips at the energy minimum.
+# Tips with less than three quarters of the tangential stiffness have an energy maximum instead.
 _TIPS: dict[str, Sections] = {
     "solid": SOLID,
     "without tangential coupling": {"simulation": {"tip_law": "bristles"}},
@@ -178,7 +179,7 @@ LATE_TIPS = {
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Return tables of the remaining angles [°]; with few draws, p99 is close to the maximum."""
+    """Return tables of residual angles [°]; with few draws, p99 is close to the maximum."""
     plants = drawn(2 if brief else _DRAW_COUNT)
     title = f"left of {math.degrees(_ANGLE_STD):g}° after {_READ_TIME:g} s at {_FORCE:g} N"
     return [
@@ -193,7 +194,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
-    """Return the differences between each plant and the settings, the same for all laws."""
+    """Return the deviation of each plant from the settings, which is the same for all laws."""
     rng = np.random.default_rng(16)
     return [
         {
@@ -209,7 +210,7 @@ def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
 
 
 def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
-    """Return the row of a law: remaining angles on these plants, and the number not held."""
+    """Return the row for one law: residual angles on ``plants``, and the number of lost objects."""
     found = [left(way, plant) for plant in plants]
     held = [each for each in found if not math.isnan(each)]
     more = {"not held": len(found) - len(held)}
@@ -217,7 +218,7 @@ def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
 
 
 def left(way: Way, simulation: Mapping[str, Any]) -> float:
-    """Return the remaining angle of the object [°] on this plant; NaN if it is not held."""
+    """Return the residual object angle [°] on one plant; NaN if the object is not held."""
     sections = merged({"simulation": simulation, "control": way.control}, way.tips)
     with SimulatedDaemon(sections) as hand:
         if way.law is not None:
@@ -231,7 +232,7 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float:
             hand.run(hand.loop.period)
         hand.plant.apply_load(*way.weight)
         hand.run(begun + _READ_TIME - _STEERING_TIME - hand.now)
-        if way.is_steered:  # do not wait for a force, because not every law measures it
+        if way.is_steered:  # do not wait for a force: not every law measures it
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERING_TIME)
         is_held = min(hand.plant.force) > 0.0

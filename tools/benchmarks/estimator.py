@@ -1,13 +1,13 @@
-"""Measure run time and error of contact table lookups and of frame estimates.
+"""Measure run time and error of contact table lookups and frame estimates.
 
-All subjects take turns in one run. Lookups use the same points: d up to 8 mm, half of them evenly
-spaced and half logarithmically down to 1 µm, |θ| up to 30°. Errors are the largest relative errors
-compared with integrals with many nodes.
+All subjects take turns in one run. All lookups use the same points: |θ| up to 30° and d up to 8 mm.
+Half of the displacements are evenly spaced, and half are logarithmically spaced down to 1 µm. The
+reported error is the maximum relative error compared with integrals that use many nodes.
 
-Frames have 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15° and noise of 0.2 % of the modulus. They
-are estimated by the control loop's Python call, for a spring tip and a solid tip in turns. Errors
-are RMS over these frames and are listed with the Cramér-Rao bound. The "sensor" rows show the
-errors for the cells of a profile, pressed in the same way for one second.
+Each frame has 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15° and noise of 0.2 % of the modulus.
+The estimator is called from Python as in the control loop, for spring tips and solid tips in turn.
+RMS errors over these frames are listed next to the Cramér-Rao bound. The "sensor" rows show the
+errors for a profile's sensor that has been pressed in the same way for one second.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ TIP = Fingertip(radius=0.020)
 SOLID = Fingertip(0.020, "solid")
 MODULUS = 0.304e6  # Pa
 LINEAR = Material.constant(MODULUS)
-SIZE, WIDTH = 44, 0.058  # cells per side, m
+SIZE, WIDTH = 44, 0.058  # cells per side; m
 NOISE = 0.002 * MODULUS
 _PASCAL_PER_COUNT = 4.0
 _FRAME_COUNT = 32
@@ -54,18 +54,18 @@ _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
 _D_MAX, _TILT_MAX = 0.008, math.radians(30.0)  # m, rad
-_SINGLE_POINT_COUNT = 16  # number of points used in turn by calls with floats
-_CALL_AIM_NS = 800.0  # aim for one call, ns
+_SINGLE_POINT_COUNT = 16  # points used in turn by calls with floats
+_CALL_AIM_NS = 800.0  # ns, aim for one call
 
 
 def rms_errors(found: FloatArray, truth: Truth) -> dict[str, float]:
-    """Return the RMS errors of d and of the tilts."""
+    """Return the RMS errors of d and the tilts."""
     rms = np.sqrt(np.mean((found - np.array(truth)) ** 2, axis=0))
     return {ERROR: 1e6 * float(rms[0]), "of tilts [°]": math.degrees(math.hypot(*rms[1:]))}
 
 
 def tilts(theta: float, azimuth: float) -> tuple[float, float]:
-    """Return (tilt_x, tilt_y) of a total tilt towards ``azimuth`` [rad]."""
+    """Return (tilt_x, tilt_y) for a total tilt towards ``azimuth`` [rad]."""
     s = math.sin(theta)
     return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
 
@@ -77,13 +77,13 @@ _LIGHT: Truth = (0.001, 0.0, 0.0)
 
 
 def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
-    """Return times and errors of lookups and of frames."""
+    """Return run times and errors of lookups and frame estimates."""
     rounds = 10 if brief else rounds
     return [lookups(rounds), frames_to_contacts(rounds)]
 
 
 def lookups(rounds: int, count: int = 512) -> Report:
-    """Return the times per point [ns] for ``count`` points at once and one by one."""
+    """Return the time per point [ns] for ``count`` points, all at once and one by one."""
     rng = np.random.default_rng(3)
     even = rng.uniform(0.0, _D_MAX, count)
     spread = 10.0 ** rng.uniform(-6.0, np.log10(_D_MAX), count)
@@ -116,7 +116,7 @@ def lookups(rounds: int, count: int = 512) -> Report:
 
 
 def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) -> dict[str, Any]:
-    """Return time per point and error of SciPy's bicubic spline of F alone."""
+    """Return time per point and error of SciPy's bicubic spline for F alone."""
     interpolate: Any = import_module("scipy.interpolate")
     at = np.linspace(0.0, _D_MAX, 129), np.linspace(-_TILT_MAX, _TILT_MAX, 65)
     spline = interpolate.RectBivariateSpline(*at, integrate(TIP, _LAW, *np.meshgrid(*at)).force.T)
@@ -127,7 +127,7 @@ def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) ->
 
 
 def frames_to_contacts(rounds: int) -> Report:
-    """Return times and errors for frames, and the bound."""
+    """Return run times and errors of frame estimates, and the Cramér-Rao bound."""
     noise = np.random.default_rng(4).standard_normal((_FRAME_COUNT, SIZE, SIZE))
     frames = GRID.pressure(TIP, LINEAR, *TRUTH) + NOISE * noise
     empty, deep = NOISE * noise, GRID.pressure(TIP, LINEAR, *_CORNER) + NOISE * noise
@@ -149,7 +149,7 @@ def frames_to_contacts(rounds: int) -> Report:
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
     times = {name: taken / _FRAME_COUNT for name, taken in interleave(subjects, rounds).items()}
-    # The minimum is least affected by other load.
+    # Use the minimum, which other load affects least.
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
     for name, (run, truth, aim) in cases.items():
@@ -166,11 +166,11 @@ def frames_to_contacts(rounds: int) -> Report:
 
 
 def centroid_and_extent(frames: FloatArray) -> FloatArray:
-    """Return d and tilts [n, 3] from centroid and extent of each frame's footprint, with NumPy.
+    """Compute d and tilts [n, 3] from the centroid and extent of each footprint with NumPy.
 
-    For a constant modulus the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance d
-    (4a − d)/6 − sin² θ d (12a − 5d)/36. The footprint first consists of the cells that exceed the
-    noise together with their neighbours, and then follows from the last d and tilts.
+    For a constant modulus, the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance is
+    d (4a − d)/6 − sin² θ d (12a − 5d)/36. The initial footprint contains all cells above a
+    threshold. It is then recomputed from the last d and tilts.
     """
     cells, a = GRID.on(TIP), TIP.radius
     x = cells.x + cells.pitch_x * (np.arange(SIZE) + 0.5)
@@ -187,7 +187,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
             trace -= (cells.pitch_x**2 + cells.pitch_y**2) / 12.0
             for _ in range(4):
                 square = (m_x * m_x + m_y * m_y) / (a - d / 3.0) ** 2
-                # Coefficients of d: (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
+                # The trace is (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
                 b, c = a * (24.0 - 12.0 * square), 6.0 - 5.0 * square
                 d = float((b - math.sqrt(max(b * b - 144.0 * c * trace, 0.0))) / (2.0 * c))
             s_x, s_y = m_x / (a - d / 3.0), m_y / (a - d / 3.0)
@@ -200,7 +200,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
 
 
 def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> FloatArray:
-    """Return d and tilts [count, 3] from frames of a profile's sensor that was pressed for 1 s."""
+    """Return d and tilts [count, 3] from a profile's sensor after it has been pressed for 1 s."""
     model = make_sensor_model(settings, 0)
     estimator = make_estimator(settings, make_material(settings.material))
     counts = np.zeros(model.grid.shape, np.uint16)
@@ -213,9 +213,9 @@ def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> Floa
 
 
 def bound() -> float:
-    """Return the Cramér-Rao bound of d [m] from all cells, with unknown tilts and gain.
+    """Return the Cramér-Rao bound for d [m] using all cells, with unknown tilts and gain.
 
-    The derivatives of pressure with respect to (d, tilt_x, tilt_y, gain) are central differences.
+    Pressure derivatives with respect to (d, tilt_x, tilt_y, gain) are central differences.
     """
     at, slopes = np.array([*TRUTH, 1.0]), []
     for step in np.diag(_STEPS):
@@ -228,7 +228,7 @@ def bound() -> float:
 def estimates(
     frames: FloatArray, cold: bool = False, tip: Fingertip = TIP
 ) -> Callable[[], FloatArray]:
-    """Return a function that estimates d, tilts [n, 3] of these frames, each alone if ``cold``."""
+    """Return a function that estimates d and tilts [n, 3]; ``cold`` resets it for each frame."""
     estimator = ContactEstimator(tip, LINEAR, GRID, NOISE)
 
     def run() -> FloatArray:
@@ -244,13 +244,13 @@ def estimates(
 
 
 def call_with_each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
-    """Call the function once with each tuple of arguments."""
+    """Call the function once with each argument tuple."""
     for one in arguments:
         call(*one)
 
 
 def decode(frames: FloatArray) -> Callable[[], object]:
-    """Return a function that decodes all frames from the bytes of a COBS board."""
+    """Return a function that decodes all frames from COBS packets."""
     counts = np.maximum(frames / _PASCAL_PER_COUNT, 0.0).astype(np.uint16)
     packets = [ENCODERS["cobs"].encode(frame, k, 0.01 * k) for k, frame in enumerate(counts)]
     feed = CobsDecoder(*frames.shape[1:]).feed

@@ -1,8 +1,8 @@
-"""Measure the behaviour of grips with faulty measurements, judged by the plant.
+"""Measure how grips behave with faulty measurements, using the plant's true state.
 
-Each case is a grip with a faulty measurement or an unusual tip. Each trial draws, from its seed,
-noise, times, the finger, the object's mass and an error of the joints' torque constant. Trials run
-on virtual time, so the results do not depend on the machine.
+Each case is a grip with a faulty measurement or an unusual tip. The seed of a trial determines the
+noise, times, finger, object mass and torque constant error. Trials run on virtual time, so the
+results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -26,44 +26,44 @@ from softfinger.tools.benchmarks.rigs import SOLID, Sections
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIAL_COUNT = 20
-_FORCES = (6.0, 12.0)  # N, requested forces
-_EVENT_PREFIX = "witness."  # prefix of the kinds of events that name a faulty measurement
+_FORCES = (6.0, 12.0)  # N, requested force
+_EVENT_PREFIX = "witness."  # prefix of event kinds that report a faulty channel
 
-# Aims: forces relative to the requested force; times in s.
+# Aims. Forces are relative to the requested force.
 SETTLES = "settled at 0.8 … 1.2, not raised"
 BOUNDED = "≤ 50 ms above 1.3, named ≤ 0.3 s"
 _SETTLED_RANGE = (0.8, 1.2)
 _EXCESS_TIME_MAX = 0.05  # s above 1.3
-_REPORT_TIME_MAX = 0.3  # s since the error reached half of its final value
+_REPORT_TIME_MAX = 0.3  # s after the error reached half of its final value
 _SLIDE_MAX = 0.010  # m
 
-# Phases of a trial [s].
-_GRIP_TIMEOUT = 2.5  # limit until the hand holds
-_REST_TIME = 1.2  # undisturbed hold
-_OBSERVATION_TIME = 5.0  # observation after the fault
-_REPEATED_LAG = 1.0  # repeated frames before another force is requested
+# Phases of a trial.
+_GRIP_TIMEOUT = 2.5  # s, time limit for establishing the hold
+_REST_TIME = 1.2  # s, undisturbed hold
+_OBSERVATION_TIME = 5.0  # s, observation after the fault
+_REPEATED_LAG = 1.0  # s, from the fault to the second force request
 
 _SENSORS = ("left_sensor", "right_sensor")
-# Full scale of 127.5 kPa, as tactile boards have; the simulated sensor has 262 kPa.
+# Full scale of 127.5 kPa, as on real tactile boards. The simulated sensor's default is 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
 @dataclass(frozen=True)
 class FaultCase:
-    """One kind of grip.
+    """One kind of grip, and its fault.
 
-    ``words`` are faults in the form of `softfinger emulate --fault`, with ``{side}`` for a finger.
-    They start when the hand holds, or before the grasp.
+    ``words`` are faults in the syntax of `softfinger emulate --fault`, with ``{side}`` as a
+    placeholder for the finger. They start during the hold, or before the grasp if ``before``.
     """
 
     name: str
     aim: str
-    force: float  # requested [N]
+    force: float  # N, requested
     words: str = ""
-    false: tuple[str, ...] = ()  # channels that may be named
-    comes: float = 0.0  # s in which the fault develops
+    false: tuple[str, ...] = ()  # channels that may be reported as faulty
+    comes: float = 0.0  # s, duration of the fault's onset
     before: bool = False
-    then: float = 0.0  # N, requested later
+    then: float = 0.0  # N, second requested force
     settings: Sections = field(default_factory=dict)
 
 
@@ -114,25 +114,25 @@ NAMES = tuple(case.name for case in CASES)
 
 @dataclass
 class GripTrial:
-    """Outcome of a trial: forces relative to the requested force, times since its start [s]."""
+    """Outcome of a trial: relative forces, and times [s] since the grasp or the fault."""
 
-    false: tuple[str, ...]  # channels that may be named
-    held: bool = True  # before the fault
-    settled: float = math.nan  # mean of both tips at the end; NaN if the object was released
-    peak: float = 0.0  # of either tip
+    false: tuple[str, ...]  # channels that may be reported as faulty
+    held: bool = True  # the hold was established
+    settled: float = math.nan  # final mean over both tips; NaN if the object was released
+    peak: float = 0.0  # maximum over both tips
     above: float = 0.0
     slid: float = 0.0  # m
-    end: str = ""  # fault or mode
+    end: str = ""  # final fault or mode
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
-        """Record the results of the observation and the final state."""
+        """Record the results of the watch and the final state."""
         self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
-        """Return (time, channel) of the channels that were named, either correctly or wrongly."""
+        """Return (time, channel) for each correct or, if not ``rightly``, each wrong diagnosis."""
         names = [
             (t, k.removeprefix(_EVENT_PREFIX))
             for t, k in self.events
@@ -141,7 +141,7 @@ class GripTrial:
         return [(t, name) for t, name in names if (name in self.false) == rightly]
 
     def missed(self, case: FaultCase) -> list[str]:
-        """Return the parts of the aim that were missed."""
+        """Return the criteria that the trial failed."""
         low, high = _SETTLED_RANGE
         named = min((t for t, _ in self.named(True)), default=math.inf) - 0.5 * case.comes
         wrong = {
@@ -161,9 +161,9 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return a table for each aim with the cases whose name contains ``only``.
+    """Return one table per aim with the cases whose name contains ``only``.
 
-    ``brief`` runs one trial of each. ``sweep`` maps trials to outcomes, in one process or in many.
+    ``brief`` runs one trial per case. ``sweep`` maps trials to outcomes in one or more processes.
     """
     trials, reports = trials or (1 if brief else _TRIAL_COUNT), []
     cases = [each for aim in (SETTLES, BOUNDED) for each in CASES if each.aim == aim]
@@ -190,7 +190,7 @@ def _outcome(drawn: tuple[FaultCase, int]) -> dict[str, Any]:
 
 
 def trial(case: FaultCase, seed: int) -> GripTrial:
-    """Run one trial of a case."""
+    """Run one trial."""
     chance = random.Random(f"{case.name} {seed}")
     side = chance.choice(FINGERS)
     found = GripTrial(tuple(name.format(side=side) for name in case.false))
@@ -219,7 +219,7 @@ def trial(case: FaultCase, seed: int) -> GripTrial:
 
 
 def summary(case: FaultCase, found: Sequence[GripTrial]) -> Row:
-    """Return a case's row: median and extremes, missed aims, and times of events."""
+    """Return a case's row: median, extremes, failed criteria and event times."""
     settled = [each.settled for each in found if not math.isnan(each.settled)]
     missed = [each.missed(case) for each in found]
     return {
@@ -246,7 +246,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Return for each kind the number of trials with it, and its median first time [s]."""
+    """Summarise, for each kind, the number of trials and the median first time [s]."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

@@ -1,4 +1,4 @@
-"""Shared by all measurements: timing in turns, and tables of rows."""
+"""Functions for all measurements: interleaved timing and result tables."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.terminal.text_layout import plain_table, table_text
 
-# Result of one measurement; each key is a column heading, with "name" first.
+# Result of one measurement. Each key is a column heading; "name" is the first.
 Row = dict[str, Any]
 
-# s of one repetition: short compared with interruptions, long compared with the clock's resolution.
+# s per repetition: short enough to avoid most interruptions, long compared with clock resolution.
 _SLICE = 4e-4
 
 
@@ -32,7 +32,7 @@ class Report:
     failed: bool = False
 
     def __str__(self) -> str:
-        """Format aligned text, with four digits for numbers and blanks for None and NaN."""
+        """Format as aligned text: four digits for numbers, blanks for None and NaN."""
         keys = list(dict.fromkeys(key for row in self.rows for key in row)) or ["name"]
         table = plain_table()
         for key in keys:
@@ -45,9 +45,9 @@ class Report:
 
 
 def attempt(title: str, part: Callable[[], Report]) -> Report:
-    """Return the table of one part of a measurement, or a failed one with the reason.
+    """Run one part of a measurement; after an error, return a failed report with the reason.
 
-    If a hand loses its grip on a busy machine, the other parts continue.
+    The other parts can then continue, e.g. if a hand loses its grip on a busy machine.
     """
     try:
         return part()
@@ -62,7 +62,7 @@ def _cell(value: Any) -> str:
 
 
 def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None, **more: Any) -> Row:
-    """Return median, interquartile range and 99th percentile of samples in ``unit``."""
+    """Return the row for samples in ``unit``: median, interquartile range and 99th percentile."""
     values = np.asarray(samples, dtype=np.float64)
     low, median, high, p99 = np.percentile(values, [25.0, 50.0, 75.0, 99.0]).tolist()
     spread = {"median": median, "IQR": high - low, "p99": p99}
@@ -72,11 +72,11 @@ def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None, *
 def interleave(
     subjects: Mapping[str, Callable[[], object]], rounds: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the time per call [ns] of each subject in each round, float64 [rounds].
+    """Measure the time per call [ns] of each subject in each round, float64 [rounds].
 
-    The subjects take turns, so that a slow period of the machine affects all of them. Each subject
-    is called once beforehand, which compiles it, and then repeated to fill a time slice. Garbage
-    collection is off during the measurement.
+    The subjects take turns, so that slow periods of the machine affect all of them. The first call
+    to each subject, which compiles it, is not counted. Each measurement repeats the call to fill a
+    time slice, with garbage collection disabled.
     """
     timers, repeats = {name: Timer(run) for name, run in subjects.items()}, {}
     for name, timer in timers.items():
@@ -90,7 +90,7 @@ def interleave(
 
 
 def timed(call: Callable[[], object], count: int = 1) -> list[float]:
-    """Return the wall time of each of ``count`` calls [µs]."""
+    """Return the wall-clock times of ``count`` calls [µs]."""
     samples = []
     for _ in range(count):
         before = time.perf_counter_ns()

@@ -1,11 +1,12 @@
-"""Measure the reaction of a grip to a sudden increase of the load.
+"""Measure how a grip reacts to a sudden load increase.
 
-A grip of 10 N carries a standing load along the object's faces, away from the palm. Then a larger
-load is applied and stays, either a push or a twist with the same force at the faces. Trials run on
-virtual time and are judged by the simulated hand. *Lost*: the object is no longer between the tips.
-*Slid*: displacement along the tips' faces from the midpoint of both tips, so that leaning fingers
-do not count. *Answer*: time from the onset of slip until the goal currents are a quarter higher.
-*Said*: time from the loss of the object until the mode is no longer a grip mode.
+A 10 N grip carries a standing load along the object faces, away from the palm. Then a larger load
+is applied and maintained: either a push, or a twist with the same force at the faces. Trials run on
+virtual time, and the results are computed from the simulated hand's true state. *Lost*: the object
+is no longer between the tips. *Slid*: object displacement along its faces relative to the midpoint
+of both tips, so that leaning fingers do not count. *Answer*: time from slip onset until the goal
+currents have increased by a quarter. *Said*: time from object loss until the hand leaves the grip
+modes.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-# Plants with an ideal sensor, and sensors on spring tips.
+# Tips with an ideal sensor, then spring tips with sensor defects.
 TIPS: dict[str, Sections] = {
     "springs": {},
     "bristles": {"simulation": {"tip_law": "bristles"}},
@@ -31,33 +32,33 @@ TIPS: dict[str, Sections] = {
 }
 MASSES = (0.1, 0.5, 2.0)  # kg
 STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
-OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; friction at a grip of 10 N holds 12 N
-REDUCED_LOADS = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # the loads used unless all are requested
+OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; friction holds 12 N in a 10 N grip
+REDUCED_LOADS = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # N, used without `--full`
 _FORCE = 10.0  # N
-_TRIAL_COUNT = 3  # number of trials for each case
-_RESPONSE_AIM, _REPORT_AIM = 22.0, 200.0  # ms, aims
-_GRIP_TIMEOUT = 5.0  # s within which the grip must hold
-# s in which the standing load is applied, s for which it then stays.
+_TRIAL_COUNT = 3  # trials per case
+_RESPONSE_AIM, _REPORT_AIM = 22.0, 200.0  # ms
+_GRIP_TIMEOUT = 5.0  # s, time limit for establishing the hold
+# s, ramp of the standing load; s, time for which it is then constant.
 _LOAD_TIME, _STANDING_TIME = 1.0, 1.5
-_LOAD_STEP_COUNT = 50  # steps in which it is applied
-_OBSERVATION_TIME = 1.0  # s of the larger load, and s to wait for the mode after a loss
+_LOAD_STEP_COUNT = 50  # steps in this ramp
+_OBSERVATION_TIME = 1.0  # s, duration of the larger load, and time limit for reporting a loss
 
 
 class Overload(NamedTuple):
     """Outcome of one trial."""
 
-    answer: float  # s; NaN: no slip, infinity: no answer
-    slid: float  # m, while it was between the tips
+    answer: float  # s; NaN without slip, infinity without reaction
+    slid: float  # m, while the object was between the tips
     lost: bool
-    said: float = math.nan  # s
+    said: float = math.nan  # s, from loss to report
 
 
 def measure(
     brief: bool = False, full: bool = False, sweep: Callable[..., Iterable[Any]] = map
 ) -> list[Report]:
-    """Return a table for each kind of tip or sensor and each mass; ``brief`` runs few of them.
+    """Return a table for each combination of tip or sensor and mass; ``brief`` runs fewer cases.
 
-    ``sweep`` maps cases to outcomes, in one process or in many.
+    ``sweep`` maps cases to outcomes in one or more processes.
     """
     standing, overloads = (STANDING, OVERLOADS) if full else REDUCED_LOADS
     loads = [
@@ -78,7 +79,7 @@ def measure(
 
 
 def _outcome(case: tuple[Sections, tuple[float, float, str], int]) -> Overload | None:
-    """Return the outcome of a case; None if the grip was not established."""
+    """Return the outcome of a case, or None if the grip was not established."""
     settings, (standing, overload, kind), seed = case
     try:
         return overloaded(settings, standing, overload, seed, kind)
@@ -102,7 +103,7 @@ def _table(
 
 
 def row(name: str, found: Sequence[Overload]) -> Row:
-    """Return the percentage held and the largest slide of those held, with the times."""
+    """Return the percentage of held objects, their maximum slide, and the reaction times."""
     answers = [1e3 * each.answer for each in found if math.isfinite(each.answer)]
     times: Row = figure(name, "ms", answers, _RESPONSE_AIM) if answers else {"name": name}
     held = [each for each in found if not each.lost]
@@ -118,7 +119,7 @@ def row(name: str, found: Sequence[Overload]) -> Row:
 def overloaded(
     settings: Sections, standing: float, overload: float, seed: int, kind: str = "push"
 ) -> Overload:
-    """Grip, carry ``standing`` [N], then ``overload`` [N], a push or a twist.
+    """Establish a grip, apply the load ``standing`` [N], then ``overload`` [N] as a push or twist.
 
     Raises RigError if the grip is not established.
     """

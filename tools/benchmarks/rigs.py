@@ -1,4 +1,4 @@
-"""Shared by several benchmarks: daemons that hold an object, canned backends, an emulated hand."""
+"""Test rigs for several benchmarks: holding daemons, canned backends and an emulated hand."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from softfinger.daemon.types import Frame, Goal, Reading
 Sections = Mapping[str, Mapping[str, Any]]
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
-SOLID: Sections = {  # tips of solid rubber
+SOLID: Sections = {  # solid rubber tips
     "tip": {"physics": "solid"},
     "material": {"law": "constant", "modulus": 0.15e6},
     "safety": {"d_max": 0.008},
 }
-SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor has noise only
+SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor has only noise
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
 SOFTFINGER = (sys.executable, "-m", "softfinger")
-_FRAME_COUNT = 16  # number of frames that take turns
+_FRAME_COUNT = 16  # frames used in turn
 
 
 class RigError(SoftfingerError):
-    """The set-up does not work, so nothing was measured."""
+    """The test rig does not work, so the measurement is not possible."""
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
-    """Return ``base`` updated by ``sections``."""
+    """Return ``base`` updated with ``sections``."""
     names = dict.fromkeys((*base, *sections))
     return {name: {**base.get(name, {}), **sections.get(name, {})} for name in names}
 
 
 @contextlib.contextmanager
 def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
-    """Yield a daemon on virtual time at its own addresses, with ``topics`` subscribed."""
+    """Yield a daemon on virtual time with private addresses and a subscriber to ``topics``."""
     with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
         sections = {
             "loop": {"clock": "virtual"},
@@ -69,7 +69,7 @@ def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
 def hold(daemon: Daemon, force: float = 8.0) -> None:
     """Grasp the simulated object.
 
-    Raises RigError if it is not held within 10 s, or Refused.
+    Raises RigError if the object is not held within 10 s, or Refused.
     """
     loop = daemon.loop
     loop.advance(0.2)
@@ -84,14 +84,14 @@ def hold(daemon: Daemon, force: float = 8.0) -> None:
 
 
 def must_hold(daemon: Daemon) -> None:
-    """Raise RigError unless the hand holds."""
+    """Raise RigError unless the hand is holding."""
     state = daemon.loop.state
     if state.mode != "holding":
         raise RigError(f"the hand does not hold: {state.mode} {state.fault}")
 
 
 class _Canned:
-    """Base of the backends: operations that do nothing."""
+    """Base class for canned backends, with operations that do nothing."""
 
     def close(self) -> None:
         """Do nothing."""
@@ -99,12 +99,12 @@ class _Canned:
     connect = open = torque_on = close
 
     def counters(self) -> dict[str, int]:
-        """Return no counters."""
+        """Return an empty dictionary."""
         return {}
 
 
 class CannedServos(_Canned):
-    """Servos that always return the same reading and ignore goals."""
+    """Servo backend that repeats one reading and ignores goals."""
 
     def __init__(self, reading: Reading, clock: Clock) -> None:
         self._clock = clock
@@ -112,7 +112,7 @@ class CannedServos(_Canned):
         self._current = reading.current.copy()
 
     def read(self, reading: Reading) -> None:
-        """Return the same reading with a new time."""
+        """Repeat the reading with a new time."""
         reading.seq += 1
         reading.valid = True
         reading.t = self._clock.now()
@@ -120,7 +120,7 @@ class CannedServos(_Canned):
         reading.current[:] = self._current
 
     def torque_off(self, reading: Reading) -> bool:
-        """Confirm immediately."""
+        """Confirm torque off immediately."""
         self.read(reading)
         return True
 
@@ -129,7 +129,7 @@ class CannedServos(_Canned):
 
 
 class CannedSensor(_Canned):
-    """Sensor that returns a few grids of counts in random order, one every ``period`` s."""
+    """Sensor backend that returns a few stored frames in random order, one every ``period`` s."""
 
     def __init__(self, counts: list[NDArray[np.uint16]], period: float, clock: Clock) -> None:
         self._counts = counts
@@ -139,7 +139,7 @@ class CannedSensor(_Canned):
         self._frame = Frame(1, clock.now(), clock.now(), True, counts[0])
 
     def latest(self) -> Frame:
-        """Return the newest frame."""
+        """Return the current frame."""
         now = self._clock.now()
         if now - self._frame.t_arrival >= self._period:
             seq = self._frame.seq + 1
@@ -148,10 +148,10 @@ class CannedSensor(_Canned):
 
 
 def can(daemon: Daemon) -> None:
-    """Replace a daemon's backends by canned ones, so that only the tick itself is timed.
+    """Replace a daemon's backends with canned ones, so that only the tick itself is timed.
 
-    The canned backends repeat the next frames and the last reading. Several frames are used,
-    because the daemon would detect a single repeated frame as a frozen sensor.
+    The canned backends repeat the next frames and the last reading. They use several frames,
+    because the daemon would detect one repeated frame as a frozen sensor.
     """
     loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate
     fingers = loop.perception.fingers

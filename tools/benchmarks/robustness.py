@@ -1,8 +1,8 @@
-"""Measure the true force of grips by hands that differ from their settings.
+"""Measure the true grip force of hands that differ from their settings.
 
-The simulated hand and the daemon have separate settings. Each of the *rows* differs in one
-parameter by the variation of an ordinary healthy hand. The *ensemble* is drawn at random and
-differs in all parameters. Grips run on virtual time, so the results do not depend on the machine.
+The simulated hand and the daemon have separate settings. In each of the *rows*, one parameter
+differs by an amount that is normal for a healthy hand. In the *ensemble*, all parameters are drawn
+at random. Grips run on virtual time, so the results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
-# s: limit for the grip to hold, undisturbed hold, observation.
+# s: time limit for establishing the hold, undisturbed hold, observation.
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
-_ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01  # relative force errors; m
-_REPORT_TIME_MAX = 2.0  # s within which a force error above `_ERROR_MAX` must be reported
-# unloaded: ratio to the requested force, longest time above it [s].
+_ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01  # 1, 1, m
+_REPORT_TIME_MAX = 2.0  # s, time limit for reporting a force error above `_ERROR_MAX`
+# Without a load: ratio to the requested force, and maximum time above it [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
 _EVENT_PREFIX = "witness."
-_GAIN_ERROR_MIN = math.log(1.3)  # log of the gain error above which naming a sensor is correct
-_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which no load should be lost
+_GAIN_ERROR_MIN = math.log(1.3)  # log of the gain error above which a sensor is faulty
+_LOAD_FRACTION = 0.8  # fraction of the friction limit, maximum load of the ensemble
 
-# Full scale of 127.5 kPa, as tactile boards have; the simulated sensor has 262 kPa.
+# Full scale of 127.5 kPa, as on real tactile boards. The simulated sensor's default is 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 _LATENCY = Settings().tactile.latency
 
 
 @dataclass(frozen=True)
 class HandCase:
-    """Grip of ``force`` [N] by a daemon on a hand with different settings."""
+    """Grip with ``force`` [N] by a daemon whose settings differ from the hand's."""
 
     name: str
     force: float
     hand: Sections = field(default_factory=dict)  # differences from the daemon's settings
     daemon: Sections = field(default_factory=dict)
     torque: float = 1.0  # true torque constant divided by the one in the settings
-    words: str = ""  # faults in the form of `softfinger emulate --fault`, started during the hold
-    load: float = 0.0  # N along the faces
-    within: float = 0.0  # s in which the load is applied
-    turn: float = 0.0  # rad
-    false: tuple[str, ...] = ()  # channels that may be named as faulty
+    words: str = ""  # faults in `softfinger emulate --fault` syntax, started in the hold
+    load: float = 0.0  # N, along the faces
+    within: float = 0.0  # s, duration of the load ramp
+    turn: float = 0.0  # rad, commanded object angle
+    false: tuple[str, ...] = ()  # channels that may be reported as faulty
 
 
 def _hand(**simulation: Any) -> Sections:
@@ -103,7 +103,7 @@ NAMES = (
 
 
 def drawn(seed: int) -> HandCase:
-    """Return a hand of the ensemble, which differs from its settings in all parameters."""
+    """Draw a hand for the ensemble; all its parameters differ from the settings."""
     chance = random.Random(f"{_ENSEMBLE}{seed}")
 
     def span(low: float, high: float) -> float:
@@ -156,7 +156,7 @@ def drawn(seed: int) -> HandCase:
         * pushed,
         within=chance.choice((0.0, 0.3, 2.0)),
         turn=span(-0.14, 0.14) * turned,
-        # A drifting zero is also a fault of the sensor.
+        # Zero drift is also a sensor fault.
         false=tuple(
             f"{side}_sensor"
             for side, wrong in zip(FINGERS, off, strict=True)
@@ -167,28 +167,28 @@ def drawn(seed: int) -> HandCase:
 
 @dataclass
 class Outcome:
-    """Outcome of a grip; forces are relative to the requested force, times in s."""
+    """Outcome of a grip. Forces are relative to the requested force, times are in s."""
 
-    held: bool = False  # the grip reached the hold
-    settled: float = math.nan  # mean of both tips at the end; NaN if the object was released
-    peak: float = 0.0  # of either tip, without a load
-    above: float = 0.0  # longest time above `_EXCESS_RATIO`, without a load
-    first_off: float = math.inf  # first time at which the mean error exceeded `_ERROR_MAX`
-    named: float = math.inf  # first time at which a channel was named
-    accused: tuple[str, ...] = ()  # named channels without a fault
-    raised: bool = False  # without a load, more force was requested than commanded
-    lost: bool = False  # the object was lost
-    end: str = ""  # fault or mode
+    held: bool = False  # the hold was established
+    settled: float = math.nan  # final mean over both tips; NaN if the object was released
+    peak: float = 0.0  # maximum over both tips, without a load
+    above: float = 0.0  # s, longest time above `_EXCESS_RATIO`, without a load
+    first_off: float = math.inf  # s, first mean error above `_ERROR_MAX`
+    named: float = math.inf  # s, first diagnosis
+    accused: tuple[str, ...] = ()  # wrongly diagnosed channels
+    raised: bool = False  # the force was increased without a load
+    lost: bool = False
+    end: str = ""  # final fault or mode
 
     def well(self) -> bool:
-        """Return True if the force is within `_ERROR_MAX`, or the error was reported in time."""
+        """Return True if the force error is within `_ERROR_MAX` or was reported in time."""
         near = self.held and abs(self.settled - 1.0) <= _ERROR_MAX and self.above == 0.0
         is_reported = self.named - self.first_off <= _REPORT_TIME_MAX and not self.raised
         return near or (self.first_off < math.inf and is_reported)
 
 
 def grip(case: HandCase, seed: int = 1) -> Outcome:
-    """Run one grip of a case; ``seed`` determines its noise and its finger."""
+    """Run one grip; ``seed`` determines the noise and the finger."""
     chance, found = random.Random(f"{case.name} {seed}"), Outcome()
     daemon = merged({"simulation": {"seed": seed}}, case.daemon)
     with VirtualGrip(daemon, merged(case.hand, daemon), case.torque) as hand:
@@ -234,7 +234,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
         ]
     found.accused = tuple(dict.fromkeys(name for _, name in names if name not in case.false))
     found.first_off -= begin
-    # A report about any channel counts as an explanation of a force error.
+    # A diagnosis of any channel counts as a report of the force error.
     found.named = min((t for t, _ in names), default=math.inf)
     return found
 
@@ -249,7 +249,7 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return a table of the rows and one of the ensemble; ``brief`` runs a few of each."""
+    """Return one table for the rows and one for the ensemble; ``brief`` runs only a few of each."""
     trials = trials or (1 if brief else _TRIAL_COUNT)
     hands = [
         drawn(seed) for seed in range(1, (4 if brief else trials * _HAND_COUNT // _TRIAL_COUNT) + 1)

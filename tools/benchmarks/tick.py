@@ -1,9 +1,9 @@
-"""Measure the tick: back to back, in place, and with emulated servos over a pty.
+"""Measure tick times: back to back, in place, and with emulated servos over a pty.
 
-Back to back, the ticks of the pipeline follow each other without a pause; in place, each tick wakes
-from a sleep as in a running daemon. Both take turns with the same hand and canned readings. With
-hardware in the loop, another process emulates the servos, either unpaced or with the transmission
-time of a baud rate. A second of virtual time of the whole simulated hand is also timed.
+Back-to-back ticks follow each other without a pause. In-place ticks each wake from a sleep, as in a
+running daemon. Both take turns, with the same hand and canned readings. With hardware in the loop,
+another process emulates the servos, either unpaced or with the transmission times at a given baud
+rate. The whole simulated hand is also timed for one second of virtual time.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from softfinger.tools.benchmarks.rigs import HIL, can, hold, must_hold, virtual_
 from softfinger.tools.processes.emulate import emulator_process
 
 _PRIORITY = 40  # SCHED_FIFO priority
-# Bits on the line: fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6 bytes.
+# Bits per cycle: fast sync read of 2 × 10 bytes, its reply, and sync write of 2 × 6 bytes.
 _BITS = 10 * (16 + 36 + 28)
-_IN_TURN = 20  # cycles in each turn
+_IN_TURN = 20  # cycles per turn
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Return times of ticks while holding an object [µs], and of a second on virtual time [ms]."""
+    """Return tick times while holding an object [µs], and the time per virtual second [ms]."""
     rounds, turns = (10, 10) if brief else (40, 60)
     parts: dict[str, Callable[[str], Report]] = {
         "tick": partial(_in_turns, rounds=rounds),
@@ -46,7 +46,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def _simulated(title: str, seconds: int) -> Report:
-    """Return the whole daemon's time with the simulated hand, per second and per tick."""
+    """Time the complete daemon with the simulated hand, per virtual second and per tick."""
     with virtual_daemon() as daemon:
         hold(daemon)
         second = timed(partial(daemon.loop.advance, 1.0), seconds)
@@ -59,12 +59,12 @@ def _simulated(title: str, seconds: int) -> Report:
 
 
 def _in_turns(title: str, rounds: int) -> Report:
-    """Time the pipeline alone: back to back with and without subscribers, in place at three rates.
+    """Time only the pipeline: back to back with and without subscribers, in place at three rates.
 
-    SCHED_FIFO is used if it is permitted.
+    SCHED_FIFO is used if permitted.
     """
     samples: dict[str, list[float]] = {}
-    used: dict[str, float] = {}  # s of processor time over all measured seconds
+    used: dict[str, float] = {}  # 1, processor load averaged over all rounds
     with virtual_daemon() as quiet, virtual_daemon(schema.STATE, schema.TACTILE) as heard:
         for daemon in (quiet, heard):
             hold(daemon)
@@ -97,7 +97,7 @@ def _in_turns(title: str, rounds: int) -> Report:
 
 
 def ticks(daemon: Daemon, count: int) -> list[float]:
-    """Return the times of ``count`` consecutive ticks on virtual time [µs]."""
+    """Return the durations of ``count`` consecutive ticks on virtual time [µs]."""
     loop, clock = daemon.loop, daemon.clock
     samples = []
     for _ in range(count):
@@ -107,7 +107,7 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
 
 
 def in_place(daemon: Daemon, rate: float) -> list[float]:
-    """Return the times of ticks [µs] that each wake at a deadline in real time, over 0.15 s."""
+    """Return tick durations [µs] over 0.15 s, with each tick started by a real-time deadline."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
     for _ in range(round(0.15 * rate)):
@@ -118,10 +118,10 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
 
 
 def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Time ticks over ptys while holding, and the servo exchanges alone, in turns.
+    """Time ticks over ptys during a hold, alternating with the servo exchanges alone.
 
-    ``baud`` 0 is unpaced; ``changes`` override the profile. Raises RigError if the hand loses its
-    grip, e.g. on a busy machine.
+    ``baud`` 0 is unpaced, and ``changes`` override the profile. Raises RigError if the hand loses
+    its grip, e.g. on a busy machine.
     """
     in_place: list[float] = []
     back_to_back: list[float] = []

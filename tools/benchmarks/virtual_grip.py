@@ -1,6 +1,6 @@
-"""Grip with a simulated hand on virtual time and observe the plant at every tick.
+"""Grip with a simulated hand on virtual time and observe the plant on every tick.
 
-True force, object position and slips come from the plant, independently of the code under test.
+True force, object position and slip are read from the plant, independently of the code under test.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 
-EXCESS_RATIO = 1.3  # ratio to the requested force
-LOST_SLIDE = 0.1  # m of slide, above which the object counts as lost
-_TORQUE_ERROR = 0.1  # largest relative error of the joints' torque constant
-_INCREASED_RATIO = 1.25  # ratio of goal currents that counts as a firmer grip
-_AVERAGING_TIME = 0.5  # s at the end over which the settled force is averaged
-_SLIP_FRACTION = 0.999  # fraction of the friction limit that counts as slip
+EXCESS_RATIO = 1.3  # 1, force relative to the requested force
+LOST_SLIDE = 0.1  # m, slide above which the object counts as lost
+_TORQUE_ERROR = 0.1  # 1, maximum relative torque constant error
+_INCREASED_RATIO = 1.25  # 1, goal current relative to the hold that counts as a reaction
+_AVERAGING_TIME = 0.5  # s, final part of the hold for averaging the force
+_SLIP_FRACTION = 0.999  # 1, fraction of the friction limit that counts as slip
 
 
 class Watch:
-    """Record true forces and the object's position, tick by tick."""
+    """Record true forces and object position on every tick."""
 
     def __init__(self, asked: float, too_much: float = EXCESS_RATIO) -> None:
-        self.asked = asked  # N
-        self.too_much = too_much  # ratio to it
-        self.peak = 0.0  # largest force of either tip relative to the requested force
-        self.above = 0.0  # longest time above `too_much` [s]
-        self.slid = 0.0  # displacement of the object while the torque is on [m]
+        self.asked = asked  # N, requested force
+        self.too_much = too_much  # 1, limit relative to the requested force
+        self.peak = 0.0  # 1, maximum force relative to the requested force
+        self.above = 0.0  # s, longest time above `too_much`
+        self.slid = 0.0  # m, object displacement while torque is on
         # (time [s], force relative to the requested force)
         self._mean: list[tuple[float, float]] = []
-        self._below = math.inf  # start of the current period above the limit
+        self._below = math.inf  # s, start of the current period above the limit
         self._place: Sequence[float] = ()
 
     def see(self, t: float, forces: Sequence[float], place: Sequence[float], torque: bool) -> None:
@@ -52,12 +52,12 @@ class Watch:
             self.slid = min(max(self.slid, math.dist(place, self._place)), LOST_SLIDE)
 
     def settled(self) -> float:
-        """Return the mean relative force at the end."""
+        """Return the final relative force, averaged over both tips and `_AVERAGING_TIME`."""
         end = self._mean[-1][0] - _AVERAGING_TIME
         return fmean(ratio for t, ratio in self._mean if t > end)
 
     def first_off(self, share: float) -> float:
-        """Return when the mean force was first off by more than ``share`` after being near [s]."""
+        """Return the first time [s] at which the mean force left the range 1 ± ``share``."""
         came = False
         for t, ratio in self._mean:
             near = abs(ratio - 1.0) <= share
@@ -73,7 +73,7 @@ class VirtualGrip(SimulatedDaemon):
     def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:
         """Build daemon and hand.
 
-        ``hand`` has the hand's settings if they differ, and ``torque`` is its torque constant
+        ``hand`` contains the hand's settings if they differ. ``torque`` is the true torque constant
         divided by the one in the settings.
         """
         self.alarms: list[tuple[float, str]] = []  # (time [s], kind) of warnings and errors
@@ -85,7 +85,7 @@ class VirtualGrip(SimulatedDaemon):
 
     @classmethod
     def drawn(cls, seed: int, chance: random.Random, sections: Sections) -> Self:
-        """Return a grip with random object mass and torque constant."""
+        """Draw a grip with random object mass and torque constant."""
         drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
         error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
         return cls(merged(sections, {"simulation": drawn}), torque=1.0 + error)
@@ -98,28 +98,28 @@ class VirtualGrip(SimulatedDaemon):
 
     def __exit__(self, *ended: object) -> None:
         super().__exit__(*ended)
-        gc.collect()  # a daemon has reference cycles that hold megabytes of frames
+        gc.collect()  # reference cycles in a daemon hold megabytes of frames
 
     def command(self, name: str, **numbers: float) -> dict[str, Any]:
-        """Send a command; a refusal is ignored."""
+        """Send a command and ignore refusals."""
         with contextlib.suppress(Refused):
             return super().command(name, **numbers)
         return {}
 
     def until(self, mode: str, seconds: float) -> bool:
-        """Advance until the hand is in ``mode``; return False if it is not within ``seconds``."""
+        """Advance until the hand is in ``mode``; return False after ``seconds``."""
         end = self.state.t + seconds
         while self.state.mode != mode and self.state.t < end:
             self.loop.advance(self.loop.period)
         return self.state.mode == mode
 
     def begin(self, words: str) -> None:
-        """Start faults given in the form of `softfinger emulate --fault`."""
+        """Start faults given in `softfinger emulate --fault` syntax."""
         for event in parse_faults(words.split(), ()):
             self.plant.apply_fault(event._replace(after=self.state.t + event.after))
 
     def watched(self, asked: float) -> Watch:
-        """Return a `Watch` that records each tick from now on."""
+        """Start recording each tick and return the `Watch`."""
         watch, hand, state = Watch(asked), self.plant, self.state
         self.look = lambda: watch.see(
             state.t, hand.force.tolist(), hand.object_pose[:2].tolist(), state.torque
@@ -127,9 +127,9 @@ class VirtualGrip(SimulatedDaemon):
         return watch
 
     def answer(self, words: str, seconds: float) -> float:
-        """Return the time from the slip caused by ``words`` to increased goal currents [s].
+        """Start the faults ``words``; return the time [s] from slip to increased goal currents.
 
-        The result is NaN if nothing slips within ``seconds``, and infinity without an answer.
+        Return NaN if no tip slips within ``seconds``, and infinity if there is no reaction.
         """
         state, loop = self.state, self.loop
         calm = sum(state.goal.current)
@@ -146,14 +146,14 @@ class VirtualGrip(SimulatedDaemon):
         return answered - onset if onset < math.inf else math.nan
 
     def along(self) -> list[float]:
-        """Return each tip's position along the object's faces, relative to their middle [m]."""
+        """Return each tip position [m] along the object faces, relative to the object's centre."""
         x, y, angle = self.plant.object_pose.tolist()
         sine, cosine = math.sin(angle), math.cos(angle)
         tips = (self.plant.plant.fingers[k] for k in range(2))
         return [(tip.y - y) * cosine - (tip.x - x) * sine for tip in tips]
 
     def between(self) -> bool:
-        """Return True if the object is between the tips, i.e. both press on it."""
+        """Return True if the object is between the tips, i.e. both tips press on it."""
         return min(self.plant.force.tolist()) > 0.0 and not self.plant.on_other_tip.any()
 
     def _slips(self) -> bool:

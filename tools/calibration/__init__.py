@@ -1,1 +1,1 @@
-"""The calibration command `calibrate`: how it gets frames, its steps and its pictures."""
+"""The `calibrate` command: frame acquisition, calibration steps and plots."""

@@ -1,4 +1,4 @@
-"""Run ``softfinger calibrate``: one calibration step of the hand or of one tip's sensor."""
+"""Run ``softfinger calibrate``: calibrate the hand or one tip's sensor, one step per call."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ STEPS = (
     "relaxation",
     "scales",
 )
-_OF_PROFILE = STEPS[: STEPS.index("tare")]  # the other steps calibrate a tip
-# Fraction of the prior standard deviation of a sensor's gain. Above it, no grip has measured the
-# gain.
+_OF_PROFILE = STEPS[: STEPS.index("tare")]  # all other steps calibrate a tip
+# Fraction of the prior standard deviation of a sensor's gain. Above it, the gain has not been
+# measured in a grip.
 _LEARNT = 0.8
-# Lower limit of each factor's relative standard deviation: rubber and joints change day by day.
+# Minimum relative standard deviation per factor, because rubber and joints vary day by day.
 _LEAST = 0.02
 _EPILOG = """\
 steps of a hand; FILE is a profile, copied from --config's if absent:
@@ -126,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(closed, open, zero) by those of a joint",
     )
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    add_daemon(parser, addresses)  # for friction, latency and scales
+    add_daemon(parser, addresses)  # used by friction, latency and scales
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
     Raises
     ------
     SoftfingerError, OSError
-        The file is then unchanged.
+        If the step fails; the file is then unchanged.
     """
     step = arguments.step
     if arguments.compression and step != "law":
@@ -200,18 +200,18 @@ def _frames(text: str) -> int:
 
 
 def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write a finger's calibration factors to its file and return the line to print.
+    """Write a finger's calibration factors to its file and return a summary line.
 
-    A sensor's gain changes when the sensor is mounted again, and the modulus of a tip may be known
-    only roughly. A grip measures both (`daemon.perception.hand_state`), and a daemon that starts
-    with these factors reaches the right force in its first grip.
+    The sensor gain changes whenever the sensor is remounted, and the tip modulus may be known only
+    roughly. Both are estimated during a grip (`daemon.perception.hand_state`). A daemon that starts
+    with these factors reaches the correct force in its first grip.
 
     Raises
     ------
     CalibrationError
-        If no grip has measured the factors.
+        If the factors have not been measured in a grip.
     NoStream
-        Without a daemon.
+        If there is no daemon.
     CalibrationFileError
     """
     from softfinger.daemon.perception.calibration_file import ScalesStep, now, save_calibration

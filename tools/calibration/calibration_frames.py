@@ -1,4 +1,4 @@
-"""Get the frames of a calibration step: live for each load, or from recordings."""
+"""Collect the frames for a calibration step, either live for each load or from recordings."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import to_stderr
 
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
-_PATIENCE = 10.0  # s without a new frame before the sensor counts as stopped
-_WAIT = 60.0  # s for --move to finish
-_BEFORE = 4000  # largest number of frames kept from before a hold
+_PATIENCE = 10.0  # s, maximum interval without a new frame
+_WAIT = 60.0  # s, time limit for --move
+_BEFORE = 4000  # maximum number of frames stored before a hold
 
 
 @dataclass(frozen=True)
 class Loads:
-    """Loads of a step.
+    """Loads in a calibration step.
 
     Attributes
     ----------
     frames
-        For each load, counts uint16 [k, rows, cols].
+        Counts, uint16 [k, rows, cols], for each load.
     truths
-        For each quantity, float64 [loads].
+        Known values, float64 [loads], for each quantity.
     """
 
     frames: list[NDArray[np.uint16]]
@@ -52,7 +52,7 @@ class Loads:
 
 
 def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
-    """Return the loads of a step.
+    """Collect the loads for a step.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
                 raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
-            # In a recording of one run, each frame with contact is a load.
+            # If there is one recording of the whole run, each frame with contact is a load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
             frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
             return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
@@ -88,7 +88,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
 
 
 def _read(path: Path, tactile: TactileSettings, full: int) -> FrameRecording:
-    """Read a recording, set saturated cells to ``full`` and print notes on its defects."""
+    """Read a recording, set saturated cells to ``full`` and print notes about defects."""
     found = load_recording(
         path, tactile.pascal_per_count, tactile.rate, tactile.noise, tactile.full_count
     )
@@ -101,7 +101,7 @@ def _read(path: Path, tactile: TactileSettings, full: int) -> FrameRecording:
 
 
 def _spread(given: dict[str, Any], count: int) -> dict[str, Any]:
-    """Expand each list of values to one value per load; a single value applies to all loads."""
+    """Expand each list to one value per load; a single value applies to all loads."""
     for name, values in given.items():
         if len(values) not in (1, count):
             raise CalibrationError(f"--{name}: found {len(values)} values for {count} loads")
@@ -127,7 +127,7 @@ def _live(
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
                 bring(arguments, told, {"load": k + 1, **load})
-            # A frame scanned before this moment may still show the previous load.
+            # Frames scanned earlier may still show the previous load.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads
@@ -140,7 +140,7 @@ def _while_pressed(
     told: str,
     load: Mapping[str, float],
 ) -> NDArray[np.uint16]:
-    """Return the frames from before a load is applied until ``--frames`` after it."""
+    """Return the frames before and while a load is applied, and ``--frames`` frames after it."""
     before: deque[NDArray[np.uint16]] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock, clock.now())
     with ThreadPoolExecutor(1) as pool:
@@ -161,7 +161,7 @@ def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | s
 
 
 def _move(command: str, load: Mapping[str, float | str]) -> None:
-    """Run the stage's program for one load until it ends; may raise CalibrationError."""
+    """Run the stage program for one load and wait for it; may raise CalibrationError."""
     try:
         words = [
             word.format(**{"force": 0.0, "d": 0.0, "theta": 0.0, **load})
@@ -176,7 +176,7 @@ def _move(command: str, load: Mapping[str, float | str]) -> None:
 
 @contextlib.contextmanager
 def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[TactileSensor]:
-    """Open the finger's sensor for a context; may raise TactileError."""
+    """Yield the finger's sensor, opened for this context; may raise TactileError."""
     hand = None
     if settings.tactile.backend == "simulated":
         from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
@@ -193,7 +193,7 @@ def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[Tacti
 
 
 def _fresh(backend: TactileSensor, clock: RealClock, since: float) -> Iterator[Frame]:
-    """Yield each new frame scanned after ``since``; raise TactileError when the sensor stops."""
+    """Yield new frames scanned after ``since``; raise TactileError if the sensor stops."""
     last = backend.latest()
     waited = clock.now()
     while True:

@@ -1,4 +1,4 @@
-"""Draw the result and the residuals of one calibration step."""
+"""Plot the result and residuals of one calibration step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from softfinger.tools import style
 
 
 class Map(NamedTuple):
-    """Panel with the values of all cells [rows, cols]."""
+    """Panel that shows one value per cell [rows, cols]."""
 
     title: str
     values: ArrayLike
@@ -24,7 +24,7 @@ class Map(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Panel with measured ``y`` over ``x``, and the fit if there is one."""
+    """Panel that shows measured ``y`` versus ``x``, with the fit if available."""
 
     title: str
     xlabel: str
@@ -45,7 +45,7 @@ Panel = Map | Points
 
 
 def draw(step: str, panels: tuple[Panel, ...], path: Path) -> None:
-    """Write the figure of ``step`` with its panels side by side."""
+    """Write a figure for ``step`` with its panels side by side."""
     with style.settings():
         figure = style.new_figure(7.5, 3.4)
         figure.suptitle(f"Calibration: {step}", fontsize=10)

@@ -1,7 +1,7 @@
-"""Calibrate the law of a tip with CSV files of a testing machine: `calibrate law --compression`.
+"""Calibrate a tip's material law from test machine CSV files: `calibrate law --compression`.
 
-A file has displacement and force, with the tilt in a column or by ``--theta``, or strain and
-stress.
+A file contains either displacement and force, with the tilt in a column or from ``--theta``, or
+strain and stress.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 class _Quantity(NamedTuple):
-    """A quantity of a file: the words that name its column, and its units in SI."""
+    """Quantity in a file: accepted column names, and accepted units with their SI factors."""
 
     words: set[str]
     units: dict[str, float]
@@ -64,25 +64,25 @@ _QUANTITIES = {
 }
 _EXAMPLE = "`d [mm],F [N],tilt [deg]` or `strain [%],stress [kPa]`"
 _NAMED = re.compile(r"^(.*?)\s*(?:[\[(]\s*(.*?)\s*[\])]|[/_]\s*([^\s/_]+))?$")
-_SAME_TILT = 2e-4  # rad, tilts of one run
-_POINTS = 10  # of a fitted law
-_BINS = 20  # points of a measured stress-strain law
-_TOE = 2.0  # ratio of slopes that shows a toe or an offset
-# Difference of the information criterion that is strong evidence (Kass & Raftery, 1995).
+_SAME_TILT = 2e-4  # rad, maximum tilt difference within a run
+_POINTS = 10  # points of a fitted law
+_BINS = 20  # maximum number of points of a measured stress-strain law
+_TOE = 2.0  # ratio of slopes that indicates a toe region or an offset
+# Difference in the information criterion that is strong evidence (Kass & Raftery, 1995).
 _BETTER = 6.0
 
 
 def read_csv(path: Path) -> dict[str, FloatArray]:
-    """Read the columns of a file by quantity, in SI units.
+    """Read the known columns of a file in SI units.
 
-    The separator is a tab, a semicolon or a comma; decimal commas need one of the first two. The
-    unit stands behind the name in the header, or in a row of its own below. Other columns, empty
-    lines and lines beginning with # are ignored.
+    The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
+    semicolon. Units follow the column names in the header, or are in a separate row below. Other
+    columns, empty lines and lines that begin with # are ignored.
 
     Raises
     ------
     CalibrationError
-        The message gives the line or the column.
+        The message names the line or column.
     OSError
     """
     try:
@@ -111,7 +111,7 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
 
 
 def _columns(path: Path, header: list[str], below: list[str]) -> dict[str, tuple[int, float]]:
-    """Return index and unit of each quantity's column."""
+    """Return the column index and the unit of each quantity."""
     found: dict[str, tuple[int, float]] = {}
     for k, title in enumerate(header):
         match = _NAMED.match(title)
@@ -148,7 +148,7 @@ def _is_number(cell: str) -> bool:
 
 @dataclass(frozen=True)
 class _Test:
-    """A run, and its name in messages."""
+    """A test run, with its name for messages."""
 
     name: str
     run: Run
@@ -157,20 +157,20 @@ class _Test:
 def fit_files(
     calibration: Calibration, settings: Settings, paths: list[Path], theta: list[float]
 ) -> tuple[Calibration, str, tuple[Panel, ...]]:
-    """Fit the law of the profile's `tip.physics` to the files.
+    """Fit the material law to files, for the profile's `tip.physics`.
 
     Parameters
     ----------
     calibration, settings
-        Calibration of the tip, and the profile.
+        The tip's calibration, and the profile.
     paths
-        Files of the machine.
+        Files from the test machine.
     theta
-        Tilt of each file [deg], or none.
+        Tilt of each file [deg], or an empty list.
 
     Returns
     -------
-    The new calibration, the line to print, and the panels of a picture.
+    The new calibration, the summary lines, and the panels of the plot.
 
     Raises
     ------
@@ -196,7 +196,7 @@ def fit_files(
 
 
 def _tests(path: Path, file: dict[str, FloatArray], theta: float) -> list[_Test]:
-    """Return the runs of a file, one for each tilt."""
+    """Split a file into runs, one for each tilt."""
     tilt = file.get("tilt", np.full(len(file["force"]), theta))
     edges = np.flatnonzero(np.abs(np.diff(tilt)) > _SAME_TILT) + 1
     tests = []
@@ -222,7 +222,7 @@ def _force_law(
         raise CalibrationError(f"law: {'; '.join(notes)}")
     best, deepest = ours[0], max(run.depth for run in runs)
     force = max(float(np.ptp(run.force)) for run in runs)
-    # The part of the residuals that is not noise is an error of the law.
+    # Residuals beyond the noise are attributed to the material law.
     misfit = best.residual * math.sqrt(max(1.0 - 1.0 / best.chi2, 0.0)) / force
     count = 0 if _is_constant(best) else _POINTS
     strain = np.linspace(0.0, deepest / tip.radius, count + 1)[1:]
@@ -321,7 +321,7 @@ def _panels(fit: CompressionFit, tests: list[_Test]) -> tuple[Panel, ...]:
 def _stress_strain(
     calibration: Calibration, path: Path, file: dict[str, FloatArray]
 ) -> tuple[Calibration, str, tuple[Panel, ...]]:
-    """Store points of a stress-strain curve as the law."""
+    """Use the points of a stress-strain curve as the material law."""
     strain, stress = file["strain"], file["stress"]
     try:
         rows, _ = rising(strain)
@@ -351,7 +351,7 @@ def _stress_strain(
 
 
 def _thinned(strain: FloatArray, stress: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the means of `_BINS` ranges of strain, if there are many more points."""
+    """Average the points in `_BINS` strain ranges if there are at least twice as many."""
     if len(strain) < 2 * _BINS:
         return strain, stress
     edges = np.linspace(strain.min(), strain.max(), _BINS + 1)
@@ -366,7 +366,7 @@ def _thinned(strain: FloatArray, stress: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _check_beginning(strain: FloatArray, stress: FloatArray) -> None:
-    """Raise CalibrationError if the curve does not begin straight from zero."""
+    """Raise CalibrationError if the curve has a toe region or does not start at zero."""
     part = (strain > 0.15 * strain[-1]) & (strain < 0.5 * strain[-1])
     first = np.flatnonzero(strain > 0.02 * strain[-1])
     if np.count_nonzero(part) < 2 or not first.size:

@@ -1,4 +1,4 @@
-"""Measure the joints' friction from slow sweeps in air: `calibrate friction`."""
+"""Measure joint friction with slow sweeps in air: `calibrate friction`."""
 
 from __future__ import annotations
 
@@ -22,26 +22,27 @@ from softfinger.tools.calibration.joints import write_keys
 from softfinger.tools.calibration.live_hand import LiveHand
 from softfinger.tools.recordings.reader import read_recording
 
-# (rad/s, rad, number) of the sweeps: slow ones for breakaway friction, two speeds for the rest.
+# (rad/s, rad, number) for each sweep. Slow sweeps measure breakaway friction, fast ones the rest.
 _SWEEPS = ((0.05, 0.06, 2), (0.3, 0.4, 2), (0.6, 0.4, 2))
 _WIDEST = max(wide for _, wide, _ in _SWEEPS)
-_FROM_ENDS = 0.05  # rad at each end of the joint's range that the sweeps avoid
-# rad, accepted error at the start of a sweep: friction may stop a joint before its goal.
+_FROM_ENDS = 0.05  # rad, margin to each end of the joint range
+# rad, tolerance for the start of a sweep, because friction may stop a joint before its goal.
 _ARRIVED = 0.05
-_REST = 0.3  # s of rest between two strokes, in addition to the smoothing time of the setpoints
-_TOUCHED = 0.2  # s discarded before and after a contact, which may not be detected immediately
-_SEEN = 2.0  # standard deviations above sliding friction from which breakaway friction is reported
+_REST = 0.3  # s, pause between two strokes, in addition to the setpoint smoothing time
+_TOUCHED = 0.2  # s, discarded before and after each contact because detection takes time
+_SEEN = 2.0  # σ, minimum excess over sliding friction for reporting breakaway friction
 
 
 def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write the joints' friction into the profile and return a summary.
+    """Write the joint friction to the profile and return a summary.
+
+    The errors of `LiveHand` may also be raised.
 
     Raises
     ------
     CalibrationError
-        If there is too little motion, or a contact.
+        If there is too little motion, or a tip touches something.
     RecordingError, SettingsError
-        And the errors of `LiveHand`.
     """
     unit = by_name(settings.servos.model).current_unit * settings.control.torque_constant
     if not unit:
@@ -66,7 +67,7 @@ def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str
 def _fit(
     columns: dict[str, NDArray[Any]], name: str, settings: Settings, unit: float
 ) -> FrictionFit:
-    """Fit a joint's contact-free motion; may raise CalibrationError."""
+    """Fit the friction to a joint's motion without contact; may raise CalibrationError."""
     t, touched = columns["t"], columns[f"{name}.contact"]
     used = columns["torque"].copy()
     for begin, end in _stretches(touched):
@@ -82,7 +83,7 @@ def _fit(
 
 
 def _stretches(holds: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Yield the first and last index of each run of True values."""
+    """Yield the first and last index of each sequence of True values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
     return zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True)
 
@@ -99,7 +100,7 @@ def _told(fit: FrictionFit) -> str:
 
 
 def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArray[Any]]:
-    """Sweep one joint after the other and return all states."""
+    """Sweep the joints one after the other and return all states."""
     names = sorted(settings.scene.fingers)
     ways = {name: _way(settings, name) for name in names}
     told = ", ".join(
@@ -127,10 +128,10 @@ def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArr
 
 
 def _way(settings: Settings, name: str) -> tuple[float, float]:
-    """Return start and signed length [rad] of a joint's sweeps.
+    """Return the start and signed length [rad] of a joint's sweeps.
 
-    The sweeps open the joint if there is room, otherwise they close it. Raises CalibrationError if
-    there is too little room.
+    The sweeps open the joint if its range permits, otherwise they close it. Raises CalibrationError
+    if the range is too short.
     """
     hand, finger = settings.hand, FINGERS.index(name)
     start = hand.open_angle[finger]

@@ -1,8 +1,8 @@
-"""Write servo data into a profile: `calibrate joints` and `calibrate heat`.
+"""Write servo data to a profile: `calibrate joints` and `calibrate heat`.
 
-For `calibrate joints`, torque is off and each finger is moved by hand; the servo's counts are read
-in the closed, open and zero poses. `calibrate heat` fits the thermal constants to a recording of a
-hold of several minutes.
+During `calibrate joints`, torque is off and the user moves each finger by hand. The servo counts
+are read in the closed, open and zero poses. `calibrate heat` fits the thermal constants to the
+recording of a hold that lasts several minutes.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ _POSES = {
     "open": "open it fully",
     "zero": "put it upright, straight away from the palm",
 }
-_LEAST = 0.2  # rad, smallest accepted rotation between closed and open
-_ALONE = 0.25  # fraction of that rotation by which the other finger may move meanwhile
-_MARGIN = 0.03  # rad between the stops and the commanded range
-_Counts = dict[int, int]  # by servo ID
+_LEAST = 0.2  # rad, minimum rotation between closed and open
+_ALONE = 0.25  # 1, fraction of this rotation by which the other finger may move
+_MARGIN = 0.03  # rad, margin between the stops and the commanded range
+_Counts = dict[int, int]  # keys: servo IDs
 
 
 def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Guide the user through the poses of each finger, write the profile and return a summary.
+    """Guide the user through each finger's poses, write the profile and return a summary.
 
     Raises
     ------
     ServoError, CalibrationError, SettingsError
-        The profile is then unchanged.
+        If this fails; the profile is then unchanged.
     """
     servos = settings.servos
     if servos.backend != "dynamixel":
@@ -91,7 +91,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _read(line: ServoLine, ids: list[int]) -> _Counts:
-    """Return each servo's position; raise ServoError unless all are limp and within one turn."""
+    """Return all servo positions; raise ServoError if torque is on or one exceeds a turn."""
     counts = {}
     for servo in ids:
         table = Registers(line.read(servo, 0, CHECKED) or b"")
@@ -100,7 +100,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
         if table[reg.TORQUE_ENABLE]:
             raise ServoError(f"servo {servo}: torque is on: end `softfinger run`, or disarm")
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # After a power-up the position equals the encoder's count, which is below one turn.
+        # After power-up, the position equals the encoder count, which is less than one turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder
@@ -114,7 +114,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
 
 
 def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
-    """Return the servo that turned between closed and open; may raise CalibrationError."""
+    """Return the servo that rotated between closed and open; may raise CalibrationError."""
     moved = {k: abs(at["closed"][k] - at["open"][k]) * radian for k in at["open"]}
     servo, *others = sorted(moved, key=lambda k: -moved[k])
     if moved[servo] < _LEAST:
@@ -131,12 +131,12 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
 
 
 def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write the thermal constants into the profile and return a summary.
+    """Write the thermal constants to the profile and return a summary.
 
     Raises
     ------
     CalibrationError
-        Without a recording, or if the hold is too short.
+        If there is no recording, or the hold is too short.
     RecordingError, SettingsError
     """
     if len(arguments.recording) != 1:
@@ -162,7 +162,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write ``new`` into the file, or into a copy of the profile, and keep all other text."""
+    """Write ``new`` to the file, or to a copy of the profile, and preserve all other text."""
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
     load(source, arguments.dir or own_runtime_folder(), [*arguments.set, *changes])
@@ -182,9 +182,9 @@ def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any
 
 
 def put(text: str, section: str, values: Mapping[str, Any]) -> str:
-    """Return a profile's text with these arrays or numbers set in ``[section]``.
+    """Return a profile's text with the arrays or numbers ``values`` set in ``[section]``.
 
-    If the profile has no such header but keys of the form ``section.key``, that form is used.
+    If the profile has no ``[section]`` header but uses dotted keys, ``section.key`` is used.
     """
     head = re.search(rf"(?m)^\[{section}\].*\n?", text)
     if head is None and not re.search(rf"(?m)^{section}\.", text):

@@ -1,4 +1,4 @@
-"""Measure the latency of tactile frames from a grip of varying force: `calibrate latency`."""
+"""Measure the tactile frame latency from a grip with varying force: `calibrate latency`."""
 
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ from softfinger.tools.recordings.recomputed import counts_of, recorded_models, r
 
 FloatArray = NDArray[np.float64]
 
-_STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, as multiples of the first force
-_HELD = 0.5  # s for which each force is held
-_STD_MAX = 5e-3  # s, largest accepted standard deviation of the latency
-# Accepted ratio of d from frames to d from joints; outside, frames do not follow the joints.
+_STEPS = (1.0, 0.5, 1.25, 0.5)  # 1, successive forces relative to the first force
+_HELD = 0.5  # s, hold time per force
+_STD_MAX = 5e-3  # s, maximum standard deviation of the latency
+# Accepted ratio of d from frames to d from joints. Outside it, frames do not follow the joints.
 _SCALE = 0.5, 2.0
-_MISFIT_MAX = 0.3e-3  # m RMS; more indicates that the object slides or tilts, or a second contact
-# Relative errors of d from frames, if d is estimated from the frame's shape or from its amplitude.
+_MISFIT_MAX = 0.3e-3  # m RMS; larger values indicate sliding, tilting or a second contact
+# Relative errors of d from frames, if d is estimated from the frame shape or its amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 
 def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write the frames' latency into the profile and return a summary.
+    """Write the frame latency to the profile and return a summary.
+
+    The errors of `LiveHand` may also be raised.
 
     Raises
     ------
     CalibrationError
         If the data do not determine the latency.
     RecordingError, SettingsError
-        And the errors of `LiveHand`.
     """
     if len(arguments.recording) > 1:
         raise CalibrationError("latency: expected one --recording, or none")
@@ -89,7 +90,7 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
-    """Grasp with several forces, then open; return the hand with the stored stream."""
+    """Grasp with several forces and open again; return the hand with its stored stream."""
     first = arguments.force[0] if arguments.force else settings.control.force_default
     forces = [min(step * first, settings.safety.force_max) for step in _STEPS]
     bring(arguments, f"latency: put an object between the fingers, for {first:g} N", {})
@@ -104,10 +105,10 @@ def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
 
 
 def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times, the sum of d over all fingers, and its noise (standard deviation).
+    """Return times, the sum of d over all fingers, and its standard deviation due to noise.
 
-    Each frame is estimated independently. Times are those of the first finger's frames, restricted
-    to the period in which all fingers touch.
+    Each frame is estimated independently. The times are the sample times of the first finger's
+    frames while all fingers touch.
     """
     names = sorted(own.scene.fingers)
     models = recorded_models(source)
@@ -142,9 +143,9 @@ def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArra
 
 
 def _closing(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray]:
-    """Return times and the depth by which the joints close [m], relative to an arbitrary origin.
+    """Return times and the depth [m] by which the joints close, relative to an arbitrary origin.
 
-    d1 + d2 = W + 2a − (O2 − O1)·n, which is unaffected by a shift of the object between the tips.
+    d1 + d2 = W + 2a − (O2 − O1)·n does not change if the object moves between the tips.
     """
     states = to_columns(read(HandState, message) for _, message in source.messages([STATE]))
     hand, angle = own.hand, states["object.angle"]

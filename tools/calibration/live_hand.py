@@ -1,4 +1,4 @@
-"""Move a running daemon's hand for a calibration and store its stream."""
+"""Move a running daemon's hand during a calibration and store its stream."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from softfinger.daemon.wire.schema import SETTINGS, STATE, TACTILE, HandState
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import client_keys
 
-_MOST = 1000  # messages read at a time
-_WITHIN = 20.0  # s of the hand's time within which a command must be completed
+_MOST = 1000  # maximum number of messages per read
+_WITHIN = 20.0  # s in hand time, time limit for each command
 
 
 class LiveHand:
-    """Context in which the hand is armed and its stream is stored as in a `Recording`.
+    """Context manager that arms the hand and stores its stream as in a `Recording`.
 
-    On exit, a hand that was disarmed before is disarmed again. After an error the torque is
+    On exit, the hand is disarmed again if it was disarmed on entry. After an error, torque is
     switched off.
     """
 
@@ -35,7 +35,7 @@ class LiveHand:
         self._address, self._keys = arguments.address, arguments.keys
         self._taken: list[tuple[bytes, dict[str, Any]]] = []
         self._disarm = False
-        self._commanded = False  # a command of this context was accepted
+        self._commanded = False  # a command in this context has been accepted
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
@@ -66,18 +66,18 @@ class LiveHand:
             self._hand.disarm()
 
     def command(self, name: str, **numbers: float) -> None:
-        """Send a command; may raise Refused and NoAnswer."""
+        """Send a command; may raise Refused or NoAnswer."""
         self._hand.command(name, **numbers)
         self._commanded = True
 
     def states(self) -> Iterator[HandState]:
-        """Yield the newest state repeatedly and store all messages; may raise NoStream."""
+        """Store all messages and repeatedly yield the newest state; may raise NoStream."""
         while True:
             if not self._socket.poll(int(1e3 * REPLY_TIMEOUT)):
                 raise no_stream(self._address[0], STATE, REPLY_TIMEOUT)
             newest = None
             for frames in drain(self._socket, _MOST):
-                with contextlib.suppress(ValueError):  # skip invalid messages
+                with contextlib.suppress(ValueError):  # Skip invalid messages.
                     topic, message = unpack(frames)
                     self._taken.append((topic, message))
                     newest = message if topic == STATE else newest
@@ -88,7 +88,7 @@ class LiveHand:
                 yield state
 
     def until(self, holds: Callable[[HandState], object]) -> None:
-        """Wait for a state for which ``holds`` is true; raise CalibrationError after 20 s."""
+        """Wait until ``holds`` is true for the state; raise CalibrationError after 20 s."""
         begin = None
         for state in self.states():
             if holds(state):
@@ -98,14 +98,14 @@ class LiveHand:
                 raise CalibrationError(f"the hand is still {state.mode} after {_WITHIN:g} s")
 
     def wait(self, seconds: float) -> None:
-        """Wait for ``seconds`` of the hand's time."""
+        """Wait for ``seconds`` in hand time."""
         end = next(self.states()).mono_ns + int(1e9 * seconds)
         self.until(lambda state: state.mono_ns >= end)
 
     def messages(
         self, topics: Collection[bytes] | None = None
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield the stored messages of ``topics`` in order of arrival."""
+        """Yield the stored messages on ``topics`` in the order of arrival."""
         for topic, message in self._taken:
             if topics is None or topic in topics:
                 yield topic, message

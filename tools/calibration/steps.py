@@ -1,7 +1,7 @@
-"""Calibration steps: compute the contents of the calibration file from loads.
+"""Compute the contents of the calibration file from loads, step by step.
 
-The mathematics is in `kinematics.calibration.calibration`, the file format in
-`daemon.perception.calibration_file`.
+`kinematics.calibration.calibration` contains the mathematics, and
+`daemon.perception.calibration_file` defines the file format.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-# Relative softening after first presses above which it is reported; plates and noise cause less.
+# Relative softening after the first loads that is reported. Plates and noise cause less.
 _SOFTENS = 0.03
-# New calibration, line to print, panels of the picture.
+# New calibration, summary line, panels of the plot.
 Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 
 def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
-    """Return the calibration in the file, or a new one; may raise CalibrationFileError."""
+    """Load the calibration file or make a new calibration; may raise CalibrationFileError."""
     sensor = sensor_of(settings, FINGERS.index(arguments.finger))
     if not arguments.file.exists():
         return Calibration(sensor=sensor, date=now())
@@ -86,7 +86,7 @@ def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
 
 @dataclass(frozen=True)
 class Step:
-    """Inputs of one step, and quantities that several steps use."""
+    """Inputs for one step, and quantities used in several steps."""
 
     arguments: argparse.Namespace
     settings: Settings
@@ -95,7 +95,7 @@ class Step:
 
     @cached_property
     def converter(self) -> Converter:
-        """Conversion of counts to pressure with the steps done so far."""
+        """Conversion from counts to pressure, according to the completed steps."""
         return Converter(self.calibration, self.settings.tactile.pascal_per_count)
 
     @property
@@ -105,7 +105,7 @@ class Step:
 
     @cached_property
     def over(self) -> list[FloatArray]:
-        """Each load's mean counts above zero, times the gains, corrected for noise cut at 0."""
+        """Mean counts above the zero offset, times the gains, corrected for clipping at 0."""
         tare, zero, gain = self.calibration.tare, self.converter.zero, self.converter.gain
         means = [frames.mean(axis=0) for frames in self.loads.frames]
         if tare is None or self.settings.tactile.threshold:
@@ -114,7 +114,7 @@ class Step:
 
     @cached_property
     def readings(self) -> list[FloatArray]:
-        """Mean reading of each load, without noise far from the contact."""
+        """Mean readings of each load, with noise far from the contact removed."""
         noise = self.calibration.tare.noise if self.calibration.tare else 0.0
         spread = np.full(self.converter.zero.shape, noise)
         return [
@@ -124,7 +124,7 @@ class Step:
 
     @cached_property
     def pressures(self) -> FloatArray:
-        """Mean pressure of each load [Pa], [loads, rows, cols]."""
+        """Mean pressure [Pa] of each load, float64 [loads, rows, cols]."""
         return np.stack(
             [
                 np.mean([self.converter(frame) for frame in frames], axis=0)
@@ -134,23 +134,23 @@ class Step:
 
     @property
     def cell_area(self) -> float:
-        """Area of a cell [m²]."""
+        """Cell area [m²]."""
         x, y = self.calibration.sensor.pitch
         return x * y
 
     @property
     def plain_grid(self) -> SensorGrid:
-        """Grid of the sensor, centred and not rotated."""
+        """Sensor grid, centred and not rotated."""
         sensor = self.calibration.sensor
         return SensorGrid(sensor.rows, sensor.cols, sensor.pitch)
 
     def result(self, **steps: Any) -> Calibration:
-        """Return the calibration updated by these steps."""
+        """Return the calibration updated with ``steps``."""
         return self.calibration.model_copy(update={"date": now(), **steps})
 
 
 def done(step: Step) -> Done:
-    """Run the step; may raise CalibrationError."""
+    """Compute the step; may raise CalibrationError."""
     truths = step.loads.truths
     if not step.loads.frames:
         raise CalibrationError("no frame with d above 0 in this run")
@@ -168,7 +168,7 @@ def done(step: Step) -> Done:
 
 
 def _kept(kind: type[Any], found: object, **more: Any) -> Any:
-    """Return a ``kind`` step for the file, with fields taken by name from ``found`` or ``more``."""
+    """Make a ``kind`` step for the file from the fields of ``found`` and ``more``."""
     values = {name: getattr(found, name) for name in kind.model_fields if hasattr(found, name)}
     lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
     return kind(date=now(), **(lists | more))
@@ -209,7 +209,7 @@ def _curve(step: Step) -> Done:
         d = truths.get("d")
         if d is None:
             raise CalibrationError("curve: expected --force or --d, or a run that has them")
-        # Compute the force from the profile's material over the whole footprint.
+        # Integrate the force over the whole footprint with the profile's material.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
         pressures = [
             step.plain_grid.pressure(tip, material, float(x), float(theta))
@@ -259,7 +259,7 @@ def _modulus(step: Step) -> Done:
     pressed = zip(step.pressures, step.readings, strict=True)
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
-    whole = ~full.any(axis=(1, 2))  # a saturated cell hides part of the force
+    whole = ~full.any(axis=(1, 2))  # saturated cells hide part of the force
     tip = make_tip(step.settings)
     found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
@@ -331,12 +331,12 @@ def _law(step: Step) -> Done:
 
 
 def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArray]:
-    """Fit curves through the presses.
+    """Fit curves to the loads.
 
     Returns
     -------
-    The curves, and the RMS residuals of d [m], θ [rad] and F (relative to its RMS), for the mean
-    over the frames of each press.
+    The curves and the RMS residuals of d [m], θ [rad] and F (relative to its RMS). The residuals
+    are computed from the mean over each load's frames.
 
     Raises
     ------
@@ -377,7 +377,7 @@ def _measured_told(law: TipCurves, left: FloatArray) -> str:
 
 
 def _over_d(trend: Trend) -> str:
-    """Describe E at the smallest, middle and largest d, with a warning if E drifts."""
+    """Describe E at minimum, middle and maximum d, with a warning if E drifts."""
     order = np.argsort(trend.d, kind="stable")[[0, len(trend.d) // 2, -1]]
     values = ", ".join(f"{each / 1e6:.3f}" for each in trend.modulus[order])
     depths = ", ".join(f"{each * 1e3:g}" for each in trend.d[order])

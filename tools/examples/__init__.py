@@ -1,1 +1,1 @@
-"""Example programs to copy; each is self-contained and uses the public client and kinematics."""
+"""Self-contained example programs to copy, which use the public client and kinematics."""

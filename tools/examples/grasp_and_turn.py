@@ -1,6 +1,6 @@
-"""Grasp an object, turn it to both sides, and plot the recorded states.
+"""Grasp an object, rotate it to both sides and plot the recorded states.
 
-The script is divided into notebook cells. Start a daemon with ``softfinger run``, then run the
+The script is divided into notebook cells. Start a daemon with ``softfinger run``. Then run the
 whole file,
 
     python -m softfinger.tools.examples.grasp_and_turn --picture grasp_and_turn.png
@@ -8,7 +8,7 @@ whole file,
 or run it cell by cell in an editor that supports ``# %%``. It needs matplotlib (extra ``plot``).
 """
 
-# %% Settings: the address of the hand, the force and the angles
+# %% Settings: hand address, force and angles
 from __future__ import annotations
 
 import argparse
@@ -27,14 +27,14 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--stream")
 parser.add_argument("--commands")
 parser.add_argument("--picture", default="grasp_and_turn.png")
-where = parser.parse_known_args()[0]  # ignore a notebook's own arguments
+where = parser.parse_known_args()[0]  # ignore arguments of a notebook
 
 FORCE = 8.0  # N on each tip
-ANGLES = (12.0, -12.0, 0.0)  # degrees, one after the other
+ANGLES = (12.0, -12.0, 0.0)  # degrees, in this order
 DEGREES = math.degrees(1.0)
 
 
-# %% Grasp, turn and release the object, and record every state
+# %% Grasp, rotate and release the object, recording every state
 def settled(state: HandState) -> bool:
     return state.mode == "holding"
 
@@ -42,7 +42,7 @@ def settled(state: HandState) -> bool:
 recorded: list[HandState] = []
 with Hand(where.stream, where.commands) as hand:
     with hand.stream(hand.timeout) as states:
-        recorded.append(next(states))  # wait for the stream before anything moves
+        recorded.append(next(states))  # wait for the stream before moving
         try:
             hand.arm()
             hand.grasp(force=FORCE)
@@ -53,21 +53,21 @@ with Hand(where.stream, where.commands) as hand:
             hand.release()
             end = hand.wait_for(lambda state: state.mode == "armed")
         finally:
-            hand.stop()  # switch the torque off after any error
-        for state in states:  # states received so far
+            hand.stop()  # switch torque off after any error
+        for state in states:  # all states received so far
             recorded.append(state)
             if state.seq >= end.seq:
                 break
     print(f"{len(recorded)} states, {states.lost} lost")
 
-# %% Convert to columns; `pandas.DataFrame(columns)` accepts them too
+# %% Convert to columns, which `pandas.DataFrame(columns)` also accepts
 columns = to_columns(recorded)
 t = (columns["mono_ns"] - columns["mono_ns"][0]) * 1e-9
 touching = {name: columns[f"{name}.contact"] for name in ("left", "right")}
 held = columns["mode"] == "holding"
 print(f"force while holding: {columns['left.force'][held].mean():.2f} N, asked for {FORCE:g} N")
 
-# %% Compute the energy landscape of the built-in hand's fingertip and its minimum over θ
+# %% Compute the energy landscape of the built-in hand's fingertip, and its minimum over θ
 tip, material = Fingertip(radius=0.020), Material.table_i()
 table = ContactTable.build(tip, material)
 deepest = 1.25 * max(columns[f"{name}.d"][touching[name]].max() for name in touching)
@@ -80,7 +80,7 @@ minimum = theta[np.argmin(energy, axis=1)]
 LOOKS = {"left": ("#0072B2", "-"), "right": ("#D55E00", "--")}
 figure = Figure(figsize=(9.0, 4.2), layout="constrained")
 panels = figure.subplot_mosaic([["force", "map"], ["angle", "map"]], width_ratios=[1.0, 1.15])
-# U grows as d³: levels are closer near its foot
+# levels are denser at low U, because U grows as d³
 levels = 1e3 * energy.max() * np.linspace(0.0, 1.0, 11) ** 2
 shown = panels["map"].contourf(
     theta * DEGREES, d * 1e3, energy * 1e3, levels, cmap="Greys", vmax=1.8 * levels[-1]

@@ -1,9 +1,9 @@
-"""Figs. 7, 10 and 11: the model's curves for the paper's two experiments, and its appendix.
+"""Draw Figs. 7, 10 and 11: model curves for the paper's two experiments and for its appendix.
 
-The paper shows the measured points only as plots, so they are not reproduced. The appendix splits
-U(d, 0), eq. 12, into three terms, which are computed both as integrals and as printed. `terms` and
-`limits` use SI units and the paper's dimensions: eq. 16 is a length, eq. 18 is dimensionless, and
-eq. 19 is an inverse length.
+The paper shows its measurements only as plots, so the measured points are not reproduced. The
+appendix splits U(d, 0) (eq. 12) into three terms. They are computed both by integration and from
+the printed equations. `terms` and `limits` use SI units and the paper's dimensions: eq. 16 is a
+length, eq. 18 is dimensionless, and eq. 19 is an inverse length.
 """
 
 from __future__ import annotations
@@ -45,25 +45,25 @@ from softfinger.tools.style import GREY, INK, KINDS, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PITCH = 0.058 / 44  # [m]
+PITCH = 0.058 / 44  # m
 GRID = SensorGrid(rows=44, cols=44, pitch=PITCH)
 
-TILTED = -11.5  # relative angle [deg] at the end of the finger's rotation
-ROLLED = 9.2  # relative angle [deg] after the object has rolled by 20.7°
+TILTED = -11.5  # degrees, relative angle after the finger rotation
+ROLLED = 9.2  # degrees, relative angle after the object has rolled by 20.7°
 
 
 def _force(d: Numbers, theta: Numbers) -> FloatArray:
-    """Return F [N] for the paper's constant modulus; d in mm, θ in degrees."""
+    """Return F [N] for the paper's constant modulus, with d in mm and θ in degrees."""
     return closed_forms(MODULUS, d * MILLI, np.radians(theta)).force
 
 
 def _force_table_i(d: Numbers, theta: Numbers) -> FloatArray:
-    """Return F [N] for the law through Table I; d in mm, θ in degrees."""
+    """Return F [N] for Table I's material law, with d in mm and θ in degrees."""
     return integrate(TIP, Material.table_i(), d * MILLI, np.radians(theta)).force
 
 
 def compression() -> tuple[Sheet, ...]:
-    """Tabulate force over displacement at each angle, of the model and summed over the cells."""
+    """Tabulate force versus displacement at each angle, from the model and the sum of all cells."""
     material = Material.constant(MODULUS)
     d = np.arange(81) / 10.0
     columns = {"d [mm]": d}
@@ -96,7 +96,7 @@ def _all_tilts(axes: Axes, numbers: Sheet) -> None:
 
 
 def _compression_panels() -> Iterator[Panel]:
-    """Yield panels (a) to (g), one per angle, and (h) with all angles."""
+    """Yield panels (a) to (g) with one angle each, and panel (h) with all angles."""
     for k, (letter, tilt) in enumerate(zip("abcdefg", TILTS, strict=True)):
         labels = DEPTH if k >= 4 else "", "" if k % 4 else FORCE
         place = "" if k else "upper left"
@@ -106,11 +106,11 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return the path of the relative angle: the finger tilts at its root, then the object rolls.
+    """Return force and energy along the path: the finger rotates about its root, the object rolls.
 
-    During the rotation to each final displacement D, the root is at the distance D/sin 11.5° from
-    the tip's centre, so that d rises from first touch as D sin |θ|/sin 11.5°. During rolling, d
-    remains D.
+    For each final displacement D, the root is D/sin 11.5° away from the tip centre. During the
+    rotation, d therefore increases from first touch as D sin |θ|/sin 11.5°. During rolling, d is
+    constant at D.
     """
     tilting = -np.arange(0, 116) / 10.0
     rolling = np.arange(-115, 93) / 10.0
@@ -124,7 +124,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
             f"F at d = {deepest} mm [N]": _force(d, tilting),
         }
         force, law = _force(d, rolling), _force_table_i(d, rolling)
-        # Springs directed at the tip's centre (Nguyen and Arimoto): N = πE d² at any tilt.
+        # If the springs point at the tip centre (Nguyen and Arimoto), N = πE d² at any tilt.
         radial = np.full(rolling.shape, math.pi * MODULUS * (d * MILLI) ** 2)
         second |= {
             f"F at d = {deepest} mm [N]": force,
@@ -167,33 +167,33 @@ _TERMS = ("first", "second", "third")
 
 
 class Terms(NamedTuple):
-    """Integrals of the root, of 1 and of the inverse root over the area element of eq. 14."""
+    """Integrals of the root, 1 and the inverse root over the area element in eq. 14."""
 
-    first: FloatArray  # eq. 16 [m]
-    second: FloatArray  # eq. 18
-    third: FloatArray  # eq. 19 [1/m]
+    first: FloatArray  # m, eq. 16
+    second: FloatArray  # 1, eq. 18
+    third: FloatArray  # 1/m, eq. 19
 
     def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
-        """Return U(d, 0) by eq. 12 [J]."""
+        """Return U(d, 0) [J] according to eq. 12."""
         first, second, third = self.terms(radius, modulus, d)
         return first + second + third
 
     def terms(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
-        """Return each term's contribution to eq. 12's energy [J]."""
+        """Return the contribution [J] of each term to the energy in eq. 12."""
         h = radius - d
         factor = 0.5 * modulus * h**2
         return factor * self.first, -2.0 * h * factor * self.second, h**2 * factor * self.third
 
 
 def limits(radius: float, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (θ_max, p) [rad] of eqs. 15 and 17: θ at the contact's rim, and t there."""
+    """Return θ_max and p [rad] from eqs. 15 and 17: the values of θ and t at the contact rim."""
     h = radius - d
     theta_max = np.arctan(np.sqrt(radius**2 - h**2) / h)
     return theta_max, np.arccos(h / radius * np.tan(theta_max))
 
 
 def printed_terms(radius: float, d: FloatArray) -> Terms:
-    """Return eqs. 16, 18 and 19 as printed, at d [m]."""
+    """Evaluate eqs. 16, 18 and 19 as printed, at d [m]."""
     h2 = (radius - d) ** 2
     return Terms(
         2.0 * np.pi * d / (3.0 * h2) * (3.0 * radius**2 - 3.0 * radius * d + d**2),
@@ -203,20 +203,20 @@ def printed_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def integrated_terms(radius: float, d: FloatArray) -> Terms:
-    """Return the terms by Gauss quadrature of eq. 12; relative error ≤ 1e-12 up to d = 0.7 a."""
+    """Return the terms from Gauss quadrature, with a relative error ≤ 1e-12 up to d = 0.7 a."""
     d = np.asarray(d, dtype=np.float64)[..., None]
     h = radius - d
     points, weights = leggauss(_NODES)
     theta_max, _ = limits(radius, d)
     theta = 0.5 * theta_max * (points + 1.0)
-    # This includes the factor 2π from φ.
+    # Include the factor 2π from the integration over φ.
     area = np.pi * theta_max * weights * np.sin(theta) / np.cos(theta) ** 3
     root = np.sqrt(radius**2 - (h * np.tan(theta)) ** 2)
     return Terms(*(np.sum(area * each, axis=-1) for each in (root, 1.0, 1.0 / root)))
 
 
 def _appendix() -> tuple[Sheet, ...]:
-    d = np.arange(1, 81) / 10.0  # at d = 0 the terms cancel
+    d = np.arange(1, 81) / 10.0  # The terms cancel at d = 0.
     metres = d * MILLI
     columns = {"d [mm]": d}
     for how, terms in (

@@ -1,6 +1,6 @@
-"""Run ``softfinger figures``: draw the paper's figures from this model, as CSV and PNG.
+"""Run ``softfinger figures``: compute the paper's figures and write them as CSV and PNG.
 
-Errata of the paper are marked.
+Figures that contain an erratum of the paper are marked.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
     *("fig7", "fig7_run", "fig10", "fig10_run", "fig10_shear", "fig11"),
 )
-BY_NAME = ("slow_turn",)  # slow figures, drawn only if named
+BY_NAME = ("slow_turn",)  # slow figures, drawn only when named
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def pages() -> dict[str, FigurePage]:
-    """Return all figures by name."""
+    """Return a dictionary of all figures."""
     from softfinger.tools.paper import (
         experiment_pages,
         model_pages,
@@ -52,7 +52,7 @@ def pages() -> dict[str, FigurePage]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the data, and the figures if matplotlib is installed; may raise OSError."""
+    """Write the data and, if matplotlib is installed, the figures; may raise OSError."""
     known = (*NAMES, *BY_NAME)
     unknown = [name for name in arguments.names if name not in known]
     if unknown:
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def write(chosen: dict[str, FigurePage], folder: Path) -> None:
-    """Write these figures into ``folder`` and print the path of each file; may raise OSError."""
+    """Write the chosen figures to ``folder`` and print each file path; may raise OSError."""
     from softfinger.tools import style
     from softfinger.tools.extras import MissingExtra
     from softfinger.tools.paper.sheets import errata_sheet

@@ -1,7 +1,7 @@
-"""Figs. 3 to 5 and Table I: material law, and force and energy over tilt and displacement.
+"""Draw Figs. 3 to 5 and Table I: material law, and force and energy versus tilt and displacement.
 
-In Figs. 4 and 5 the lines are closed forms and the markers are the paper's double integrals,
-evaluated numerically.
+In Figs. 4 and 5, lines show the closed forms. Markers show the paper's double integrals, evaluated
+numerically.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 TIP = Fingertip(radius=0.020)
-MODULUS = TABLE_I_MAXIMUM  # the paper's choice [Pa]
+MODULUS = TABLE_I_MAXIMUM  # Pa, the paper's choice
 MILLI = 1e-3
 MPA = 1e-6
-_NODES = 64  # Gauss nodes of the double integrals
-_STEEP_TILT = 25  # degrees at which the slope over the tilt is reported
-_FITTED = slice(10, None)  # displacements from 1 to 8 mm, to which exponents are fitted
-_STEP = 1e-4  # step of finite differences, relative or in rad
+_NODES = 64  # Gauss nodes per double integral
+_STEEP_TILT = 25  # degrees, tilt at which the slope is reported
+_FITTED = slice(10, None)  # rows from 1 to 8 mm, used to fit the exponents
+_STEP = 1e-4  # relative or rad, finite-difference step
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
 
@@ -62,7 +62,7 @@ def _tangent(material: Material, strain: FloatArray) -> FloatArray:
 
 
 def law() -> tuple[Sheet, ...]:
-    """Tabulate the law over strain, and Table I with the law at its strains."""
+    """Tabulate the law versus strain, and compare Table I with the law at the same strains."""
     material = Material.table_i()
     strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
     curve = {
@@ -87,7 +87,7 @@ def _stress(axes: Axes, curve: Sheet, _: Sheet) -> None:
 
 
 def _slope(axes: Axes, curve: Sheet, table: Sheet) -> None:
-    """Draw the slope of the law and Table I, with its numbers next to the points."""
+    """Draw the law's slope and the points of Table I, labelled with their values."""
     axes.plot(curve["strain"], curve["modulus"], color=KINDS[0], label="slope of the law")
     measured = table["modulus in the paper"]
     axes.plot(table["strain"], measured, "o", color="white", mec=KINDS[0], mew=1.4, label="Table I")
@@ -105,13 +105,14 @@ def _slope(axes: Axes, curve: Sheet, table: Sheet) -> None:
 def double_integrals(
     radius: float, modulus: float, d: ArrayLike, theta: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Return (F, U) [N], [J] of eqs. 3 and 10 as printed, at d [m] and θ [rad], which broadcast.
+    """Return F [N] and U [J] from eqs. 3 and 10 as printed; d [m] and θ [rad] broadcast.
 
-    The integrals use product Gauss quadrature, so they and the closed forms verify each other. The
-    relative error is ≤ 1e-10 for tilts at least 6° below θ's limit; the result is 0 at d = 0.
+    The integrals are computed by product Gauss quadrature, so they verify the closed forms
+    independently. The relative error is ≤ 1e-10 if θ is at least 6° below its limit. F and U are 0
+    at d = 0.
     """
     points, weights = leggauss(_NODES)
-    # With x and y as sines over the ellipse, its rim does not reduce the accuracy.
+    # Substitute sines for x and y, so that the rim of the ellipse does not reduce the accuracy.
     angle = 0.5 * np.pi * points
     weight = 0.5 * np.pi * weights * np.cos(angle)
     depth, tilt = np.broadcast_arrays(np.asarray(d, float), np.asarray(theta, float))
@@ -125,7 +126,7 @@ def double_integrals(
         y = b * np.sin(angle)
         area = (rho * c * weight)[:, None] * b * weight
         z = np.sqrt(radius**2 - x**2 - y**2)
-        q = (h - x * s) / c  # height of the object's face above the base
+        q = (h - x * s) / c  # height of the object face above the base
         force[i] = modulus * np.sum((1.0 - q / z) * area)
         energy[i] = 0.5 * modulus * np.sum((z - 2.0 * q + q**2 / z) * area)  # eq. 9
     return force, energy
@@ -133,46 +134,46 @@ def double_integrals(
 
 @dataclass(frozen=True)
 class Plotted:
-    """Force or energy, with its notation in the figures."""
+    """Force or energy, with its symbols and units in the figures."""
 
     symbol: str
     label: str
     unit: str
-    scale: float  # from SI to the unit
+    scale: float  # factor from SI to the unit
     row: int  # row in closed_forms and double_integrals
-    slope: int  # row of its derivative with respect to d in closed_forms
+    slope: int  # row of the derivative with respect to d in closed_forms
     exponent: int
     equation: int
-    power: str  # power law of the displacement at θ = 0
+    power: str  # power law in d at θ = 0
     prefactor: str
-    straight: float  # factor of the power law, divided by E
+    straight: float  # power-law factor divided by E
 
     def closed(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Return the closed form in the figure's unit; d in mm, θ in degrees."""
+        """Return the closed form in the figure's unit, with d in mm and θ in degrees."""
         return closed_forms(MODULUS, d * MILLI, np.radians(theta))[self.row] * self.scale
 
     def integral(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Return the paper's double integral in the figure's unit; d in mm, θ in degrees."""
+        """Return the double integral in the figure's unit, with d in mm and θ in degrees."""
         pair = double_integrals(TIP.radius, MODULUS, d * MILLI, np.radians(theta))
         return pair[self.row] * self.scale
 
     def local_exponent(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Return d ln(integral) / d ln(d); d in mm, θ in degrees."""
+        """Return d ln(integral) / d ln(d), with d in mm and θ in degrees."""
         above, below = (self.integral(d * (1.0 + step), theta) for step in (_STEP, -_STEP))
         return np.log(above / below) / math.log((1.0 + _STEP) / (1.0 - _STEP))
 
     def steepness(self, d: Numbers) -> FloatArray:
-        """Return the integral's slope over θ at 25° [unit/rad]; d in mm."""
+        """Return the derivative of the integral with respect to θ [unit/rad] at 25°; d in mm."""
         step = math.degrees(_STEP)
         above, below = (self.integral(d, np.float64(_STEEP_TILT + each)) for each in (step, -step))
         return (above - below) / (2.0 * _STEP)
 
     def at_zero_tilt(self, d: Numbers) -> FloatArray:
-        """Return the paper's continuous line: πEd² or πEd³/3, in the figure's unit; d in mm."""
+        """Return the paper's solid line, πEd² or πEd³/3, in the figure's unit, with d in mm."""
         return self.straight * MODULUS * np.asarray(d * MILLI) ** self.exponent * self.scale
 
     def largest(self, tilt: float) -> float:
-        """Return the value at 8 mm and this tilt [degrees], in the figure's unit."""
+        """Return the value at 8 mm and ``tilt`` [degrees], in the figure's unit."""
         cosine = np.cos(np.radians(tilt)) ** (self.exponent - 1)
         return float(self.at_zero_tilt(np.float64(8.0)) / cosine)
 
@@ -181,7 +182,7 @@ class Plotted:
         return f"{self.label} {self.symbol} [{self.unit}]"
 
     def columns(self, d: Numbers, theta: Numbers, at: str) -> dict[str, FloatArray]:
-        """Return columns of the closed form and of the double integral."""
+        """Return the columns for the closed form and the double integral."""
         return {
             f"{self.symbol} {at} [{self.unit}]": self.closed(d, theta),
             f"{self.symbol} by eq. {self.equation} {at} [{self.unit}]": self.integral(d, theta),
@@ -195,7 +196,7 @@ ENERGY = Plotted(
 
 
 def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Tabulate over θ from −25° to 25° at each displacement."""
+    """Tabulate the quantity versus θ from −25° to 25° at each displacement."""
     theta = np.arange(-50, 51) / 2.0
     columns = {"theta [deg]": theta}
     for d in DEPTHS:
@@ -207,10 +208,10 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Tabulate over d to 8 mm at each tilt: the ratio to θ = 0, and exponents for both laws.
+    """Tabulate the quantity versus d up to 8 mm at each tilt, with ratios to θ = 0 and exponents.
 
-    Ratio and exponents come from the double integral, so that they are independent of the closed
-    form; those of Table I's law come from its own integral.
+    Ratios and exponents are computed from the double integral, so that they do not depend on the
+    closed form. The exponents for Table I's law are computed from its own integral.
     """
     d = np.arange(81) / 10.0
     power = quantity.at_zero_tilt(d)
@@ -243,7 +244,7 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def _power(d: FloatArray, values: FloatArray) -> float:
-    """Return the exponent of the power law of d that fits ``values`` best from 1 to 8 mm."""
+    """Fit a power law in d to ``values`` from 1 to 8 mm and return its exponent."""
     return float(np.polyfit(np.log(d[_FITTED]), np.log(values[_FITTED]), 1)[0])
 
 

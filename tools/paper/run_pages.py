@@ -1,8 +1,8 @@
-"""Figs. 7, 8 and 10 in simulation, with the daemon's plant, sensor, estimator and table.
+"""Reproduce Figs. 7, 8 and 10 in simulation, with the daemon's plant, sensor, estimator and table.
 
-Each run returns true and estimated values, one row per frame. A figure shows the model, the
-estimates and their errors. The sensor is that of the paper: 44 × 44 cells on 58 mm, 40 ms per scan,
-with noise of 0.5 % of the modulus in each cell.
+Each run returns true and estimated values, one row per frame. The figures show the model, the
+estimates and their errors. The simulated sensor matches the paper's: 44 × 44 cells on 58 mm and
+40 ms per scan. The noise of each cell is 0.5 % of the modulus.
 """
 
 from __future__ import annotations
@@ -36,29 +36,29 @@ from softfinger.tools.style import GREY, KINDS, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ), and the result of `_estimates`
+Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ) and the result of `_estimates`
 
 RADIUS = 0.020  # m
 SCAN = 0.040  # s
-TILTED = math.radians(11.5)  # rotation of the finger about its root
-ROLLED = math.radians(20.7)  # rolling of the object back
-_SPEED = 0.002  # m/s, compression
+TILTED = math.radians(11.5)  # finger rotation about its root
+ROLLED = math.radians(20.7)  # rotation of the object as it rolls back
+_SPEED = 0.002  # m/s, compression speed
 _GAP = 0.5e-3  # m, gap before compression
 _D_MAX = 0.4 * RADIUS
-_ROOT_DEPTH = 0.004  # m, displacement at the end of the finger's rotation
+_ROOT_DEPTH = 0.004  # m, displacement after the finger rotation
 _MOTION_MARGIN = math.radians(3.0)
 _WIDTH = 0.040
 _HALF_SEPARATION = 0.050
-_ROLL_STEPS = 104  # frames during the rolling
+_ROLL_STEPS = 104  # frames during rolling
 _LATE_FRAME_COUNT = 2  # frames in transit
-_RELATIVE_D_MIN = 1.0  # mm of displacement above which relative errors are shown
-_ROLLED_AT = 4  # mm, displacement of the path that is shown through rotation and rolling
+_RELATIVE_D_MIN = 1.0  # mm, displacement above which relative errors are shown
+_ROLLED_AT = 4  # mm, displacement in the figure of the whole path
 _PATH = -12.5, 10.5
-_SCALES = {"d": 1e3, "theta": 1.0}  # scale of the errors shown
+_SCALES = {"d": 1e3, "theta": 1.0}  # factors for displayed errors
 
 
 def run_compression(tilt: float) -> dict[str, FloatArray]:
-    """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm."""
+    """Press an object face tilted by ``tilt`` [rad] onto the tip until d is 8 mm."""
     x = -_HALF_SEPARATION + (RADIUS + 0.5 * _WIDTH + _GAP) / math.cos(tilt)
     sections: Sections = {
         "servos": {"backend": "none"},
@@ -74,10 +74,10 @@ def run_compression(tilt: float) -> dict[str, FloatArray]:
 
 
 def run_rotation() -> dict[str, FloatArray]:
-    """Turn the finger by 11.5° about its root against a fixed object, starting at first touch.
+    """Rotate the finger by 11.5° about its root against a fixed object, starting at first touch.
 
-    The distance of the root is chosen so that d is 4 mm at the end. The servo moves the joint, and
-    d and θ are predicted from the joint angle between frames.
+    The root distance is chosen so that d reaches 4 mm. The servo moves the joint. Between frames, d
+    and θ are predicted from the joint angle.
     """
     length = _ROOT_DEPTH / math.sin(TILTED)
     sections: Sections = {
@@ -92,7 +92,7 @@ def run_rotation() -> dict[str, FloatArray]:
         loop = daemon.loop
         loop.advance(0.3)
         loop.command({"command": "arm"})
-        # Command a larger angle, because the servo yields under the force.
+        # The servo yields under load, so command a larger angle.
         loop.command({"command": "move", "left": TILTED + _MOTION_MARGIN})
         assert daemon.hand is not None
         rows: list[Row] = []
@@ -106,7 +106,7 @@ def run_rotation() -> dict[str, FloatArray]:
 
 
 def run_rolling(depth: int) -> dict[str, FloatArray]:
-    """Roll the object on the fixed finger from 11.5° to −9.2° at constant ``depth`` [mm]."""
+    """Roll the object over the fixed finger from 11.5° to −9.2° at constant ``depth`` [mm]."""
     sections: Sections = {
         "servos": {"backend": "none"},
         "hand": {"open_angle": (TILTED, 0.0)},
@@ -126,7 +126,7 @@ def _daemon(sections: Sections) -> Daemon:
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
-        # The sensor is calibrated, so excess pressure is attributed to a stiffer tip.
+        # The sensor is calibrated, so a stiffer tip explains the excess pressure.
         "tactile": {
             "rate": 1.0 / SCAN,
             "latency": SCAN,
@@ -146,12 +146,12 @@ def _daemon(sections: Sections) -> Daemon:
 def _frames(
     daemon: Daemon, count: int, place: Callable[[SimulatedHand, float], None] | None = None
 ) -> Iterator[Row]:
-    """Yield the truth at each frame's sample time and the estimate from that frame alone."""
+    """Yield each frame's true state at its sample time and the estimate from this frame alone."""
     hand, loop = daemon.hand, daemon.loop
     assert hand is not None
     if place is not None:
         place(hand, 0.0)
-        loop.advance(3.0 * SCAN)  # wait until older frames have arrived
+        loop.advance(3.0 * SCAN)  # Let older frames arrive first.
     last = loop.state.contacts[0].seq
     for k in range(count + _LATE_FRAME_COUNT):
         if place is not None:
@@ -175,7 +175,7 @@ def _estimates(contact: Contact) -> tuple[float, ...]:
 def _columns(
     rows: Iterable[Row], daemon: Daemon, suffix: str = "", sign: float = 1.0
 ) -> dict[str, FloatArray]:
-    """Return truth and estimates, one row per frame; ``sign`` gives the paper's sign of θ."""
+    """Return true and estimated values per frame; ``sign`` converts θ to the paper's sign."""
     truth, estimates = (np.array(each) for each in zip(*rows, strict=True))
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
     contact = daemon.tables[0](d, theta)
@@ -190,16 +190,16 @@ def _columns(
 
 
 def roll(hand: SimulatedHand, d: float, angle: float, rolling: float = 1.0) -> None:
-    """Place the held object as if it had rolled to ``angle`` [rad] at constant ``d`` [m].
+    """Place the held object where rolling to ``angle`` [rad] at constant ``d`` [m] would move it.
 
-    ``rolling`` is the fraction of the face's motion that the tip follows by rolling.
+    ``rolling`` is the fraction of the face motion that the tip follows by rolling.
     """
     q = float(hand.q[0])
     parameters = hand.plant.parameters
     length = parameters.length
     tip = -_HALF_SEPARATION + length * math.sin(q), length * math.cos(q)
     out = RADIUS + 0.5 * _WIDTH - d
-    along = rolling * (RADIUS - d) * angle  # position of the tip on the face
+    along = rolling * (RADIUS - d) * angle  # tip position on the face
     parameters.script_x = tip[0] + out * math.cos(angle) + along * math.sin(angle)
     hand.object_pose[:] = (
         parameters.script_x,
@@ -215,7 +215,7 @@ def _rms(off: FloatArray) -> float:
 
 @cache
 def compression() -> tuple[Sheet, ...]:
-    """Return one sheet per angle, and one with the errors beyond 1 mm."""
+    """Return one sheet per angle and a sheet with the errors for displacements above 1 mm."""
     sheets, rows = [], []
     for tilt in TILTS:
         run = Sheet(f"fig7_run_{tilt}deg", run_compression(float(np.radians(tilt))))
@@ -235,7 +235,7 @@ def compression() -> tuple[Sheet, ...]:
 
 
 def _deep_errors(run: Sheet, symbol: str) -> FloatArray:
-    """Return the errors beyond 1 mm: d [µm], θ [degrees], force or energy [%]."""
+    """Return the errors for d > 1 mm: d in µm, θ in degrees, force or energy in %."""
     deep = run["d"] > _RELATIVE_D_MIN
     truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
     relative = symbol in ("F", "U")
@@ -266,7 +266,7 @@ def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
 
 @cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return the rotation, the rolling at each displacement, and the minima of force and energy."""
+    """Return sheets for the rotation, rolling at each displacement, and force and energy minima."""
     columns: dict[str, FloatArray] = {}
     for depth in DEPTHS:
         columns |= run_rolling(depth)
@@ -290,10 +290,10 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
 
 
 def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
-    """Return the minimum of a parabola in θ through all values, and its standard error.
+    """Fit a parabola in θ and return the position of its minimum with the standard error.
 
-    Without noise both curves are parabolas within 0.1 %. The standard error follows from the
-    residuals of the fit; the scatter of runs with ten seeds was the same.
+    Without noise, both curves are parabolas to within 0.1 %. The standard error is computed from
+    the fit residuals; it matches the scatter of runs with ten seeds.
     """
     (a, b, _), covariance = np.polyfit(theta, values, 2, cov=True)
     slope = np.array([0.5 * b / a**2, -0.5 / a, 0.0])
@@ -301,7 +301,7 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
 
 
 def _along(symbol: str, axes: Axes, rotation: Sheet, rolling: Sheet, _: Sheet) -> None:
-    """Draw the path: the rotation, then the rolling at 4 mm."""
+    """Draw the path: rotation, then rolling at 4 mm."""
     for piece, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),

@@ -1,7 +1,7 @@
-"""Minimum slightly before 0° (Sec. IV-B): rolling during which a small share shears the tip.
+"""Explain the minimum slightly before 0° (Sec. IV-B): part of the rolling motion shears the tip.
 
-The finger has been tilted to −11.5°, then the object rolls to 9.2° at a constant displacement d. If
-a share s of the face's motion is not followed by rolling, it shears the tip by
+The finger is tilted to −11.5°, then the object rolls to 9.2° at constant displacement d. A fraction
+s of the face motion is not followed by rolling and shears the tip by
 
     ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
 
@@ -9,13 +9,13 @@ For the springs of the parallel distributed model, with equal lateral and axial 
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      F = πE [d²/cos θ + 2 d ζ sin θ]
 
-F is the sum of the spring forces on the base, which a sensor under the tip measures. The term with
-ζ has the sign of θ, so the minima of F and U lie before the upright position. ∂U/∂d, the force on
-the face at fixed tilt and shear, has its minimum in between.
+F is the sum of the spring forces on the base. A sensor under the tip measures this sum. The ζ term
+has the same sign as θ, so the minima of F and U are before the upright position. ∂U/∂d is the force
+on the face at fixed tilt and shear. Its minimum is between those of F and U.
 
 *Plant* is the simulated tip, which integrates the shear. The force on its base is N cos θ + T sin
-θ. It exceeds F by πE ζ² cos θ, because the plant's energy shears the springs at the contact's rim
-as soon as they touch.
+θ. This exceeds F by πE ζ² cos θ, because the plant's springs shear as soon as they touch at the
+contact rim.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ from softfinger.tools.style import GREY, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHARES = (0.0, 0.02, 0.05, 0.1)  # shares that are drawn
+SHARES = (0.0, 0.02, 0.05, 0.1)  # values drawn
 _EACH = tuple(k / 100.0 for k in range(11))
-DEPTH, SHARE = 6, 0.05  # mm, 1; drawn and simulated with the plant
+DEPTH, SHARE = 6, 0.05  # mm, 1; also simulated with the plant
 _STEPS = 208
 _FORCE, _SLOPE, _ENERGY = "F on the base", "dU/dd", "U"
 
 
 def rolled(d: float, share: float, theta: FloatArray) -> dict[str, FloatArray]:
-    """Return F, ∂U/∂d [N] and U [mJ] at tilts ``theta`` [rad] and constant ``d`` [m]."""
+    """Return F [N], ∂U/∂d [N] and U [mJ] at tilts ``theta`` [rad] and constant ``d`` [m]."""
     shear = share * (TIP.radius - d) * (theta + TILTED)
     sine, cosine, tangent = np.sin(theta), np.cos(theta), np.tan(theta)
     stiff = math.pi * MODULUS
@@ -65,7 +65,7 @@ def rolled(d: float, share: float, theta: FloatArray) -> dict[str, FloatArray]:
 
 
 def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return θ [rad], N cos θ + T sin θ [N] and U [mJ] of the simulated tip at ``d`` [m]."""
+    """Simulate the tip at ``d`` [m]; return θ [rad], N cos θ + T sin θ [N] and U [mJ]."""
     settings = Settings.model_validate(
         {
             "scene": {"fingers": ("left",)},
@@ -94,7 +94,7 @@ def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def angle_of_minimum(theta: FloatArray, values: FloatArray) -> float:
-    """Return the angle of the minimum [degrees], from a parabola through three points."""
+    """Return the angle [degrees] of the minimum of a parabola through three points."""
     k = int(np.clip(np.argmin(values), 1, len(values) - 2))
     near = slice(k - 1, k + 2)
     a, b, _ = np.polyfit(theta[near] - theta[k], values[near], 2)
@@ -103,7 +103,7 @@ def angle_of_minimum(theta: FloatArray, values: FloatArray) -> float:
 
 @cache
 def sheared_rolling() -> tuple[Sheet, ...]:
-    """Return the curves at one depth, those of the plant, and the minima at all depths."""
+    """Return model and plant curves at one depth, and the minima at all depths."""
     theta = np.linspace(-TILTED, ROLLED - TILTED, _STEPS + 1)
     columns = {"theta [deg]": np.degrees(theta)}
     rows = []

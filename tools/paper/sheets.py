@@ -1,4 +1,4 @@
-"""Represent figures as data: sheets of numbers, each a CSV file, and the panels drawn from them."""
+"""Represent figures as data: one sheet of numbers per CSV file, and the panels drawn from it."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ DOT = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
 
 @dataclass(frozen=True)
 class Sheet:
-    """Columns of equal length with keys ``name [unit]``; ``name`` is the name of the file.
+    """Columns of equal length, with keys of the form ``name [unit]``; ``name`` names the file.
 
-    Values are texts or numbers; NaN is written as an empty cell. Dimensionless numbers have the
-    unit 1, and texts have no unit.
+    Values are strings or numbers. NaN is written as an empty cell. Dimensionless numbers have the
+    unit 1, and strings have no unit.
     """
 
     name: str
     columns: Columns
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return the values of the column ``name``; raise KeyError if it does not exist."""
+        """Return the values in column ``name``; raise KeyError if the column does not exist."""
         heads = {head.partition(" [")[0]: head for head in self.columns}
         return np.asarray(self.columns[heads[name]])
 
@@ -57,7 +57,7 @@ class Sheet:
 
 
 def summary(name: str, rows: Sequence[Mapping[str, Any]]) -> Sheet:
-    """Return a sheet from rows with the same keys."""
+    """Build a sheet from rows with identical keys."""
     return Sheet(name, {head: [row[head] for row in rows] for head in rows[0]})
 
 
@@ -69,7 +69,7 @@ def _cell(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Erratum:
-    """Erratum of the paper: its place, the printed statement and the correct one."""
+    """Erratum in the paper: its location, the printed statement and the corrected statement."""
 
     place: str
     printed: str
@@ -78,15 +78,15 @@ class Erratum:
 
 @dataclass(frozen=True)
 class Panel:
-    """Axes of a figure: the function that draws the sheets, labels, limits and legend."""
+    """Axes in a figure: drawing function, labels, limits and legend."""
 
-    content: Callable[..., None]  # called with axes and sheets
+    content: Callable[..., None]  # called with the axes and all sheets
     xlabel: str
     ylabel: str
     title: str = ""
     x: Ends | None = None
     y: Ends | None = None
-    legend: str | dict[str, Any] = ""  # location, or keyword arguments for matplotlib
+    legend: str | dict[str, Any] = ""  # location or matplotlib keyword arguments
 
     def draw(self, axes: Axes, sheets: Sequence[Sheet]) -> None:
         self.content(axes, *sheets)
@@ -98,20 +98,20 @@ class Panel:
 
 @dataclass(frozen=True)
 class FigurePage:
-    """Figure of the paper: its data, its panels, and the errata of the paper's version."""
+    """Figure from the paper: data, panels and errata."""
 
     title: str
-    size: tuple[float, float]  # [inch]
+    size: tuple[float, float]  # inch
     sheets: Callable[[], tuple[Sheet, ...]]
     panels: tuple[Panel, ...]
     rows: int = 1
-    # Keyword arguments for matplotlib's subplots.
+    # Keyword arguments for `matplotlib.figure.Figure.subplots`.
     layout: dict[str, Any] = field(default_factory=dict)
     errata: tuple[Erratum, ...] = ()
     notes: tuple[str, ...] = ()
 
     def draw(self, figure: Figure, sheets: Sequence[Sheet]) -> None:
-        """Draw title, panels, errata and notes."""
+        """Draw the title, panels, errata and notes."""
         figure.suptitle(self.title, fontsize=10)
         columns = len(self.panels) // self.rows
         every = figure.subplots(self.rows, columns, squeeze=False, **self.layout).ravel()
@@ -122,7 +122,7 @@ class FigurePage:
 
 
 def errata_sheet(pages: dict[str, FigurePage]) -> Sheet:
-    """Return the errata of these figures, one per row."""
+    """Return all errata in ``pages``, one per row."""
     rows = [
         {"figure": name, "place in the paper": e.place, "printed": e.printed, "holds": e.holds}
         for name, page in pages.items()

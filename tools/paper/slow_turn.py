@@ -1,15 +1,16 @@
-"""Quasi-static manipulation (Sec. V): a slow turn, from the equations and on the simulated hand.
+"""Compute quasi-static manipulation (Sec. V) from equations and compare with the simulated hand.
 
-Both tips are the paper's springs and stick to the object; there is no other friction. With the
-shear ζ of a tip
+Both tips consist of the paper's springs and stick to the object. There is no other friction. For a
+tip with shear ζ
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
-The shear rate is the difference between the tip's rolling and its motion along the face, minus the
-component along a tilted face as d increases (s, d, θ of `kinematics.hand.geometry`, with θ of the
-right tip mirrored). The object is in balance if Σ δU = 0 for each of its motions. With M = ∂U/∂θ,
-T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0. Every pose of a
-slow turn fulfils this condition. `turned` solves it step by step, without time, mass or damping.
+The shear rate is the rolling speed minus the speed along the face and minus the component along a
+tilted face due to increasing d. s, d and θ are defined in `kinematics.hand.geometry`; the right
+tip's θ is mirrored. The object is at equilibrium if Σ δU = 0 for each possible motion. With M =
+∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0. Every
+pose in a slow turn satisfies this condition. `turned` solves it step by step, without time, mass or
+damping.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from softfinger.tools.style import INK, KINDS, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FORCE, WIDTH = 10.0, 0.040  # N on each tip's base, m
-REACH = math.radians(8.0)  # object angle reached to both sides
+FORCE, WIDTH = 10.0, 0.040  # N per tip base; m
+REACH = math.radians(8.0)  # maximum object angle per side
 ANTISYMMETRIC_ANGLES = (-4, -2, 0, 2, 4)  # degrees
-_SWING_TIME = 4.0  # s from 0 to REACH
+_SWING_TIME = 4.0  # s, from 0 to REACH
 _SIDE_ANGLES = np.radians(np.linspace(-2.5, 2.5, 41))
 _STEPS = 64
 _FRICTION = 0.6
@@ -44,7 +45,7 @@ _FREE = {"table_friction": 0.0, "joint_friction": 0.0}
 
 
 class Held(NamedTuple):
-    """Pose of hand and object, and the contact of each tip."""
+    """Pose of hand and object, and both tip contacts."""
 
     q: FloatArray
     pose: FloatArray
@@ -54,7 +55,7 @@ class Held(NamedTuple):
     shear: FloatArray
 
     def gradient(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return N [N], M [N·m] and T [N] of both tips."""
+        """Return N [N], M [N·m] and T [N] for both tips."""
         d, shear = self.d, self.shear
         tangent, inverse = np.tan(self.theta), 1.0 / np.cos(self.theta) ** 2
         stiff = math.pi * MODULUS
@@ -67,13 +68,13 @@ class Held(NamedTuple):
         )
 
     def energy(self) -> float:
-        """Return U of both tips [J]."""
+        """Return the sum of U over both tips [J]."""
         d, shear, tangent = self.d, self.shear, np.tan(self.theta)
         parts = d**3 / (3.0 * np.cos(self.theta) ** 2) + d**2 * shear * tangent + d * shear**2
         return float(math.pi * MODULUS * parts.sum())
 
     def torques(self) -> FloatArray:
-        """Return the torque of each joint [N·m], positive closing."""
+        """Return the joint torques [N·m], positive in the closing direction."""
         lengths = _HAND.finger_length, _HAND.finger_offset
         moves = np.array(
             [tip_velocity(q, k, *lengths) for q, k in zip(self.q, _SIDES, strict=True)]
@@ -86,7 +87,7 @@ class Held(NamedTuple):
         return np.asarray(normal * deeper - tangential * along + rolls)
 
     def unbalanced(self) -> FloatArray:
-        """Return the residual forces along x and y [N], moment over W [N] and grip force [N]."""
+        """Return residuals [N]: force along x and y, moment divided by W, and grip force."""
         normal, moment, tangential = self.gradient()
         angle = self.pose[2]
         across, along = [math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]
@@ -104,7 +105,7 @@ class Held(NamedTuple):
 
 
 def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
-    """Return a pose to which the tips have rolled from ``last``; None means unsheared tips."""
+    """Return the pose after the tips have rolled from ``last``; None means unsheared tips."""
     contacts = _HAND.contacts(q, pose, WIDTH)
     theta = _SIDES * contacts.theta
     shear = np.zeros(2)
@@ -116,7 +117,7 @@ def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
 
 
 def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
-    """Return the root near ``start`` by Newton's method; raise RuntimeError if it is not found."""
+    """Find the root near ``start`` by Newton's method; raise RuntimeError if this fails."""
     x = start.copy()
     for _ in range(30):
         value = residual(x)
@@ -130,7 +131,7 @@ def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
 
 @cache
 def gripped() -> Held:
-    """Return the balanced upright grip with unsheared tips."""
+    """Return the upright equilibrium grip with unsheared tips."""
 
     def met(x: FloatArray) -> Held:
         q = np.full(2, x[0])
@@ -141,7 +142,7 @@ def gripped() -> Held:
 
 
 def turned(angles: FloatArray, start: Held) -> list[Held]:
-    """Return the quasi-static path from ``start`` along which the object takes ``angles`` [rad]."""
+    """Return the quasi-static path from ``start`` through the object angles ``angles`` [rad]."""
     path = [start]
     for angle in angles:
 
@@ -156,16 +157,17 @@ def turned(angles: FloatArray, start: Held) -> list[Held]:
 
 
 def potential(there: Held, start: Held) -> float:
-    """Return V = ΣU − τ (q1 + q2) [J], 0 at ``start``, where both joint torques are τ."""
+    """Return V = ΣU − τ (q1 + q2) [J] relative to ``start``, whose mean joint torque is τ."""
     torque = float(start.torques().mean())
     return there.energy() - start.energy() - torque * float((there.q - start.q).sum())
 
 
 def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
-    """Return V at the object angle of ``floor`` plus each of ``aside`` [rad], at the same lean.
+    """Return V at the object angle of ``floor`` plus each offset in ``aside`` [rad].
 
-    V is minimised over all other coordinates. The tips have rolled there from ``start`` in one
-    step. The value is NaN where a tip would slip.
+    The antisymmetric joint angle is that of ``floor``, and V is minimised over all other
+    coordinates. The tips roll to each pose from ``start`` in one step. V is NaN where a tip would
+    slip.
     """
     antisymmetric = 0.5 * float(floor.q[0] - floor.q[1])
     torque = float(start.torques().mean())
@@ -191,9 +193,10 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
 
 
 def swing() -> list[dict[str, float]]:
-    """Turn the simulated hand's object there and back; return one row every 20 ms.
+    """Rotate the object in the simulated hand back and forth; return one row every 20 ms.
 
-    The held force deviates by some percent, so ΣU and T are scaled to `FORCE`, with F^(3/2) and F.
+    The holding force deviates by a few percent, so ΣU and T are scaled to `FORCE`: ΣU is
+    proportional to F^(3/2), and T to F.
     """
     sections: dict[str, dict[str, Any]] = {
         "material": {"law": "constant", "modulus": MODULUS},
@@ -229,13 +232,13 @@ def swing() -> list[dict[str, float]]:
 
 
 def _triangle(turns: float) -> float:
-    """Return a triangle wave: 0, 1, 0, −1, 0 at 0, 1, 2, 3, 4."""
+    """Return a triangle wave with the values 0, 1, 0, −1, 0 at 0, 1, 2, 3, 4."""
     return 1.0 - abs((turns + 1.0) % 4.0 - 2.0)
 
 
 @cache
 def slow_turn() -> tuple[Sheet, ...]:
-    """Return the path by the equations, that of the plant, and V at some leans of the fingers."""
+    """Return the path from the equations, the plant's path, and V at antisymmetric joint angles."""
     there = np.linspace(0.0, REACH, _STEPS + 1)[1:]
     back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _STEPS + 1)]
     start = gripped()

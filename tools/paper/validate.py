@@ -1,8 +1,8 @@
-"""Run ``softfinger validate``: compare this model with published figures.
+"""Run ``softfinger validate``: compare the model with published values.
 
-Each row computes a quantity and names the source of the published value; the verdict is agree,
-disagree or unknown. A quantity that is not modelled here, or that needs measurements on hardware,
-is unknown, with the reason.
+Each row shows a computed quantity, the published value with its source, and a verdict: agree,
+disagree or unknown. Quantities that are not modelled, or that require measurements on hardware, are
+unknown; the reason is given.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-RADIUS, MODULUS, POISSON = 0.020, 0.304e6, 0.49  # m, Pa, 1: the paper's tip
+RADIUS, MODULUS, POISSON = 0.020, 0.304e6, 0.49  # m, Pa, 1; the paper's tip
 DEPTHS = np.linspace(0.001, 0.007, 25)  # m
 TILTS = np.radians(np.linspace(0.0, 20.0, 41))
 FIGURES = {"agree": "✓", "disagree": "✗", "unknown": "?"}
 _TRIALS = 5
 _FRAMES = 64
-_PRESSED = 0.005, 0.2  # m, rad: contact in the sensors' frames
+_PRESSED = 0.005, 0.2  # m, rad; contact in the sensor frames
 
 
 class PublishedValue(NamedTuple):
-    """Row with a published value and the value of this project."""
+    """Row that compares a published value with the model's value."""
 
     quantity: str
     published: str
     source: str
     ours: str
-    verdict: str  # key of FIGURES
+    verdict: str  # key in FIGURES
     why: str = ""
 
 
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the comparisons as a table."""
+    """Print all comparisons as a table."""
     table = plain_table()
     for head in ("", "quantity", "published", "here", "source, and what stands between"):
         table.add_column(head, overflow="fold")
@@ -67,14 +67,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def comparisons() -> Iterator[PublishedValue]:
-    """Yield all rows; each is computed when it is requested."""
+    """Yield all rows, computing each on demand."""
     for rows in (_tips, _energy, _relaxation, _sensors, _hands):
         yield from rows()
 
 
 def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
             unit: str = "", why: str = "") -> PublishedValue:  # fmt: skip
-    """Return a row that agrees if ``ours`` is within [low, high], to the digits of ``form``."""
+    """Return a row that agrees if ``ours``, rounded to ``form``, is within [low, high]."""
     shown = [f"{each:{form}}" for each in (low, high, ours)]
     inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
     verdict = "agree" if inside else "disagree"
@@ -83,7 +83,7 @@ def between(quantity: str, low: float, high: float, source: str, ours: float, fo
 
 
 def exponent(d: FloatArray, force: FloatArray) -> float:
-    """Return ζ from a least-squares fit of ln F = ln C + ζ ln d."""
+    """Return ζ from a least-squares fit to ln F = ln C + ζ ln d."""
     return float(np.polyfit(np.log(d), np.log(force), 1)[0])
 
 
@@ -217,7 +217,7 @@ def _sensors() -> Iterator[PublishedValue]:
 
 
 def _errors(settings: Settings) -> tuple[float, float, float]:
-    """Return RMS errors of d [m], tilt [rad] and force [N] for settled frames of a sensor."""
+    """Return the RMS errors of d [m], tilt [rad] and force [N] for a sensor's settled frames."""
     from softfinger.daemon.profile.factory import make_material
     from softfinger.tools.benchmarks.estimator import settled
 
