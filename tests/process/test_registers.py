@@ -116,6 +116,16 @@ def test_factory_settings_of_every_model_pass_the_checks():
         assert wrong <= {"return delay", "operating mode"}, name
 
 
+def test_stall_torques_fit_current_speed_and_gears():
+    """A torque constant is inversely proportional to the speed of servos with one motor."""
+    for name, model in MODELS.items():
+        torque, current, voltage = model.stall
+        assert 0.5 < torque * model.no_load_speed / (voltage * current) < 1.2, name
+    found, same_motor = MODELS["XW430-T200"], MODELS["XH430-W210"]
+    constant = same_motor.torque_constant * same_motor.no_load_speed / found.no_load_speed
+    assert found.torque_constant == pytest.approx(constant, rel=0.05)
+
+
 def test_registers_are_saved_and_restored(bus, tmp_path):
     path, settings = tmp_path / "servos.json", backend_settings(bus.path)
     put(bus, reg.PWM_LIMIT, 300)
