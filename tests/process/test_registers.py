@@ -177,6 +177,34 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
     assert [each.status for each in told(bus)] == ["pass"]
 
 
+def test_an_error_that_a_wrong_limit_causes_is_corrected_with_the_limit(bus):
+    put(bus, reg.MIN_VOLTAGE_LIMIT, 140)
+    until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
+    supply = [each for each in told(bus) if each.text.startswith("supply is ")]
+    assert [each.fix for each in supply] == [FIX]
+    fixed = [each.text for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    assert fixed == [
+        "min voltage limit 140 → 95",
+        "rebooted, since it had a hardware error: input voltage out of limits",
+    ]
+    assert [each.status for each in told(bus)] == ["pass"]
+
+
+def test_an_error_that_a_reboot_does_not_clear_is_reported(bus):
+    bus.fault("undervoltage=1")
+    until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
+    (left,) = [each for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    assert left.text == "hardware error after a reboot: input voltage out of limits"
+    assert left.fix == "remove the cause"
+
+
+def test_no_reboot_is_advised_for_a_reversed_drive_mode(bus):
+    put(bus, reg.DRIVE_MODE, 1)
+    fixes = [each.fix for each in told(bus) if each.status == "FAIL"]
+    assert fixes == ["`softfinger calibrate joints`, since its drive mode is reversed"]
+    assert provision(backend_settings(bus.path)) == []
+
+
 def test_a_servo_with_protocol_1_is_recognised(bus):
     put(bus, reg.PROTOCOL_TYPE, 1)
     text = "answers Protocol 1.0, expected 2.0"
