@@ -13,6 +13,14 @@ def port_group_remedy(path: str) -> str:
     return "plug the adapter in" if path.startswith("/dev/") else "start `softfinger emulate`"
 
 
+def serial_group() -> str:
+    """Return the group of serial ports on this system: ``dialout``, or ``uucp`` without it."""
+    import grp  # missing on some systems that run a client
+
+    groups = {each.gr_name for each in grp.getgrall()}
+    return "uucp" if "uucp" in groups and "dialout" not in groups else "dialout"
+
+
 def grant(path: str) -> str:
     """Return the command that gives this user access, usually by joining the port's group."""
     import grp  # not available on some client systems

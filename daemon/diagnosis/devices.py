@@ -68,9 +68,13 @@ def check_servos(settings: Settings) -> list[Finding]:
             _wait_for(line, settings)
             found = examine(line, settings, model)
             exchange = _try_exchange(line, settings, model, found)
-        results = [line for each in found for line in _judge(each, settings, model)]
+            silent = [each.id for each in found if not each.replies and not each.errors]
+            late = [servo_id for servo_id in silent if line.ping(servo_id) is not None]
+        results = [
+            line for each in found for line in _judge(each, settings, model, each.id in late)
+        ]
         results += exchange
-        if not all(each.replies or each.errors for each in found):
+        if len(late) < len(silent):
             results += _search(settings, model) or _blame_power(found)
     except ServoError as error:
         return [Finding("FAIL", "servos", str(error))]
@@ -119,7 +123,8 @@ def _try_exchange(
     return [*results, judge_exchanges(times, settings, what, emulated(settings))]
 
 
-def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Finding]:
+def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -> list[Finding]:
+    """Return the findings of one servo; ``late`` if it answered only after the others' checks."""
     name = servo.name
     if not servo.replies:
         if servo.errors:
@@ -129,6 +134,8 @@ def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Findi
             f"no answer at {settings.servos.baud} baud within servos.open_timeout = {waited:g} s"
         )
         fix = "check its power and cable, then see what was found below"
+        if late:
+            fix = "it answers now: set a longer servos.open_timeout"
         return [Finding("FAIL", name, problem, fix)]
     results = [*servo.errors, *servo.notices]
     if servo.table:

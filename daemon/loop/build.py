@@ -115,7 +115,8 @@ class Daemon:
                 return servos.connect()
             except ServosSilent as silent:
                 if time.monotonic() - began >= patience:
-                    raise
+                    text = f"{silent}; waited servos.open_timeout = {patience:g} s"
+                    raise ServosSilent(text) from None
                 if on_event is not None and not was_reported:
                     text = f"{silent}; waiting up to servos.open_timeout = {patience:g} s"
                     on_event("warning", "servos", text)

@@ -19,6 +19,7 @@ import threading
 from collections.abc import Callable, Mapping
 from functools import partial
 
+from softfinger.daemon.port_access import serial_group
 from softfinger.daemon.profile.settings import Settings
 
 _SWITCH_INTERVAL = 2e-4  # s
@@ -29,7 +30,7 @@ _LATENCY_DEVICE = "/dev/cpu_dma_latency"
 # Commands that grant the requested permissions to a user.
 _LIMITS_FILE = "/etc/security/limits.d/softfinger.conf"
 _UDEV_RULE_FILE = "/etc/udev/rules.d/99-softfinger.rules"
-_LATENCY_UDEV_RULE = 'KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"'
+_LATENCY_UDEV_RULE = f'KERNEL=="cpu_dma_latency", GROUP="{serial_group()}", MODE="0660"'
 
 GRANT_PRIORITY = f'echo "$USER - rtprio 80" | sudo tee -a {_LIMITS_FILE}, then log in again'
 GRANT_MEMORY_LOCK = (

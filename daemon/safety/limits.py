@@ -29,6 +29,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
+from softfinger.kinematics.hand.geometry import tip_position
 
 _NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention noise
 _WARNING_FRACTION = 0.9  # fraction of a fault limit at which a warning starts
@@ -403,6 +404,34 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
         f"{FINGERS[i]} joint stands at {math.degrees(reading.q[i]):.0f}° in the approach, and its "
         "tip feels nothing: something is in its way, or it opens instead of closing: is "
         "servos.direction right?"
+    )
+
+
+_OVERLAP_RATIO = 0.5  # of the tip radius; more than zero errors and frame latency cause
+
+
+@Limit("joint.opens", "tips that overlap by their joint angles in an approach, and one of them has "
+    "no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
+def _joint_opens(view: View, state: State, _: float) -> str:
+    """Report fingers that open instead of closing.
+
+    With the wrong direction, goal, angle and current change their signs together, so the servos'
+    readings are those of a finger that closes. The first difference is the contact that is missing
+    when the tips should meet.
+    """
+    felt = [contact.contact for contact in state.contacts]
+    if state.mode != Mode.GRASPING or len(view.sensors) < len(FINGERS) or all(felt):
+        return ""
+    hand, radius, q = view.settings.hand, view.settings.tip.radius, state.reading.q
+    lengths = (0.5 * hand.pivot_separation, hand.finger_length, hand.finger_offset)
+    (x1, y1), (x2, y2) = tip_position(q[0], 1.0, *lengths), tip_position(q[1], -1.0, *lengths)
+    overlap = 2.0 * radius - math.hypot(x2 - x1, y2 - y1)
+    if overlap < _OVERLAP_RATIO * radius:
+        return ""
+    tips = f"the {FINGERS[felt.index(False)]} tip has no" if any(felt) else "neither tip has"
+    return (
+        f"the joint angles let the tips overlap by {1e3 * overlap:.0f} mm, but {tips} contact: "
+        "if a finger opens instead of closing, correct servos.direction; otherwise servos.zero"
     )
 
 

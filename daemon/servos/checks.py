@@ -82,8 +82,7 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
         table = Registers(line.read(servo_id, 0, CHECKED) or b"")
         if table:
             scale = JointScale.of(settings.servos, finger, model)
-            counts = table.long(reg.PRESENT_POSITION)
-            misplaced = check_angle(name, scale, counts, settings.hand, finger)
+            misplaced = check_position(name, scale, table, settings.hand, finger)
             errors = check_servo(name, model, table, settings, finger)
             notices = notice_servo(name, model, table, settings, finger)
         else:
@@ -142,7 +141,9 @@ def check_servo(
         for at in (reg.PRESENT_INPUT_VOLTAGE, reg.MIN_VOLTAGE_LIMIT, reg.MAX_VOLTAGE_LIMIT)
     )
     if not low <= volts <= high:
-        wrong(f"supply is {volts:.1f} V, not in {low:.1f} … {high:.1f} V", "check the supply")
+        fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
+        fix = FIX if fits else "check the supply"  # its own limits are too narrow
+        wrong(f"supply is {volts:.1f} V, not in {low:.1f} … {high:.1f} V", fix)
     firmware = table[reg.FIRMWARE_VERSION]
     if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:
         wrong(
@@ -205,7 +206,7 @@ def notice_servo(
         ),
         (
             table[reg.DRIVE_MODE] & DRIVE_REVERSE,
-            "its drive mode is reversed; servos.direction comes on top of that",
+            "its drive mode is reversed; servos.direction applies in addition",
         ),
         (table[reg.TORQUE_ENABLE], "torque is on already; it stays so until disarm or arm"),
         (
@@ -267,6 +268,22 @@ def check_angle(
         return Finding("FAIL", name, problem, LOST_TURN_FIX)
     cure = "turn it there by hand, or `softfinger calibrate joints`, which finds its zero"
     return Finding("FAIL", name, problem, cure)
+
+
+def check_position(
+    name: str, scale: JointScale, table: Registers, hand: GeometrySettings, finger: int
+) -> Finding | None:
+    """Check the angle of a servo from its registers.
+
+    A servo with reversed drive mode counts from 0 down, which no reboot changes.
+    """
+    counts = table.long(reg.PRESENT_POSITION)
+    found = check_angle(name, scale, counts, hand, finger)
+    reversed_ = table[reg.DRIVE_MODE] & DRIVE_REVERSE and -reg.COUNTS_PER_TURN < counts <= 0
+    if found is not None and found.fix == LOST_TURN_FIX and reversed_:
+        fix = "`softfinger calibrate joints`, since its drive mode is reversed"
+        return Finding(found.status, name, found.text.partition(": ")[0], fix)
+    return found
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:

@@ -229,8 +229,9 @@ _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MO
 # (specifications and both areas of the control table). Where model numbers differ (XD430), the
 # source is control_table/dynamixel.model in dynamixel-sdk. The velocity limits for XH430-V,
 # XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's values
-# apply to firmware before 42. The XW430-T200 is omitted because its page lists the stall torque of
-# another model.
+# apply to firmware before 42. The page of the XW430-T200 lists the stall torque of the XW540-T140,
+# 6.9 N·m at 4.9 A. The values used are scaled by the gear ratio, 200 : 213, from those of the
+# XH430-W210. The same rule gives 3.2 N·m for the XW430-T333, whose page lists 3.1 N·m at 1.3 A.
 _430 = 82, (28.5, 46.5, 34.0)  # g, mm
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)
@@ -265,6 +266,8 @@ _MODELS: tuple[tuple[Any, ...], ...] = (
      (1920, 100), (0, 0, 800), 52, 5, 45, (6.4, 2.4, 24.0), *_540),
     ("XH540-V270", 1140, 48, 7, 2.69e-3, 2047, 148, 1023, 80, 110, 300,
      (1920, 100), (0, 0, 800), 52, 5, 45, (9.2, 2.4, 24.0), *_540),
+    ("XW430-T200", 1280, 48, 7, 2.69e-3, 2047, 235, 1023, 80, 95, 160,
+     (1920, 100), (0, 0, 900), 52, 13, 45, (2.3, 1.3, 12.0), *_430),
     ("XW430-T333", 1270, 48, 7, 2.69e-3, 2047, 139, 1023, 80, 95, 160,
      (1920, 100), (0, 0, 900), 52, 13, 45, (3.1, 1.3, 12.0), *_430),
     ("XW540-T140", 1180, 48, 7, 2.69e-3, 2047, 304, 1023, 80, 95, 160,

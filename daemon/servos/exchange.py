@@ -156,11 +156,14 @@ def judge_exchanges(
             f"{_ms(allowed)} (servos.reply_timeout)"
         )
         return Finding("FAIL", "exchange", text, _remedy(decisive, settings))
-    status: Status = "pass"
     if times.failed > _FAILED_FRACTION_WARN:
-        status = "FAIL" if times.failed > _FAILED_FRACTION_FAIL else "warn"
-    fix = "" if status == "pass" else "check the cable and its plugs, and lower servos.baud"
-    return Finding(status, "exchange", text, fix)
+        status: Status = "FAIL" if times.failed > _FAILED_FRACTION_FAIL else "warn"
+        fix = "check the cable and its plugs, and lower servos.baud"
+        return Finding(status, "exchange", text, fix)
+    if decisive * rate > _REPLY_FRACTION_MAX:
+        text += f"; a tick takes {_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
+        return Finding("warn", "exchange", text, _remedy(decisive, settings))
+    return Finding("pass", "exchange", text)
 
 
 def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) -> list[Finding]:

@@ -24,7 +24,7 @@ from softfinger.daemon.servos.checks import (
     LOST_TURN_FIX,
     OLD_PROTOCOL,
     Registers,
-    check_angle,
+    check_position,
     other_model,
 )
 from softfinger.daemon.servos.control_table import ServoModel, by_name
@@ -332,27 +332,14 @@ def _set_up(
         result.append(Finding("warn", name, problem))
 
     # At level 0, servos do not reply to reads, so set the level before the first read.
-    if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
-        return failed("answers a ping but no read")
+    if line.read(servo_id, reg.STATUS_RETURN_LEVEL, 1) is None:
+        if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
+            return failed("answers a ping but no read")
+        result.append(Finding("fixed", name, "status return level 0 → 2"))
     table = line.read(servo_id, 0, CHECKED)
     if table is None:
         return failed("its registers could not be read")
-    found = Registers(table)
-    error = found[reg.HARDWARE_ERROR_STATUS]
-    scale = JointScale.of(settings.servos, finger, model)
-    counts = found.long(reg.PRESENT_POSITION)
-    misplaced = check_angle(name, scale, counts, settings.hand, finger)
-    why = ""
-    if error:
-        why = f"it had a hardware error: {reg.hardware_error_names(error)}"
-    elif misplaced is not None and misplaced.fix == LOST_TURN_FIX:
-        why = f"its position was a turn off: {counts} counts"
-    if why:
-        if not _reboot(line, servo_id):
-            return failed(f"no answer after a reboot, since {why}")
-        result.append(Finding("fixed", name, f"rebooted, since {why}"))
-        table = line.read(servo_id, 0, CHECKED) or table
-    elif table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
+    if table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
         return None
     rows = required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION])
     # Write the operating mode first, because this resets gains, profiles and goals.
@@ -366,7 +353,37 @@ def _set_up(
             failed(f"{what} {wrong} could not be set to {value}")
         else:
             result.append(Finding("fixed", name, f"{what} {wrong} → {value}", row.then))
-    return None
+    return _reboot_if_needed(line, settings, finger, model, result)
+
+
+def _reboot_if_needed(
+    line: ServoLine,
+    settings: Settings,
+    finger: int,
+    model: ServoModel,
+    result: list[Finding],
+) -> None:
+    """Reboot a servo with a hardware error or a lost turn; its limits are already corrected."""
+    servo_id = settings.servos.ids[finger]
+    name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
+    table = Registers(line.read(servo_id, 0, CHECKED) or b"")
+    if not table:
+        return result.append(Finding("warn", name, "its registers could not be read"))
+    misplaced = check_position(name, scale, table, settings.hand, finger)
+    if error := table[reg.HARDWARE_ERROR_STATUS]:
+        why = f"it had a hardware error: {reg.hardware_error_names(error)}"
+    elif misplaced is not None and misplaced.fix == LOST_TURN_FIX:
+        why = f"its position was a turn off: {table.long(reg.PRESENT_POSITION)} counts"
+    else:
+        return None
+    match _reboot(line, servo_id):
+        case None:
+            return result.append(Finding("warn", name, f"no answer after a reboot, since {why}"))
+        case 0:
+            return result.append(Finding("fixed", name, f"rebooted, since {why}"))
+        case error:
+            text = f"hardware error after a reboot: {reg.hardware_error_names(error)}"
+            return result.append(Finding("warn", name, text, "remove the cause"))
 
 
 def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]) -> bool:
@@ -377,11 +394,13 @@ def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]
     return True
 
 
-def _reboot(line: ServoLine, servo_id: int) -> bool:
+def _reboot(line: ServoLine, servo_id: int) -> int | None:
+    """Reboot a servo and return its hardware errors, or None if it does not answer in time."""
     line.handler.reboot(line.port, servo_id)
     end = time.monotonic() + _REBOOT_TIMEOUT
     while time.monotonic() < end:
         # A ping without a reply waits for its deadline, which paces this loop.
         if line.ping(servo_id, tries=1) is not None:
-            return line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1) == b"\x00"
-    return False
+            status = line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
+            return status[0] if status else None
+    return None

@@ -316,7 +316,8 @@ def _row(arrays: dict[str, NDArray[Any]], name: str, count: int) -> NDArray[Any]
     if name == "t" and array.dtype.kind in "mM":
         array = array.astype(f"{array.dtype.kind}8[ns]").astype(np.int64)
     if array.shape != (count,) or array.dtype.kind not in "uif":
-        raise ValueError(f"{name}: found shape {array.shape}, expected {count} numbers")
+        kind = f"{array.dtype} of shape {array.shape}"
+        raise ValueError(f"{name}: found {kind}, expected {count} numbers")
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: not finite")
     return array
@@ -354,7 +355,9 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
 def _factor(t: NDArray[Any], step: float, rate: float) -> float:
     """Return the unit [s] of undated times based on their step. Raises ValueError."""
     whole = t.dtype.kind in "ui"
-    if whole and (np.diff(t) == 1).all() and len(t) > 2:
+    if len(t) > 2 and (t % 1 == 0).all() and (np.diff(t) == 1).all():
+        if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # a frame per second
+            return 1.0
         raise ValueError("t: whole numbers that rise by 1, expected times in s, or no t")
     if not whole and step * rate <= _INTERVAL_RATIO_MAX:
         return 1.0

@@ -264,11 +264,16 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
     return values
 
 
+_GROUPS = str.maketrans("", "", "'\N{RIGHT SINGLE QUOTATION MARK}\N{NO-BREAK SPACE}\u202f")
+
+
 def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
-    If both occur, the last one is the decimal sign, and the other one groups digits.
+    If both occur, the last one is the decimal sign, and the other one groups digits. Apostrophes
+    and narrow spaces only group digits.
     """
+    text = text.translate(_GROUPS)
     if "," in text:
         text = text.replace("," if text.rfind(",") < text.rfind(".") else ".", "")
         text = text.replace(",", ".")

@@ -185,8 +185,10 @@ def decode(payload: bytes) -> dict[str, Any]:
     """
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
+    except msgpack.StackError:
+        raise _malformed("not msgpack: nested too deeply") from None
     except Exception as error:  # msgpack has no common base class for its exceptions
-        raise _malformed(f"not msgpack: {error}") from None
+        raise _malformed(f"not msgpack: {str(error) or 'invalid format'}") from None
     if not isinstance(request, dict):
         raise _malformed(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):

@@ -198,6 +198,11 @@ KINDS: dict[str, EventKind] = {
         "A joint moves the tip of the other finger, or an object turns opposite to its command.",
         f"Swap `servos.ids`, `zero` and `direction`. {_CALIBRATE_JOINTS}",
     ),
+    "joint.opens": EventKind(
+        "warning",
+        "By the joint angles the tips overlap in an approach, but one of them has no contact.",
+        f"Correct `servos.direction`, or `servos.zero`. {_CALIBRATE_JOINTS}",
+    ),
     "joint.blocked": EventKind(
         "warning",
         "A joint has stopped in the approach at maximum current, and its tip has no contact.",

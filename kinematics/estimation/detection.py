@@ -22,6 +22,8 @@ from softfinger.kinematics.sensing.footprint import (
 
 _HYSTERESIS = 0.5  # ratio of the detection levels during and before a contact; avoids flicker
 STRONG_PEAK = 6.0  # noise standard deviations; above it, the largest cell is tested first
+_NOISE_RATIO = 1.75  # ratio of measured and set noise above which a frame is noisy
+_SUSPECT_PEAK = 4.0  # noise standard deviations; with a smaller largest cell no frame is noisy
 
 
 @inner_kernel
@@ -82,6 +84,30 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
     signal.contact = contact
     signal.row = cell // grid.cols if cell >= 0 else -1
     signal.col = cell - signal.row * grid.cols if cell >= 0 else -1
+
+
+@inner_kernel
+def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
+    """Return True if the cells of a frame without contact scatter by more than their noise.
+
+    Only cells above a centre are used, since readings may be clipped at 0. The centre is the mean
+    reading, or 0 if more than a quarter of the cells read 0. Half of 788 cells measure the noise
+    with a standard deviation of 4 %.
+    """
+    signal = state.signal
+    if not (signal.is_finite and signal.peak > signal.mean + _SUSPECT_PEAK * signal.noise):
+        return False
+    zeros = 0
+    for k in range(frame.shape[0]):
+        zeros += (height[k] >= 0.0) & (frame[k] == 0.0)
+    centre = 0.0 if 4 * zeros > signal.number else signal.mean
+    number = 0
+    squares = 0.0
+    for k in range(frame.shape[0]):
+        if height[k] >= 0.0 and frame[k] > centre:
+            number += 1
+            squares += (frame[k] - centre) ** 2
+    return squares > (_NOISE_RATIO * signal.noise) ** 2 * number
 
 
 @inner_kernel

@@ -12,6 +12,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.estimation.detection import (
     STRONG_PEAK,
+    is_noisy,
     presses_outside,
     restore_outliers,
     shows_pattern,
@@ -258,14 +259,14 @@ def estimate_frame(
     signal = state.signal
     _reset_results(state, scale, step)
     rejected = without_outliers(state, frame, cells.height)
-    unexplained = False
+    strong = False
     if state.options.is_solid and signal.is_finite:
         # Every contact matches the pattern. A strong signal without the pattern is not a contact of
         # this tip; a small common zero offset is not a signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > STRONG_PEAK * signal.noise
         signal.contact = shows_pattern(state, frame, cells)
-        unexplained = strong and not signal.contact
+    unexplained = not signal.contact and (strong or is_noisy(state, frame, cells.height))
     estimate.peak = signal.peak * scale
     estimate.rejected_count = rejected
     estimate.contact = signal.contact or unexplained

@@ -73,6 +73,9 @@ def test_assessment_of_exchange_times():
 
     assert judged(0.0004, 0.0009).status == "pass"
     assert judged(0.0004, 0.0009).text == "50: p50 0.4 ms, p99 0.9 ms, 0% failed"
+    near = judged(0.0017, 0.0018)  # `run` warns of the same
+    assert (near.status, near.fix.split(";")[0]) == ("warn", "set loop.rate = 440")
+    assert near.text.endswith("a tick takes 2 ms (loop.rate = 500): ticks will be late")
     both = judged(0.0028, 0.003)  # shorter than reply_timeout and longer than a tick
     assert (both.status, both.fix.split(";")[0]) == ("FAIL", "set loop.rate = 260")
     assert "a tick takes 2 ms (loop.rate = 500), and a reply may take 4 ms" in both.text
@@ -167,6 +170,23 @@ def test_doctor_waits_as_long_as_run(running):
     found = [each for each in devices.check_servos(settings) if each.subject == "servo 2 (right)"]
     assert [each.status for each in found] == ["pass"]
     assert Settings().tactile.open_timeout == Settings().servos.open_timeout == 5.0
+
+
+def test_a_servo_that_answers_after_the_wait_is_told_from_a_broken_cable(running, monkeypatch):
+    bus = running()
+    bus.servo(1).silent = True
+    examine = devices.examine
+
+    def examine_then_boot(*args: Any) -> Any:
+        found = examine(*args)
+        bus.servo(1).silent = False
+        return found
+
+    monkeypatch.setattr(devices, "examine", examine_then_boot)
+    settings = backend_settings(bus.path, open_timeout=0.01)
+    failed = [each for each in devices.check_servos(settings) if each.status != "pass"]
+    assert [each.fix for each in failed] == ["it answers now: set a longer servos.open_timeout"]
+    assert failed[0].text.endswith("within servos.open_timeout = 0.01 s")
 
 
 # Ports.

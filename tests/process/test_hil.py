@@ -164,6 +164,7 @@ def test_start_up_waits_for_servos_that_have_not_responded_yet(tmp_path, address
         refused = softfinger(*words, "servos.open_timeout=0.1")
         assert refused.returncode == 1
         assert "servo 2 (right): no answer at 2000000 baud" in refused.stderr
+        assert refused.stderr.rstrip().endswith("waited servos.open_timeout = 0.1 s")
         waiting = started(*words, "servos.open_timeout=60", stdout=None)
         with ending(waiting):
             text = "waiting up to servos.open_timeout = 60 s"

@@ -116,6 +116,16 @@ def test_factory_settings_of_every_model_pass_the_checks():
         assert wrong <= {"return delay", "operating mode"}, name
 
 
+def test_stall_torques_fit_current_speed_and_gears():
+    """A torque constant is inversely proportional to the speed of servos with one motor."""
+    for name, model in MODELS.items():
+        torque, current, voltage = model.stall
+        assert 0.5 < torque * model.no_load_speed / (voltage * current) < 1.2, name
+    found, same_motor = MODELS["XW430-T200"], MODELS["XH430-W210"]
+    constant = same_motor.torque_constant * same_motor.no_load_speed / found.no_load_speed
+    assert found.torque_constant == pytest.approx(constant, rel=0.05)
+
+
 def test_registers_are_saved_and_restored(bus, tmp_path):
     path, settings = tmp_path / "servos.json", backend_settings(bus.port)
     put(bus, reg.PWM_LIMIT, 300)
@@ -165,6 +175,34 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
     (fixed,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert "rebooted, since its position was a turn off" in fixed.text
     assert [each.status for each in told(bus)] == ["pass"]
+
+
+def test_an_error_that_a_wrong_limit_causes_is_corrected_with_the_limit(bus):
+    put(bus, reg.MIN_VOLTAGE_LIMIT, 140)
+    until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
+    supply = [each for each in told(bus) if each.text.startswith("supply is ")]
+    assert [each.fix for each in supply] == [FIX]
+    fixed = [each.text for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    assert fixed == [
+        "min voltage limit 140 → 95",
+        "rebooted, since it had a hardware error: input voltage out of limits",
+    ]
+    assert [each.status for each in told(bus)] == ["pass"]
+
+
+def test_an_error_that_a_reboot_does_not_clear_is_reported(bus):
+    bus.fault("undervoltage=1")
+    until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
+    (left,) = [each for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    assert left.text == "hardware error after a reboot: input voltage out of limits"
+    assert left.fix == "remove the cause"
+
+
+def test_no_reboot_is_advised_for_a_reversed_drive_mode(bus):
+    put(bus, reg.DRIVE_MODE, 1)
+    fixes = [each.fix for each in told(bus) if each.status == "FAIL"]
+    assert fixes == ["`softfinger calibrate joints`, since its drive mode is reversed"]
+    assert provision(backend_settings(bus.path)) == []
 
 
 def test_a_servo_with_protocol_1_is_recognised(bus):

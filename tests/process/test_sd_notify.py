@@ -1,6 +1,7 @@
 """The daemon as a systemd service: watchdog messages on a real socket, unit, rules, logs."""
 
 import configparser
+import grp
 import json
 import math
 import os
@@ -188,6 +189,18 @@ def test_rules_contain_only_keys_operators_and_quoted_values(inline):
     for rule in rules:
         assert all(part.fullmatch(each) for each in rule.split(", ")), rule
     assert any('ATTR{latency_timer}="1"' in rule for rule in rules)
+
+
+@pytest.mark.parametrize(
+    ("groups", "expected"),
+    [(("dialout", "uucp"), "dialout"), (("uucp",), "uucp"), ((), "dialout")],
+)
+def test_unit_and_rules_name_the_group_of_this_system(inline, monkeypatch, groups, expected):
+    every = [grp.struct_group((name, "x", 1, [])) for name in ("root", *groups)]
+    monkeypatch.setattr(grp, "getgrall", lambda: every)
+    assert f"\nSupplementaryGroups={expected}\n" in inline("install-service").stdout
+    rules = inline("install-service", "--udev").stdout
+    assert set(re.findall('GROUP="(.*?)"', rules)) == {expected}
 
 
 @pytest.mark.parametrize(

@@ -322,10 +322,18 @@ def test_a_slow_recording_is_read_unchanged_and_reported(press, tmp_path):
     assert read.notes == ("t: taken as s: a frame comes every 0.5 s, by tactile.rate every 0.01 s",)
 
 
-def test_frame_numbers_are_not_used_as_times(press, tmp_path):
-    np.savez(tmp_path / "a.npz", frames=press, t=np.arange(8))
+@pytest.mark.parametrize("t", [np.arange(8), np.arange(1.0, 9.0)])
+def test_frame_numbers_are_not_used_as_times(press, tmp_path, t):
+    np.savez(tmp_path / "a.npz", frames=press, t=t)
     with pytest.raises(RecordingError, match="t: whole numbers that rise by 1, expected times"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
+    assert load_recording(tmp_path / "a.npz", SCALE, 1.0).t.tolist() == list(range(8))
+
+
+def test_times_as_texts_are_reported(press, tmp_path):
+    np.savez(tmp_path / "a.npz", frames=press, t=(STEPS * 1e-3).astype(str))
+    with pytest.raises(RecordingError, match=r"t: found <U\d+ of shape \(8,\), expected 8 numbers"):
+        load_recording(tmp_path / "a.npz", SCALE, 25.0)
 
 
 def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_path):
@@ -359,6 +367,20 @@ def test_frames_without_contact_are_reported_with_the_maximum_reading(
     assert "threshold 4560 Pa (3 times tactile.noise)" in line
     with np.load(path) as held:
         assert f"largest reading {held['frames'].max():.4g} " in line
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.uint16])
+def test_noise_above_its_setting_is_reported_with_both(tmp_path, inline, kind):
+    noise = np.random.default_rng(2).normal(0.0, 4000.0, (8, 44, 44))
+    scale = 1.0 if kind is np.float64 else 4.0
+    np.savez(tmp_path / "a.npz", frames=np.maximum(noise / scale, 0.0).astype(kind))
+    (line,) = [
+        each
+        for each in inline("analyse", tmp_path / "a.npz", "--config", "paper").stdout.splitlines()
+        if "no contact in any frame" in each
+    ]
+    found = re.search(r"threshold 4560 Pa .*the noise of the cells is (\d+) Pa: set", line)
+    assert float(found[1]) == pytest.approx(4000.0, rel=0.03)
 
 
 def test_frames_with_contact_cause_no_message(press, tmp_path, inline):

@@ -71,7 +71,7 @@ def test_a_plain_req_socket_gets_its_reply(server, addresses):
     ("payload", "error"),
     [
         (b"", "not msgpack"),
-        (b"\xc1\xff", "not msgpack"),
+        (b"\xc1\xff", "not msgpack: invalid format"),
         (msgpack.packb([1, 2]), "expected a map, found list"),
         (msgpack.packb({"force": 1.0}), 'expected a text under "command"'),
         (msgpack.packb({"command": 7}), 'expected a text under "command"'),
@@ -396,6 +396,11 @@ def test_stop_is_accepted_with_unknown_fields():
     assert decode(msgpack.packb({"command": "stop", **more})) == {"command": "stop", "client": "a"}
     with pytest.raises(Refused, match="numbers and texts as values"):
         decode(msgpack.packb({"command": "arm", "how": ["now"]}))
+
+
+def test_a_request_that_is_nested_too_deeply_is_reported():
+    with pytest.raises(Refused, match="not msgpack: nested too deeply"):
+        decode(b"\x91" * 2000 + b"\xc0")
 
 
 def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(context, addresses):

@@ -120,6 +120,22 @@ def test_a_baseline_far_below_zero_is_invalid(estimator):
     assert not estimator(-GRID.pressure(TIP, MEASURED, 0.004) - 2000.0).valid
 
 
+@pytest.mark.parametrize("clipped", [False, True], ids=["floats", "counts above 0"])
+@pytest.mark.parametrize("times", [1.0, 1.5, 2.0, 2.6, 4.0])
+def test_more_noise_than_set_is_not_mistaken_for_no_contact(estimator, times, clipped):
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        frame = rng.normal(0.0, times * 600.0 / 4.0, (44, 44))
+        if clipped:
+            frame = np.maximum(np.round(frame), 0.0).astype(np.uint16)
+        e = estimator(frame, 4.0)
+        if times < 2.0:
+            assert (e.contact, e.valid) == (False, True)
+        else:
+            assert e.contact
+            assert e.invalid in (Invalid.MODEL_MISMATCH, Invalid.NOT_CONVERGED)
+
+
 def test_one_hot_cell_is_not_a_contact(estimator):
     rng = np.random.default_rng(1)
     frame = rng.normal(0.0, 600.0, (44, 44))

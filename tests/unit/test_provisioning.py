@@ -211,7 +211,7 @@ def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):
         ("overload=2", None, 0, f"{RIGHT}: rebooted, since it had a hardware error: overload"),
         ("", reg.TORQUE_ENABLE, 1, f"{LEFT}: torque off, since EEPROM is locked while it is on"),
         ("", reg.DRIVE_MODE, 0b1100, f"{LEFT}: drive mode 12 → 4"),
-        ("", reg.STATUS_RETURN_LEVEL, 0, ""),
+        ("", reg.STATUS_RETURN_LEVEL, 0, f"{LEFT}: status return level 0 → 2"),
     ],
 )
 def test_configured_registers(wired, fault, register, value, done):
@@ -220,7 +220,7 @@ def test_configured_registers(wired, fault, register, value, done):
         put_fault(bus.bus, fault, 0.0)
     if register is not None:
         bus.servos[0].table.set(register, value)
-    assert bus.provision() == ([done] if done else [], [])
+    assert bus.provision() == ([done], [])
     assert bus.servos[1].table.get(reg.HARDWARE_ERROR_STATUS) == 0
     assert not bus.servos[0].torque_on
     assert bus.servos[0].table.get(reg.STATUS_RETURN_LEVEL) == 2

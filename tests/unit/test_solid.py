@@ -314,10 +314,9 @@ def test_a_completely_saturated_sensor_is_reported_as_saturated(kind, scale):
     assert (found.contact, found.invalid) == (True, Invalid.SATURATED)
 
 
-@pytest.mark.parametrize("times", [4.0, 6.0, 10.0])
+@pytest.mark.parametrize("times", [2.0, 2.6, 4.0, 6.0, 10.0])
 def test_strong_noise_is_not_mistaken_for_no_contact(times):
     rng = np.random.default_rng(7)
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     found = [estimator(times * NOISE * rng.standard_normal(GRID.shape)).invalid for _ in range(50)]
-    assert set(found) <= {Invalid.MODEL_MISMATCH, Invalid.OUTLIERS, Invalid.NONE}
-    assert found.count(Invalid.NONE) < 10
+    assert set(found) <= {Invalid.MODEL_MISMATCH, Invalid.OUTLIERS}

@@ -76,6 +76,11 @@ def test_pressures_are_converted_to_pa(unit, pascal):
     assert export.values[0, 1, 1] == pytest.approx(2.55 * pascal)
 
 
+def test_apostrophes_group_the_digits_of_readings():
+    found = parse(EXPORT.replace("UNITS RAW", "UNITS Pa").replace("255", "1'224.5"))
+    assert found.values[0, 1, 1] == 1224.5
+
+
 def test_a_single_frame_needs_no_frame_line():
     single = EXPORT.split("Frame 4")[0] + "0,5,B,\n7,255,1,\n@@\n"
     assert np.array_equal(parse(single).values, parse(EXPORT).values[:1])

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from typing import Any
 
+import numpy as np
 import pytest
 
 from softfinger.daemon.loop import build
@@ -12,29 +13,42 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
 from tests.harness.loop import command, heard
 
+# Sign and offset [rad] of each joint's readings.
+JOINTS = {
+    "reversed": ((-1.0, -1.0), (0.0, 0.0)),
+    "left reversed": ((-1.0, 1.0), (0.0, 0.0)),
+    "right reversed": ((1.0, -1.0), (0.0, 0.0)),
+    "both zeros off": ((1.0, 1.0), (0.05, 0.05)),
+    "one zero off": ((1.0, 1.0), (0.1, 0.0)),
+}
+
 
 class Miswired:
     """A simulated hand whose servos move the other finger or in the wrong direction."""
 
-    def __init__(self, hand: Any, swapped: bool) -> None:
-        self._hand, self._swapped = hand, swapped
+    def __init__(self, hand: Any, wiring: str) -> None:
+        self._hand, self._swapped = hand, wiring == "swapped"
+        signs, zeros = JOINTS.get(wiring, ((1.0, 1.0), (0.0, 0.0)))
+        self._signs, self._zeros = np.array(signs), np.array(zeros)
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._hand, name)
         if name in ("q", "dq", "current"):
-            return found[::-1] if self._swapped else -found
+            zeros = self._zeros if name == "q" else 0.0
+            return found[::-1] if self._swapped else self._signs * found + zeros
         return found
 
     def measured_current(self, joint: int) -> float:
         if self._swapped:
             return self._hand.measured_current(1 - joint)
-        return -self._hand.measured_current(joint)
+        return self._signs[joint] * self._hand.measured_current(joint)
 
     def drive(self, joint: int, mode: int, torque: bool, q: float, current: float) -> None:
         if self._swapped:
             self._hand.drive(1 - joint, mode, torque, q, current)
         else:
-            self._hand.drive(joint, mode, torque, -q, current)
+            q = self._signs[joint] * (q - self._zeros[joint])
+            self._hand.drive(joint, mode, torque, q, current)
 
 
 Make = Callable[..., Daemon]
@@ -47,7 +61,7 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
         def make(wiring: str, **simulation: Any) -> Daemon:
             def servos(settings: Settings, clock: Any, hand: Any) -> SimulatedServos:
-                miswired = hand if wiring == "right" else Miswired(hand, wiring == "swapped")
+                miswired = hand if wiring == "right" else Miswired(hand, wiring)
                 return SimulatedServos(settings, miswired, clock)
 
             monkeypatch.setattr(build, "make_servos", servos)
@@ -112,16 +126,55 @@ def test_correctly_wired_servos_grasp_and_turn(make, off, object_):
         greatest_force(daemon, 2.0)
     assert daemon.loop.state.fault == ""
     assert daemon.loop.state.mode in ("holding", "rotating")
-    assert not [kind for _, kind, _ in events if kind in ("joint.swapped", "joint.blocked")]
+    assert not [kind for _, kind, _ in events if kind.startswith("joint.")]
 
 
-def test_fingers_that_open_instead_of_closing_are_reported(make):
+def texts(events: list[tuple[str, str, str]], kind: str) -> list[str]:
+    return [text for _, found, text in events if found == kind]
+
+
+EMPTY = {"object_position": (0.0, 0.3)}  # out of reach
+
+
+@pytest.mark.parametrize(
+    ("wiring", "simulation"), [("reversed", {}), ("reversed", EMPTY), ("left reversed", EMPTY)]
+)
+def test_fingers_that_open_are_reported_before_they_reach_their_stop(make, wiring, simulation):
+    daemon = make(wiring, **simulation)
+    events = heard(daemon)
+    command(daemon, "grasp", force=6.0)
+    while daemon.hand.q.min() > -0.54:  # the stop is at -0.55
+        daemon.loop.advance(0.02)
+    (text,) = texts(events, "joint.opens")
+    assert "neither tip has contact: if a finger opens" in text
+
+
+def test_a_finger_that_opens_while_the_other_one_touches_is_reported(make):
+    daemon = make("right reversed", object_width=0.01)
+    events = heard(daemon)
+    command(daemon, "grasp", force=6.0)
+    greatest_force(daemon, 2.5)
+    (text,) = texts(events, "joint.opens")
+    assert "the right tip has no contact: if a finger opens" in text
+
+
+@pytest.mark.parametrize("wiring", ["right", "both zeros off", "one zero off"])
+def test_tips_that_meet_have_nothing_to_grasp(make, wiring):
+    daemon = make(wiring, **EMPTY)
+    events = heard(daemon)
+    command(daemon, "grasp", force=6.0)
+    greatest_force(daemon, 3.0)
+    assert texts(events, "joint.opens") == []
+    assert texts(events, "grasp")[0].startswith("nothing between the tips")
+
+
+def test_fingers_that_stand_in_the_approach_are_reported(make):
     daemon = make("reversed")
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
     while daemon.hand.q[0] > -0.54:  # until it reaches its stop
         daemon.loop.advance(0.02)
     daemon.loop.advance(1.0)
-    (told,) = [text for level, kind, text in events if kind == "joint.blocked"]
-    assert told.startswith("left joint stands at 3")
-    assert told.endswith("is servos.direction right?")
+    (text,) = texts(events, "joint.blocked")
+    assert text.startswith("left joint stands at 3")
+    assert text.endswith("is servos.direction right?")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import sys
 import time
 from collections import Counter
@@ -109,6 +110,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 
 _EIGHT_BITS = 255
+_NOISE_RATIO = 1.5  # times tactile.noise; more noise is named
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
@@ -132,7 +134,11 @@ def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
         if recording.largest <= _EIGHT_BITS < tactile.full_count:
             cause = "counts of 8 bits need a larger tactile.pascal_per_count"
     else:
+        counts = recording.counts[:, recording.live].astype(np.float64)
+        noise = tactile.pascal_per_count * math.sqrt(np.mean(counts[counts > 0.0] ** 2))
         cause = "no such cells beside each other: single cells are outliers"
+        if noise > _NOISE_RATIO * tactile.noise:
+            cause = f"the noise of the cells is {noise:.0f} Pa: set tactile.noise"
     return (
         f"  no contact in any frame: largest reading {found}{pressure:.4g} Pa, threshold "
         f"{level:.4g} Pa ({PEAK_LEVEL:g} times tactile.noise); {cause}\n"

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.port_access import serial_group
 from softfinger.daemon.profile.load import find
 
 _EPILOG = """\
@@ -29,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the unit or the rules. Raises SettingsError if the user or profile does not exist."""
-    rules = _file("70-softfinger.rules") if arguments.udev else ""
-    print(rules or unit(arguments.config, arguments.user), end="")
+    rules = _file("70-softfinger.rules").replace("dialout", serial_group())
+    print(rules if arguments.udev else unit(arguments.config, arguments.user), end="")
     return 0
 
 
@@ -49,7 +50,7 @@ def unit(config: Path | None, user: str) -> str:
             raise SettingsError(f"install-service: {user}: no such user") from None
         line = f"User={user}\n"
     command = " ".join(_quoted(word) for word in words)
-    return _file("softfinger.service").format(command=command, user=line)
+    return _file("softfinger.service").format(command=command, user=line, group=serial_group())
 
 
 def _file(name: str) -> str:

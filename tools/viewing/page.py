@@ -13,6 +13,7 @@ import asyncio
 import errno
 import json
 import logging
+import math
 import os
 import re
 import secrets
@@ -275,10 +276,12 @@ class Site:
             age = time.monotonic() - float(asked.pop("seen", "nan"))
             # This call fails for values that msgpack can't represent: deep nesting, long integers.
             msgpack.packb(asked)
-        except _NO_COMMAND as error:
-            return f"✗ no command: {error!r}"
+        except _NO_COMMAND:
+            return '✗ no command: expected a JSON object with "command", not nested deeply'
         if name == "record":
             return self.record()
+        if name != "stop" and math.isnan(age):
+            return f'✗ {name}: expected "seen", the time of its picture'
         if name != "stop" and not age < self._stale:
             return f"✗ {name}: dropped, the page is {age:.0f} s behind"
         try:
