@@ -119,13 +119,13 @@ def _plugin(kind: Kind, name: str) -> Backend:
     if not entries:
         raise KeyError(name)
     if len(entries) > 1:
-        raise PluginError(f"{' and '.join(map(source, entries))} have the same name")
+        raise PluginError(f"{' and '.join(map(source, entries))} have the same name: uninstall one")
     (entry,) = entries
     try:
         made = entry.load()
     except Exception as error:  # A plugin may raise any exception.
         why = f"{type(error).__name__}: {error}"
-        raise PluginError(f"{source(entry)} fails to load: {why}") from error
+        raise PluginError(f"{source(entry)} can't be loaded: {why}") from error
     metal, hand = getattr(made, "metal", True), getattr(made, "hand", False)
     return Backend(entry.load, metal, hand, source(entry), getattr(made, "Settings", None))
 

@@ -104,19 +104,19 @@ class Reason(StrEnum):
 
 
 _MEANINGS = {
-    Reason.LATE: "The command was too old when its turn came, or a servo's reply was late. "
-    "It has no effect. Send it again if you still want it.",
-    Reason.STOPPED: "The command was sent before the last `stop`, or too soon after it to tell. "
-    "Do not repeat it automatically.",
+    Reason.LATE: "The command was too old when it was handled, or a servo's reply was late. It "
+    "has no effect. Send it again if you still want it.",
+    Reason.STOPPED: "The command was received before the last `stop`, or too soon after it. Do "
+    "not repeat it automatically.",
     Reason.SUPERSEDED: "A newer `hold` of the same connection replaced this one, or another "
     "command was carried out before this one was repeated.",
     Reason.BUSY: "Too many commands are waiting, or this client sends too many. Send fewer.",
-    Reason.LEASE: "Another client commands the hand (`commands.lease`).",
+    Reason.LEASE: "Another client has the lease (`commands.lease`).",
     Reason.MODE: "The hand does not accept this command in its present mode.",
     Reason.BOUNDS: "A number is outside the range that the hand accepts.",
     Reason.SCENE: "The profile lacks something that the command needs: a sensor, servos, a task.",
-    Reason.STATE: "The present state prevents the command: a broken limit, a touched tip, a tare "
-    "in progress, servos that cannot be reached.",
+    Reason.STATE: "The present state prevents the command: a limit is exceeded, a tip is in "
+    "contact, a tare is in progress, or the servos do not answer.",
     Reason.REQUEST: "The request is malformed: unknown command, or a missing or unknown parameter.",
 }
 

@@ -137,5 +137,5 @@ def _refuse_foreign(path: str, found: os.stat_result) -> None:
     strange = HAS_OWNERS and found.st_uid not in (os.geteuid(), 0)
     link = stat.S_ISLNK(found.st_mode)
     if strange and (link or Path(path).parent.stat().st_mode & _WORLD_WRITABLE):
-        what = "a link" if link else "a file in a folder that all may write in"
-        raise PermissionError(errno.EPERM, f"{what}, of another user", path)
+        what = "a link" if link else "a file in a folder that all users may write to"
+        raise PermissionError(errno.EPERM, f"{what} that belongs to another user", path)

@@ -31,8 +31,8 @@ def grant(path: str) -> str:
     except (OSError, KeyError):
         return f"sudo chmod a+rw {path}"
     if group.gr_name in _SYSTEM_GROUPS or not status.st_mode & 0o020:
-        return f"sudo chmod a+rw {path}, until it is plugged in again; for good, a udev rule"
+        return f"sudo chmod a+rw {path} until it is unplugged; permanently, add a udev rule"
     user = os.environ.get("USER", "")
     if user in group.gr_mem and status.st_gid not in os.getgroups():
-        return f"log in again: {user} is in {group.gr_name}, this session is not yet"
+        return f"log in again: {user} was added to {group.gr_name} after this login"
     return f"sudo usermod -aG {group.gr_name} $USER, then log in again"

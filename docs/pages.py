@@ -701,7 +701,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "measured": measured,
     "control": partial(_control, 0),
     "control_limits": partial(_control, 1),
-    "control_late": partial(_control_late, "late"),
+    "control_late": partial(_control_late, "delayed angle"),
     "control_late_tips": partial(_control_late, "two-phased"),
     "held_loads": held_loads,
     "envelope_map": envelope_map,

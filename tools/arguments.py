@@ -158,7 +158,7 @@ def no_stream(address: str, folder: Path | None) -> str:
 
 
 def _hint(folder: Path | None) -> str:
-    return " (with access.keys it needs --keys FOLDER)" if folder is None else ""
+    return " (with access.keys, give --keys FOLDER)" if folder is None else ""
 
 
 def to_stderr(subcommand: str) -> Callable[[str], None]:
@@ -225,7 +225,7 @@ def add_daemon(
         "--keys", type=Path, metavar="FOLDER", help="this client's keys, from `softfinger keys`"
     )
     if client:
-        name = "client name, to which the commander's lease is bound"
+        name = "client name; the lease is bound to it"
         parser.add_argument("--client", default="", help=name)
 
 
@@ -239,7 +239,8 @@ def add_stream(
     parser.add_argument(
         "--no-wait",
         action="store_true",
-        help=f"exit with an error if nothing arrives for {WAIT_MAX:g} s (monitor: or at its end)",
+        help=f"exit with an error if nothing arrives for {WAIT_MAX:g} s (monitor: also when the "
+        "stream ends)",
     )
     add_duration(parser)
 
@@ -277,5 +278,5 @@ def topic(text: str) -> bytes:
     name = (text if text.startswith("hand/") else f"hand/{text}").encode()
     if name not in schema.TOPICS:
         known = ", ".join(each.decode().removeprefix("hand/") for each in schema.TOPICS)
-        raise argparse.ArgumentTypeError(f"found topic {text!r}, expected one of {known}, all")
+        raise argparse.ArgumentTypeError(f"found topic {text!r}, expected all or one of {known}")
     return name

@@ -43,14 +43,14 @@ GROUPS = {  # package in tools/ and description of each subcommand
         "export": ("recordings", "export a recording's topics as CSV or Parquet"),
     },
     "machine": {
-        "doctor": ("setup", "check ports, servos, boards and this machine, and name fixes"),
+        "doctor": ("setup", "check ports, servos, boards and this machine, and suggest fixes"),
         "scan": ("setup", "find the servos on a port, at any baud rate"),
         "calibrate": ("calibration", "calibrate joints, sensors and tips, step by step"),
         "envelope": ("setup", "simulate which shapes, sizes, frictions and masses a hand holds"),
         "limits": ("setup", "list every limit: condition, consequence, setting"),
         "config": ("setup", "list and show the profiles, and every setting with its default"),
         "compile": ("processes", "compile a hand's kernels before its first start"),
-        "keys": ("setup", "make the keys required for access from other machines"),
+        "keys": ("setup", "create the keys required for access from other machines"),
         "install-service": ("setup", "print a systemd unit and udev rules"),
         "completion": ("setup", "print a completion script for bash, zsh or fish"),
     },
@@ -101,7 +101,7 @@ class Parser(argparse.ArgumentParser):
             known += [word for action in self._actions for word in action.choices or ()]
             word = next(filter(None, unknown.groups()))
             if near := nearest(word.partition("=")[0], known):
-                message = f"found {word!r}, expected a known word{near}"
+                message = f"unknown word {word!r}{near}"
         super().error(message)
 
 
@@ -168,8 +168,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not _lacks_memory(error):
             raise
         print(
-            "softfinger: not enough memory for this process, which needs about 1 GB of addresses: "
-            "see `ulimit -v` and what else runs",
+            "softfinger: not enough memory for this process, which needs about 1 GB of address "
+            "space: raise `ulimit -v`, or end other programs",
             file=sys.stderr,
         )
         return 1
@@ -189,8 +189,8 @@ def _main(argv: Sequence[str] | None) -> int:
     called = next((word for word in words if word in SUBCOMMANDS), "")
     if called in _LINUX and sys.platform != "linux":
         print(
-            f"{called}: found {sys.platform}, expected Linux, whose scheduler and serial ports the "
-            "daemon needs; here the client, gym, recordings and `softfinger view` work",
+            f"{called}: found {sys.platform}, expected Linux: the daemon needs its scheduler and "
+            "serial ports; the client, gym, recordings and `softfinger view` work here",
             file=sys.stderr,
         )
         return 1

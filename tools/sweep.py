@@ -153,7 +153,9 @@ class Sweep(Generic[Case, Result]):
                     workers = 1  # one case at a time, to identify the case that crashes its worker
                 else:
                     case = self._cases[self._left()[0]]
-                    raise SweepError(f"{self._name}: each worker dies at {case}") from None
+                    raise SweepError(
+                        f"{self._name}: all worker processes ended at {case}"
+                    ) from None
 
     def _by(self, executor: Executor) -> Iterator[int]:
         futures: dict[Future[Result], int] = {
@@ -191,7 +193,9 @@ class Sweep(Generic[Case, Result]):
         with open_regular(self._journal) as file:
             lines = file.read().decode("utf-8", "replace").splitlines()
         if not lines or lines[0] != json.dumps(self._digest):
-            raise SweepError(f"{self._journal}: of another sweep; expected this one's, or no file")
+            raise SweepError(
+                f"{self._journal}: belongs to another sweep; remove it or choose another file"
+            )
         for line in lines[1:]:
             try:
                 k, result = json.loads(line)

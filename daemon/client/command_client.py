@@ -123,7 +123,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
             _log.warning(still_waiting(answer, timeout))
             answered = socket.poll(math.ceil((remaining - silence) * 1e3))
         if not answered:
-            hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
+            hint = " (with access.keys, give --keys or keys=)" if keys is None else ""
             raise NoAnswer(
                 f"no {answer} within {timeout:g} s; is softfinger running, or still starting?{hint}"
             )
@@ -132,7 +132,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
         socket.close()
         context.term()
     if not isinstance(reply, dict):
-        raise NoAnswer(f"{address} answered something that is not a reply")
+        raise NoAnswer(f"{address} sent an invalid reply")
     return reply
 
 
@@ -220,7 +220,7 @@ class HandClient(Generic[_Done]):
 
     def _require_open(self) -> None:
         if self._context.closed:
-            raise HandClosed(f"this {type(self).__name__} is closed: make another")
+            raise HandClosed(f"this {type(self).__name__} is closed: create a new one")
 
     def _request(self, name: str, numbers: dict[str, float | None]) -> dict[str, Any]:
         self._require_open()

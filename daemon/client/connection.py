@@ -137,7 +137,7 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
         topic, packed = frames
         message = msgpack.unpackb(packed)
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
-        raise ValueError(f"not a message of the stream: {error}") from None
+        raise ValueError(f"not a stream message: {error}") from None
     if not isinstance(message, dict):
         raise ValueError("not a map")
     return topic, message

@@ -171,7 +171,7 @@ class Subscriber(Generic[_Record]):
     def _require_open(self) -> None:
         self._thread.claim()
         if self._socket.closed:
-            raise HandClosed("this subscription is closed: make another")
+            raise HandClosed("this subscription is closed: create a new one")
 
     def _take(self, frames: list[bytes]) -> _Record | None:
         """Decode a message; return None if it is unreadable or a repetition."""
@@ -187,8 +187,8 @@ class Subscriber(Generic[_Record]):
         if found != SCHEMA and not self._warned:
             self._warned = True
             warnings.warn(
-                f"the stream is of schema {found!r}, this client knows {SCHEMA}; "
-                "it keeps to the fields it knows",
+                f"the stream has schema {found!r}, this client supports {SCHEMA}; it ignores "
+                "fields that it does not know",
                 stacklevel=3,
             )
         return record
@@ -251,6 +251,6 @@ class Wait:
         if self._last is None:
             return no_stream(address, STATE, self._timeout)
         return NotInTime(
-            f"not within {self._timeout:g} s; the last state: mode {self._last.mode}, "
+            f"condition not met within {self._timeout:g} s; last state: mode {self._last.mode}, "
             f"tick {self._last.seq}"
         )

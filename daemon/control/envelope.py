@@ -22,7 +22,7 @@ OUTCOME_TEXTS = {
     HELD: "held",
     TURNED: "held, but turned by more than 5°",
     LOST: "slips out",
-    REFUSED: "no grip comes about",
+    REFUSED: "is not gripped",
 }
 _GRAVITY = 9.81  # m/s²
 _SECTIONS = ("hand", "tip", "material")
@@ -78,10 +78,11 @@ class Envelope:
             self._force_limit = found["raised"]
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
             raise SettingsError(
-                f"control.envelope: {own}: no map of `softfinger envelope --keep`: {error!r}"
+                f"control.envelope: {own}: can't read a map of `softfinger envelope --keep`: "
+                f"{error!r}"
             ) from None
         if own and other:
-            raise SettingsError(f"control.envelope: {own} is another hand's: {other}")
+            raise SettingsError(f"control.envelope: {own} belongs to another hand: {other}")
         self._is_valid = not other
         self._settings = settings
 
@@ -102,7 +103,7 @@ class Envelope:
         if HELD in outcome or TURNED in outcome:
             return ""
         return (
-            f"outside of what this hand holds in simulation: {1e3 * settings.object.width:g} mm "
+            f"outside the simulated envelope of this hand: {1e3 * settings.object.width:g} mm "
             f"(object.width) at friction {control.tip_friction:g} (control.tip_friction) and "
             f"{mass:.2g} kg (control.object_load) with {force:g} N: {OUTCOME_TEXTS[outcome[0]]}; "
             "see docs/envelope.md"

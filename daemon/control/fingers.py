@@ -71,7 +71,7 @@ class Fingers:
     def turn_refusal(self, angle: float) -> str:
         """Return the reason why the object can't rotate to ``angle`` [rad], or "" if it can."""
         if not self.pose.valid:
-            return "the object's angle is not known"
+            return "the object's angle is unknown"
         low, high = self.turning_range()
         return "" if low <= angle <= high else f"angle: {range_text(angle, low, high)} in this grip"
 

@@ -211,7 +211,9 @@ class Control:
             self.events.append(("info", "mode", f"{last.mode.value} → {state.mode.value}"))
         waits = isinstance(last, Approaching | Pressing) and last.command.angle is not None
         if waits and not isinstance(state, Approaching | Gripping):
-            self._warn("rotate", f"rotate: dropped, since the grasp ended in {state.mode.value}")
+            self._warn(
+                "rotate", f"rotate: dropped, because the grasp ended in mode {state.mode.value}"
+            )
 
     def _enter_armed(self) -> None:
         self._enter(Armed(self._settings.safety.current_move))
@@ -406,7 +408,7 @@ class Control:
         elif self.fingers.advance_setpoints(self._settings.control.approach_speed):
             state.arrived_for += dt
             if state.arrived_for > _ARRIVAL_TIMEOUT:
-                self._warn("grasp", "nothing to grasp within the joints' limits")
+                self._warn("grasp", "no object within the joint limits")
                 self.fingers.hold_here()
                 self._enter_armed()
 
@@ -421,8 +423,8 @@ class Control:
             return 0.0
         if before + dt > _EMPTY_TIME:
             text = (
-                f"nothing between the tips: {pose.width * 1e3:.1f} mm, "
-                f"less than object.width_min {width_min * 1e3:g} mm; opening"
+                f"nothing between the tips: {pose.width * 1e3:.1f} mm apart, expected at least "
+                f"object.width_min = {width_min * 1e3:g} mm; opening"
             )
             self._warn("grasp", text)
             self.release()
@@ -455,7 +457,7 @@ class Control:
         self.fingers.follow_setpoints(goal, loss.current)
         loss.lost_for += dt
         if loss.lost_for > _CONTACT_LOSS_TIME:
-            self._warn("lost", "contact lost; the joints hold where they are")
+            self._warn("lost", "contact lost; the joints hold their position")
             self._enter(Armed(loss.current))
 
     def _check_settled(self, state: Gripping, dt: float) -> None:
@@ -504,7 +506,7 @@ class Control:
         shear_max = law.tip_friction * (1.0 - law.slip_margin)
         if self.fingers.grasp.shear * self.grip.stopping_ratio > shear_max:
             if not history.turn_end_reported:
-                text = f"turning ended at {math.degrees(angle):.1f}°: the tips would slip"
+                text = f"rotation stopped at {math.degrees(angle):.1f}°: the tips would slip"
                 self._warn("slip", text)
             history.turn_end_reported = True
             self.grip.steer(angle, angle)
@@ -513,12 +515,12 @@ class Control:
         """Report slip and the start of each force increase that counteracts it."""
         grip = self.grip
         if grip.has_slipped:
-            self._warn("slip", "the object turns in the grip")
+            self._warn("slip", "the object is turning in the grip")
         if grip.target <= grip.commanded:
             history.increase_reported = False
         elif not history.increase_reported and grip.target > (1 + _FORCE_NOISE) * grip.commanded:
             history.increase_reported = True
-            why = "the object turns in it" if grip.has_slipped else "a load came at once"
+            why = "the object is turning" if grip.has_slipped else "sudden load"
             if grip.slip.assumed_load > 0.0:
-                why = f"each tip may bear {grip.slip.assumed_load:.1f} N along its face"
-            self._warn("slip", f"grip raised above {grip.commanded:.1f} N: {why}")
+                why = f"up to {grip.slip.assumed_load:.1f} N along the face of each tip"
+            self._warn("slip", f"grip force increased above {grip.commanded:.1f} N: {why}")

@@ -56,7 +56,7 @@ class Task:
         """
         if state.mode != self._end_mode:
             if state.mode in (Mode.FAULT, Mode.DISARMED):
-                raise TaskEnded(f"the hand is in {state.mode}")
+                raise TaskEnded(f"the mode is {state.mode}")
             self._remaining = self._pause
             self._waited += dt
             if self._waited > _STEP_TIMEOUT:
@@ -71,12 +71,16 @@ class Task:
 
     def restart(self, state: State, reason: str) -> str:
         """Pause, leave the current mode and restart the script; return the event text."""
-        way_out, says = ("clear", "clears it") if state.mode == Mode.FAULT else ("stop", "stops it")
+        way_out, says = (
+            ("clear", "clears the fault")
+            if state.mode == Mode.FAULT
+            else ("stop", "stops the hand")
+        )
         self._steps = chain([({"command": way_out}, Mode.DISARMED, 0.5)], self._script())
         self._end_mode = state.mode
         self._remaining, self._waited = _RESTART_PAUSE, 0.0
         pause = f"{_RESTART_PAUSE:g} s"
-        return f"{reason}; the task {says} and begins again in {pause}: the hand is simulated"
+        return f"{reason}; on a simulated hand the task {says} and restarts in {pause}"
 
 
 def demo(force: float, angle: float) -> Iterator[Step]:

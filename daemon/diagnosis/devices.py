@@ -114,11 +114,11 @@ def _try_exchange(
     address = goal_address(mode, model, firmwares[0])
     held = [line.read(servo_id, address, GOAL_SIZE[mode]) for servo_id in ids]
     limp = not any(each.table[reg.TORQUE_ENABLE] for each in found)
-    write, what = None, f"{EXCHANGE_COUNT} of a tick's reads (no writes: torque is on)"
+    write, what = None, f"{EXCHANGE_COUNT} read cycles (no writes, because torque is on)"
     if limp and len(set(firmwares)) == 1 and None not in held:
         group = GroupWrite(line.port, address, GOAL_SIZE[mode], ids)
         write = partial(group.send, [value for value in held if value is not None])
-        what = f"{EXCHANGE_COUNT} of a tick's reads and writes"
+        what = f"{EXCHANGE_COUNT} read and write cycles"
     times = time_exchanges(line.port, reads, write)
     return [*results, judge_exchanges(times, settings, what, emulated(settings))]
 
@@ -133,9 +133,9 @@ def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -
         problem = (
             f"no answer at {settings.servos.baud} baud within servos.open_timeout = {waited:g} s"
         )
-        fix = "check its power and cable, then see what was found below"
+        fix = "check its power and cable, and see the findings below"
         if late:
-            fix = "it answers now: set a longer servos.open_timeout"
+            fix = "it replies now: set a longer servos.open_timeout"
         return [Finding("FAIL", name, problem, fix)]
     results = [*servo.errors, *servo.notices]
     if servo.table:
@@ -162,14 +162,14 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
     if found.old:
         return found.old_protocol()
     if not found.servos and not found.garbled:
-        problem = f"nothing answers on {servos.port} at any rate"
+        problem = f"no servo answers on {servos.port} at any rate"
         return [Finding("FAIL", "servos", problem, "check the bus's power and cable")]
     what = plan(found, settings, model, model.baud_rates)
     lines = [Finding("FAIL", "servos", str(each), ONE_SERVO_ONLY) for each in found.garbled]
     for change in what.changes:
         same = change.servo.id == change.id
-        other = f"servos.baud = {change.servo.baud}" if same else "servos.ids as it is"
-        fix = f"softfinger doctor --fix makes it {change.name}: {change}; or set {other}"
+        other = f"servos.baud = {change.servo.baud}" if same else "the other servos.ids"
+        fix = f"`softfinger doctor --fix` makes it {change.name}: {change}; or set {other}"
         lines.append(Finding("note", "found", str(change.servo), fix))
     for each in what.strangers:
         fix = ONE_SERVO_ONLY if what.missing and each.number == model.number else ""
@@ -184,8 +184,15 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
     problem = "no other servo answers at any rate"
     if not volts:
         return [Finding("note", "found", problem)]
-    fix = "likely the power or cable from one servo to the next: swap it, then look at the supply"
-    return [Finding("note", "found", f"{problem}; {min(volts):.1f} V at those that do", fix)]
+    fix = "replace the cable between the servos, then check the supply"
+    return [
+        Finding(
+            "note",
+            "found",
+            f"{problem}; the supply is {min(volts):.1f} V at the servos that answer",
+            fix,
+        )
+    ]
 
 
 def check_law(settings: Settings, finger: int) -> Finding:
@@ -196,17 +203,15 @@ def check_law(settings: Settings, finger: int) -> Finding:
     except CalibrationFileError as error:
         return Finding("FAIL", name, str(error), "`softfinger calibrate`")
     if calibration is None or not calibration.wants:
-        problem = f"tip.physics is {tip.physics!r}, which no presses have tried"
+        problem = f"tip.physics is {tip.physics!r}, not verified by presses"
         return Finding("note", name, problem, "`softfinger calibrate law`")
     for key, wanted in calibration.wants.items():
         found = getattr(tip, key)
         near = isinstance(wanted, float) and key == "poisson"
         if found != wanted and not (near and abs(found - wanted) <= _POISSON_TOLERANCE):
-            problem = (
-                f"tip.{key} is {found!r}, where the presses of `calibrate law` want {wanted!r}"
-            )
+            problem = f"tip.{key} is {found!r}, but the presses of `calibrate law` fit {wanted!r}"
             return Finding("warn", name, problem, f"set tip.{key}")
-    return Finding("pass", name, f"{tip.physics}, the law that its presses want")
+    return Finding("pass", name, f"{tip.physics}, the model that fits its presses")
 
 
 def check_board(settings: Settings, finger: int) -> Finding:
@@ -234,7 +239,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
     found = f"{tactile.rows} × {tactile.cols} cells, {rate:.0f} frames a second"
     lost = after.get("skipped_bytes", 0) - before.get("skipped_bytes", 0)
     if lost:
-        fix = "check its cable and what else loads the USB hub"
+        fix = "check its cable and the other devices on its USB hub"
         return Finding("warn", name, f"{found}, but {lost} bytes were damaged or lost", fix)
     rest = 0.0 if frame is None else _rest(settings, finger, frame)
     if rest > _REST_NOISE_RATIO * tactile.noise:
@@ -243,7 +248,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
         return Finding("warn", name, text, fix)
     # The frame count is uncertain by ±1, depending on the timing.
     if abs(frames - tactile.rate * spent) > max(_RATE_TOLERANCE * tactile.rate * spent, 1.5):
-        text = f"{found}, not {tactile.rate:g}"
+        text = f"{found}, expected {tactile.rate:g}"
         fix = f"set tactile.rate = {rate:.0f}, unless this machine is busy"
         return Finding("warn", name, text, fix)
     return Finding("pass", name, found)

@@ -41,7 +41,7 @@ def check_scheduling() -> Finding:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
     except OSError:
         soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
-        problem = f"not allowed (RLIMIT_RTPRIO {soft}): other processes can hold up a tick"
+        problem = f"not allowed (RLIMIT_RTPRIO {soft}): other processes can delay a tick"
         return Finding("warn", "scheduling", f"SCHED_FIFO is {problem}", GRANT_PRIORITY)
     os.sched_setscheduler(0, *before)
     return Finding("pass", "scheduling", "SCHED_FIFO is allowed")
@@ -56,7 +56,9 @@ def check_memory_lock(limit: int) -> Finding:
     size = f"{limit >> 10} KiB"
     if limit >= _MEMORY:
         return Finding("pass", "memory lock", size)
-    problem = f"{size} of {_MEMORY >> 20} MiB may be locked: pages of the loop can be swapped out"
+    problem = (
+        f"only {size} of {_MEMORY >> 20} MiB may be locked: pages of the loop can be swapped out"
+    )
     return Finding("warn", "memory lock", problem, GRANT_MEMORY_LOCK)
 
 
@@ -64,10 +66,10 @@ def check_idle_states(path: Path) -> Finding:
     """Check that the daemon can disable deep processor idle states, which wake up slowly."""
     name = str(path)
     if not path.exists():
-        return Finding("warn", name, "this kernel has none: wake-ups take what idle states take")
+        return Finding("warn", name, "this kernel has none: deep idle states delay wake-ups")
     if os.access(path, os.W_OK):
-        return Finding("pass", name, "may be held")
-    problem = "no permission to hold it: wake-ups take what idle states take"
+        return Finding("pass", name, "can be opened")
+    problem = "no permission to open it: deep idle states delay wake-ups"
     return Finding("warn", name, problem, GRANT_LATENCY)
 
 
@@ -76,7 +78,7 @@ def check_wall_clock(now: float) -> Finding:
     if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
-    problem = f"says {date}: published timestamps will be wrong"
+    problem = f"is at {date}: published timestamps will be wrong"
     return Finding("warn", "wall clock", problem, "sudo timedatectl set-ntp true")
 
 
@@ -99,7 +101,7 @@ def check_wake_ups(late: list[float]) -> Finding:
     if middle < 0.25 * _PERIOD:
         return Finding("pass", "wake-ups", text)
     problem = f"{text}: the machine is busy or slow to wake"
-    return Finding("warn", "wake-ups", problem, "end what else runs")
+    return Finding("warn", "wake-ups", problem, "end other programs")
 
 
 def check_kernels(settings: Settings) -> list[Finding]:
@@ -109,13 +111,13 @@ def check_kernels(settings: Settings) -> list[Finding]:
             place, spoilt = folder.path, len(damaged(folder))
     except (OSError, RuntimeError) as error:
         problem = f"can't be used, so every start compiles: {error}"
-        fix = "export NUMBA_CACHE_DIR=FOLDER, one that is yours alone"
+        fix = "export NUMBA_CACHE_DIR=FOLDER with a folder of your own"
         return [Finding("warn", "kernel cache", problem, fix)]
     if spoilt:
-        problem = f"{spoilt} damaged files in {place}: the next start compiles them anew"
-        return [Finding("warn", "kernels", problem, "softfinger compile, or just start it")]
+        problem = f"{spoilt} damaged files in {place}: the next start compiles them again"
+        return [Finding("warn", "kernels", problem, "softfinger compile, or start the daemon")]
     cold = [part.name for part in parts(settings) if not is_built(part, settings)]
     if not cold:
         return [Finding("pass", "kernels", f"compiled, in {place}")]
     problem = f"{', '.join(cold)} not compiled yet: the next start takes longer"
-    return [Finding("warn", "kernels", problem, "softfinger compile, or just start it")]
+    return [Finding("warn", "kernels", problem, "softfinger compile, or start the daemon")]

@@ -34,7 +34,7 @@ def note_ports() -> Finding:
     found = [
         f"{path} ({text})" if text not in ("", "n/a") else path for path, text in serial_ports()
     ]
-    return Finding("note", "serial ports", ", ".join(found) or "none on this machine")
+    return Finding("note", "serial ports", ", ".join(found) or "none found")
 
 
 def check_runtime_folder() -> Finding:
@@ -44,7 +44,7 @@ def check_runtime_folder() -> Finding:
         return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
     folder = runtime_folder()
     if folder.exists() and folder.stat().st_mode & 0o077:
-        what = f"{folder}: others may enter it, so the local stop is elsewhere"
+        what = f"{folder}: other users may enter it, so the local stop socket is elsewhere"
         return Finding("warn", "runtime folder", what, f"chmod 700 {folder}")
     return Finding("pass", "runtime folder", str(folder))
 
@@ -59,8 +59,8 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
         mode = Path(path).stat()
     except OSError as error:
         dangling = Path(path).is_symlink()
-        why = "leads nowhere" if dangling else (error.strerror or "not found").lower()
-        fix = f"{port_group_remedy(path)}, or set {key} to one of the ports there are"
+        why = "the link has no target" if dangling else (error.strerror or "not found").lower()
+        fix = f"{port_group_remedy(path)}, or set {key} to an available port"
         return Finding("FAIL", path, why, fix)
     if not stat.S_ISCHR(mode.st_mode):
         return Finding("FAIL", path, "is not a serial port", f"set {key}")
@@ -83,19 +83,17 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     others = users(path)
     if others:
         return _busy(path, mode_of_daemon)
-    return Finding("pass", path, "there, may be opened, nobody else has it")
+    return Finding("pass", path, "can be opened, not in use")
 
 
 def _busy(path: str, mode_of_daemon: str) -> Finding:
     others = users(path)
     daemons = [pid for pid, _ in others if _is_daemon(pid)]
     if mode_of_daemon and daemons:
-        text = f"the softfinger daemon that runs here has it ({mode_of_daemon}, process "
-        return Finding(
-            "warn", path, f"{text}{daemons[0]})", "end that one to have its port checked"
-        )
+        text = f"in use by the softfinger daemon that runs here ({mode_of_daemon}, process "
+        return Finding("warn", path, f"{text}{daemons[0]})", "end it to check the port")
     names = ", ".join(f"process {pid} ({name})" for pid, name in others) or "another process"
-    fix = "kill " + " ".join(str(pid) for pid, _ in others) if others else "end that one"
+    fix = "kill " + " ".join(str(pid) for pid, _ in others) if others else "end it"
     return Finding("FAIL", path, f"in use by {names}", fix)
 
 
@@ -179,9 +177,9 @@ def _check(settings: Settings, key: str, address: str) -> Finding:
     if trouble != IN_USE:
         return Finding("FAIL", subject, trouble, f"set {key}")
     if mode := daemon_mode(settings.commands.address, settings.access.keys):
-        text = f"a softfinger daemon runs here already ({mode}); a second one will not start"
-        return Finding("warn", subject, text, "end that one before you start another")
-    text = "in use by something that is not a softfinger daemon"
+        text = f"a softfinger daemon is already running here ({mode}); a second one will not start"
+        return Finding("warn", subject, text, "end it before you start another one")
+    text = "in use by a program other than a softfinger daemon"
     return Finding("FAIL", subject, text, f"end it, or set {key} to another address")
 
 

@@ -39,7 +39,7 @@ class StoredServo(Section):
         known = {each.name: each for each in REGISTERS}
         for name, value in self.registers.items():
             if name not in known:
-                raise ValueError(f"there is no register {name!r}")
+                raise ValueError(f"unknown register {name!r}")
             bits = 8 * known[name].size
             if not -(1 << bits - 1) <= value < 1 << bits:
                 raise ValueError(f"{name}: found {value}, expected {bits} bits")

@@ -31,11 +31,12 @@ from softfinger.daemon.wire.loop_link import ASK, Ask
 
 _PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't occur within a string
 _MALFORMED_REFUSAL = refusal(
-    "envelope: expected the command in one frame, alone or behind an empty frame that ends an "
-    f"envelope of at most {bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes",
+    "envelope: expected the command in one frame, alone or after an envelope of at most "
+    f"{bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes that ends with an "
+    "empty frame",
     Reason.REQUEST,
 )
-_QUEUE_FULL_REFUSAL = refusal("too many commands wait already", Reason.BUSY)
+_QUEUE_FULL_REFUSAL = refusal("too many commands are waiting", Reason.BUSY)
 
 
 class Client:
@@ -73,7 +74,7 @@ class CommandEndpoint(Endpoint):
         """Bind the socket. Raises AddressError."""
         self._admission = admission
         self._config = config
-        text = f"too many commands: at most {config.per_second:g} a second"
+        text = f"too many commands: expected at most {config.per_second:g} per second"
         self._too_many = refusal(text, Reason.BUSY)
         self._send_to_loop = send_to_loop
         self._clock = clock
@@ -165,7 +166,7 @@ class CommandEndpoint(Endpoint):
         elif ends + 1 != len(parts):
             self._answer(route, _MALFORMED_REFUSAL)
         elif len(payload) > self._config.max_bytes:
-            text = f"message of {len(payload)} bytes; at most {self._config.max_bytes}"
+            text = f"message of {len(payload)} bytes, expected at most {self._config.max_bytes}"
             self._answer(route, refusal(text, Reason.REQUEST))
         else:
             came = now if self._dated is None else self._dated

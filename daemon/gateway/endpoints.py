@@ -99,7 +99,7 @@ class Admission(ThreadAuthenticator):
             raise RestartNeeded(str(error)) from None
         gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
         if gone or found.secret != self._keys.secret:
-            raise RestartNeeded(f"access.keys: shut out: {', '.join(gone) or 'all clients'}")
+            raise RestartNeeded(f"access.keys: removed clients: {', '.join(gone) or 'all'}")
         self._keys = found
 
 
@@ -129,7 +129,7 @@ def _taken(path: str) -> str:
     if not Path(path).exists():
         return ""
     if not Path(path).is_socket():
-        return "is there already and is no socket"
+        return "exists and is not a socket"
     with socket.socket(socket.AF_UNIX) as trial:
         trial.setblocking(False)
         try:

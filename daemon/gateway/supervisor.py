@@ -72,7 +72,7 @@ class Gateway:
                 self.link.offer(self._channel)
                 return
             raise AddressError(*fields)
-        raise AddressError("the process that serves clients could not be started")
+        raise AddressError("the gateway process did not start")
 
     def _watch(self) -> None:
         wait, longest = _RESTART_DELAYS
@@ -83,7 +83,7 @@ class Gateway:
                 return
             if status != loop_link.RESTART_STATUS:
                 cause = f"signal {-status}" if status < 0 else f"status {status}"
-                self.link.notices.append(f"the process that serves clients ended ({cause})")
+                self.link.notices.append(f"the gateway process ended ({cause})")
             if time.monotonic() - began > _STABLE_TIME:
                 wait = _RESTART_DELAYS[0]
             error_before = ""
@@ -96,7 +96,7 @@ class Gateway:
                     self._kill()
                     if str(error) != error_before:
                         error_before = str(error)
-                        self.link.notices.append(f"clients can't be served: {error}")
+                        self.link.notices.append(f"the gateway can't start: {error}")
                 else:
                     break
             if self._closing.is_set():  # `close` was called during the restart.
@@ -111,7 +111,7 @@ class Gateway:
             except subprocess.TimeoutExpired:
                 stopped = stopped + 1 if _is_stopped(process.pid) else 0
             if stopped == _STOPPED_COUNT_MAX:
-                self.link.notices.append("the process that serves clients was stopped")
+                self.link.notices.append("the gateway process was suspended")
                 process.kill()
 
     def _kill(self) -> None:

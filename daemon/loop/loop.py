@@ -325,7 +325,7 @@ class Loop:
         if name == "clear":
             self._latch("", "")
         if self._task is not None and not by_task:
-            self._end_task(f"ended by the command {name}")
+            self._end_task(f"ended by command {name}")
         if name == "demo":
             self._task = Task.named(self._settings)
         return reply
@@ -349,7 +349,7 @@ class Loop:
 
     def _end_task(self, reason: str) -> None:
         self._task = None
-        self.emit("warning", "task", f"task over: {reason}")
+        self.emit("warning", "task", f"task ended: {reason}")
 
     def emit(self, level: str, kind: str, text: str) -> None:
         """Publish an event and pass it to the log."""

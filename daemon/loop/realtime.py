@@ -120,7 +120,7 @@ class RealTime:
         self._undo += [gc.unfreeze, partial(sys.setswitchinterval, sys.getswitchinterval())]
         if freeze:
             gc.freeze()
-            self._granted("collector frozen")
+            self._granted("garbage collector frozen")
         gc.enable()
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
@@ -144,8 +144,8 @@ class RealTime:
             for each in undo:
                 each()
             self._refused(
-                f"SCHED_FIFO {priority} refused ({error.strerror}): "
-                "other processes can hold up a tick",
+                f"SCHED_FIFO {priority} refused ({error.strerror}): other processes can delay a "
+                "tick",
                 GRANT_PRIORITY,
             )
         else:
@@ -165,7 +165,7 @@ class RealTime:
         shortened = [_set_slice(calls, thread, nanoseconds) for thread in threads]
         if any(shortened):  # Older kernels ignore the request.
             undo = [partial(_set_slice, calls, thread, 0) for thread in threads]
-            self._granted(f"slices of {nanoseconds * 1e-6:g} ms", *undo)
+            self._granted(f"scheduler slices of {nanoseconds * 1e-6:g} ms", *undo)
 
     def _keep_to_processors(self, cpus: tuple[int, ...]) -> None:
         """Pin the loop thread to processors, which other threads may also use."""
@@ -176,8 +176,8 @@ class RealTime:
         except OSError as error:
             there = ", ".join(map(str, sorted(before)))
             self._refused(
-                f"processor {names} refused ({error.strerror}; there are {there}): "
-                "the loop may move between processors"
+                f"processor {names} refused ({error.strerror}; available: {there}): the loop may "
+                "move between processors"
             )
         else:
             self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))
@@ -206,9 +206,7 @@ class RealTime:
         try:
             descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
-            text = (
-                f"{_LATENCY_DEVICE} refused ({error.strerror}): wake-ups take what idle states take"
-            )
+            text = f"{_LATENCY_DEVICE} refused ({error.strerror}): deep idle states delay wake-ups"
             self._refused(text, "" if isinstance(error, FileNotFoundError) else GRANT_LATENCY)
             return
         try:
@@ -217,14 +215,14 @@ class RealTime:
             os.close(descriptor)
             self._refused(f"{_LATENCY_DEVICE} refused ({error.strerror})")
         else:
-            self._granted("idle states held off", partial(os.close, descriptor))
+            self._granted("deep idle states disabled", partial(os.close, descriptor))
 
     def _sharpen_timer(self, nanoseconds: int) -> None:
         """Reduce the timer slack by which the kernel may delay wake-ups to merge them."""
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
             why = os.strerror(ctypes.get_errno())
-            self._refused(f"timer slack refused ({why}): wake-ups come 50 µs later")
+            self._refused(f"timer slack refused ({why}): wake-ups may be 50 µs late")
         else:  # 0 restores the thread's initial slack.
             undo = partial(libc.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
             self._granted(f"timer slack {nanoseconds} ns", undo)

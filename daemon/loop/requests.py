@@ -46,10 +46,10 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
     """Validate a request against the command table. Raises Refused if it is invalid."""
     name = request["command"]
     if name not in COMMANDS:
-        raise _malformed(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")
+        raise _malformed(f"unknown command {name[:40]!r}; expected one of {', '.join(COMMANDS)}")
     client = request.get("client", "")
     if not isinstance(client, str) or len(client) > 64:
-        raise _malformed("client: expected a text of at most 64 characters")
+        raise _malformed("client: expected a string of at most 64 characters")
     heard, parameters = COMMANDS[name].modes, COMMANDS[name].parameters
     unknown = sorted(set(request) - _ENVELOPE_KEYS - set(parameters))
     if unknown:
@@ -68,10 +68,10 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
             raise _malformed(f"{name}: {key}: expected a finite number, found {value}")
         numbers[key] = float(value)
     if mode not in heard:
-        hint = _MODE_REMEDIES.get(mode) or f"possible while {', '.join(sorted(heard))}"
+        hint = _MODE_REMEDIES.get(mode) or f"accepted in {', '.join(sorted(heard))}"
         if name == "clear":
             hint = "there is no fault"
-        raise Refused(f"{name}: not while {mode.value}; {hint}", Reason.MODE)
+        raise Refused(f"{name}: not accepted in mode {mode.value}; {hint}", Reason.MODE)
     return Command(name, numbers, client)
 
 
@@ -110,7 +110,7 @@ class Lease:
             return
         if now < self._until and command.client != self._owner:
             owner = self._owner or "an unnamed client"
-            text = f"{command.name}: {owner} commands the hand ({self._until - now:.1f} s)"
+            text = f"{command.name}: {owner} has the lease for another {self._until - now:.1f} s"
             raise Refused(text, Reason.LEASE)
 
     def lapses(self, now: float) -> str:
@@ -121,7 +121,7 @@ class Lease:
         if not -math.inf < self._until <= now:
             return ""
         self._until = -math.inf
-        return self._owner or "the commander"
+        return self._owner or "the commanding client"
 
     def renew(self, command: Command, now: float) -> None:
         """Take or extend the lease after the execution of a command."""
@@ -251,7 +251,10 @@ class Requests:
         streamed = name == "hold" and self._control.mode in GRIPPING_MODES
         longest = AGE_MAX if streamed or name in SAFE_COMMANDS else self._command_age_max
         if age > longest:
-            text = f"{name}: {age:.2f} s old when its turn came, at most {longest:g} s is allowed"
+            text = (
+                f"{name}: the command was {age:.2f} s old when it was handled, expected at most "
+                f"{longest:g} s"
+            )
             raise Refused(f"{text}; send it again", Reason.LATE)
 
     def _check(self, name: str, numbers: dict[str, float]) -> None:
@@ -266,7 +269,7 @@ class Requests:
             refuse_if(
                 state.torque and not self._control.torque,
                 Reason.STATE,
-                "the servos have not confirmed torque off yet: check their cable and their power",
+                "the servos have not confirmed torque off yet: check their cable and power",
             )
         begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING_MODES)
         if begins or name in ("arm", "clear"):
@@ -274,25 +277,25 @@ class Requests:
             refuse_if(cause, Reason.STATE, cause)
         if name == "arm":
             refuse_if(self._torque.servos is None, Reason.SCENE, "this scene has no servos")
-            text = "the servos did not answer at this tick; send it again"
+            text = "the servos did not answer in this tick; send it again"
             refuse_if(not state.reading.valid, Reason.LATE, text)
         elif name == "tare":
             refuse_if(not fingers, Reason.SCENE, "this scene has no tactile sensors")
             touched = any(contact.contact for contact in state.contacts)
-            refuse_if(touched, Reason.STATE, "something touches a tip")
+            refuse_if(touched, Reason.STATE, "a tip is in contact; free both tips")
         elif name == "move":
             self._check_move(numbers)
         elif name == "demo":
-            text = "the profile names no task; softfinger run --config demo has one"
+            text = "the profile defines no task; `softfinger run --config demo` has one"
             refuse_if(settings.task.name == "none", Reason.SCENE, text)
         elif name == "hold":
             refuse_if(not numbers, Reason.REQUEST, "force or angle is missing")
         if begins:
             taring = any(perception.is_taring for perception in fingers)
-            refuse_if(taring, Reason.STATE, "tare is still at work")
+            refuse_if(taring, Reason.STATE, "a tare is in progress")
             text = "each finger needs a tactile sensor in this scene"
             refuse_if(not fingers, Reason.SCENE, text)
-            text = 'nothing bounds the current while servos.mode is "position"'
+            text = 'servos.mode = "position" does not limit the current; choose another mode'
             refuse_if(settings.servos.mode == "position", Reason.SCENE, text)
             numbers.setdefault("force", settings.control.force_default)
         if "force" in numbers:
@@ -301,7 +304,7 @@ class Requests:
             refuse_if(not low < force <= high, Reason.BOUNDS, text)
         if "angle" in numbers:
             turns = len(settings.scene.fingers) == 2 and settings.scene.object_model
-            text = "needs both fingers and the object model in the scene"
+            text = "an angle needs two fingers and scene.object_model = true"
             refuse_if(not turns, Reason.SCENE, text)
             if self._control.mode in HOLDING_MODES and (name == "rotate" or not state.object.valid):
                 text = self._control.fingers.turn_refusal(numbers["angle"])
@@ -339,7 +342,7 @@ class Requests:
             self._torque.reconnect()
         except ServoError as error:
             raise Refused(f"clear: {error}") from None
-        self._emit("info", "servos", "connected anew")
+        self._emit("info", "servos", "reconnected")
 
     def _reopen(self, name: str) -> None:
         """Reopen sensors with a lost port. Only ``clear`` and ``arm`` do this, with torque off.
@@ -363,7 +366,7 @@ class Requests:
                     raise Refused(f"{name}: {error}") from None
                 self._emit("warning", "tactile", str(error))
             else:
-                self._emit("info", "tactile", f"{side} sensor opened anew")
+                self._emit("info", "tactile", f"{side} sensor reopened")
                 self._perception.update(self._state)
 
     def _status(self) -> dict[str, Any]:

@@ -141,8 +141,12 @@ class Lateness:
         return None
 
     def _text(self, new: float) -> str:
-        did = f"the hand waited {new:.2f} s" if self._waits else f"ticks came {new:.2f} s late"
-        return f"this machine is busy: {did}, {self._sum:.1f} s in all"
+        did = (
+            f"the simulated hand waited {new:.2f} s"
+            if self._waits
+            else f"ticks were {new:.2f} s late"
+        )
+        return f"this machine is busy: {did}, {self._sum:.1f} s in total"
 
     def with_cause(self, name: str, text: str, at_work: float) -> str:
         """Return the fault text, prefixed with "this machine was busy" if this may be the cause.

@@ -189,7 +189,7 @@ def load_calibration(path: Path) -> Calibration:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise CalibrationFileError(
-            f"{path}: no calibration of this version: {where}: {first['msg']}"
+            f"{path}: not a calibration file of this version: {where}: {first['msg']}"
         ) from None
     wrong = _contradiction(calibration)
     if wrong:
@@ -208,7 +208,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
     calibration = load_calibration(Path(name))
     wrong = difference(calibration.sensor, sensor_of(settings, finger))
     if wrong:
-        raise CalibrationFileError(f"{name}: this is the calibration of another sensor: {wrong}")
+        raise CalibrationFileError(f"{name}: calibration of another sensor: {wrong}")
     return calibration
 
 
@@ -216,7 +216,7 @@ def difference(file: Sensor, there: Sensor) -> str:
     """Describe how the sensor of a file differs from ``there``; return "" if they are equal."""
     pairs = [
         ("finger", file.finger, there.finger),
-        ("sensor", file.label or "no name", there.label or "no name"),
+        ("sensor", file.label or "unnamed", there.label or "unnamed"),
         ("grid", f"{file.rows} × {file.cols}", f"{there.rows} × {there.cols}"),
         ("full_count", str(file.full_count), str(there.full_count)),
     ]
@@ -268,8 +268,8 @@ class Converter:
             finite = math.isfinite(self.largest)
         if not finite:
             raise CalibrationFileError(
-                f"calibration: its curve {self._curve[1]:g}·x^{self._curve[0]:g} has no number of "
-                f"Pa for a full cell"
+                f"calibration: the curve {self._curve[1]:g}·x^{self._curve[0]:g} gives no finite "
+                "pressure for a saturated cell"
             )
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
@@ -331,18 +331,18 @@ def _contradiction(calibration: Calibration) -> str:
         if len(rows) != sensor.rows or any(len(row) != sensor.cols for row in rows):
             return f"{name}: expected {sensor.rows} rows of {sensor.cols} numbers"
         if min(min(row) for row in rows) < 0.0:
-            return f"{name}: expected no number below 0"
+            return f"{name}: expected no negative numbers"
     rho = calibration.tare.correlation if calibration.tare else []
     if rho and (len({len(row) for row in rho}) > 1 or rho[0][:1] != [1.0]):
-        return "tare.correlation: expected rows of equal length, the first beginning with 1"
+        return "tare.correlation: expected rows of equal length, the first one starting with 1"
     if calibration.equilibrate and not any(map(any, calibration.equilibrate.gain)):
-        return "equilibrate.gain: every cell is dead"
+        return "equilibrate.gain: all cells are dead"
     if calibration.curve:
         converter = Converter(Calibration(sensor=sensor, date="", curve=calibration.curve), 1.0)
         counts = np.linspace(0, sensor.full_count, min(_MONOTONE_POINTS, sensor.full_count + 1))
         pressures = [converter.at(int(count)).max() for count in counts]
         if not np.isfinite(pressures).all() or (np.diff(pressures) <= 0.0).any():
-            return "curve.coefficients: the pressure doesn't rise with the count"
+            return "curve.coefficients: the pressure must increase with the count"
     if calibration.modulus:
         try:
             calibration.modulus.material()

@@ -92,8 +92,8 @@ def make_models(
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
         if material.misfits is not None and on_event is not None:
             text = (
-                f"{name}: the law is within {material.fit_error:.0f} Pa of its points, which is "
-                f"{material.worst_force_error:.1%} of F at most"
+                f"{name}: the law fits its points within {material.fit_error:.0f} Pa, at most "
+                f"{material.worst_force_error:.1%} of F"
             )
             on_event("info", "material", text)
     left, right = (made.get(k) or replace(made[1 - k], finger=k) for k in range(len(FINGERS)))
@@ -125,18 +125,18 @@ def _measured_tip(settings: Settings, finger: int, calibration: Calibration | No
     file = settings.tactile.calibration[finger]
     if law is None:
         raise SettingsError(
-            f'tip.physics: found "measured", but {file or "tactile.calibration"} has no curves of '
-            f"{FINGERS[finger]}; `softfinger calibrate law` measures them"
+            f'tip.physics: found "measured", but {file or "tactile.calibration"} has no curves '
+            f"for the {FINGERS[finger]} tip; measure them with `softfinger calibrate law`"
         )
     if law.radius != settings.tip.radius:
         raise SettingsError(
-            f"tip.radius: found {settings.tip.radius:g} m, expected {law.radius:g} m, as when "
-            f"{file} was measured"
+            f"tip.radius: found {settings.tip.radius:g} m, expected {law.radius:g} m, the radius "
+            f"in {file}"
         )
     if settings.safety.d_max > law.deepest:
         raise SettingsError(
-            f"safety.d_max: found {settings.safety.d_max:g} m, expected at most {law.deepest:g} m, "
-            f"the deepest press of {file}"
+            f"safety.d_max: found {settings.safety.d_max:g} m, expected at most {law.deepest:g} "
+            f"m, the deepest press in {file}"
         )
     return Fingertip(law.radius, "measured", law=law)
 

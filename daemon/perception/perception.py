@@ -253,7 +253,7 @@ class FingerPerception:
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
         if not np.median(ends) > 0.0:  # Above such a zero offset, no contact could be measured.
-            text = f"{side} sensor's zero stays: most cells are full where nothing presses"
+            text = f"{side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))
             return
         if self._converter is not None:

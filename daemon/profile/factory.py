@@ -20,7 +20,7 @@ def make_tip(settings: Settings) -> Fingertip:
     tip = settings.tip
     if tip.physics == "measured":
         raise SettingsError(
-            'tip.physics: found "measured", expected "springs" or "solid" for what needs a model'
+            'tip.physics: found "measured", expected "springs" or "solid", which have a model'
         )
     return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base, tip.face)
 
@@ -31,8 +31,8 @@ def law_problem(material: Material, limit: float) -> str:
     if found <= limit:
         return ""
     return (
-        f"the smooth law misses its points by up to {material.fit_error:.4g} Pa, which makes "
-        f"{found:.1%} of F; expected {limit:.1%} at most (material.force_error_max)"
+        f"the smooth law deviates from its points by up to {material.fit_error:.4g} Pa, "
+        f"{found:.1%} of F; expected at most {limit:.1%} (material.force_error_max)"
     )
 
 

@@ -74,7 +74,7 @@ def names_backend(kind: Kind) -> AfterValidator:
             backend(kind, name)
         except PluginError as error:
             why = {"why": str(error)}
-            raise PydanticCustomError("plugin", "a plugin that works: {why}", why) from None
+            raise PydanticCustomError("plugin", "a working plugin: {why}", why) from None
         except KeyError:
             *most, last = map(repr, known(kind))
             listed = {"known": f"{', '.join(most)} or {last}"}

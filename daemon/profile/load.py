@@ -101,7 +101,7 @@ def checked(data: dict[str, Any]) -> Settings:
 def _without_errors(found: ExaminedProfile) -> Settings:
     lines, more = found.errors[:_ERROR_COUNT_MAX], len(found.errors) - _ERROR_COUNT_MAX
     if more > 0:
-        lines.append(f"{found.name}: and {more} more errors")
+        lines.append(f"{found.name}: {more} more errors")
     if lines:
         raise SettingsError("\n".join(lines))
     return found.settings
@@ -163,8 +163,7 @@ def find(path: Path) -> Path:
     file = _PROFILES / f"{path.name}.toml"
     if not file.exists():
         raise SettingsError(
-            f"{path}: found no such profile, expected the path of a file or one of "
-            f"{', '.join(names())}"
+            f"{path}: no such profile; expected a file or one of {', '.join(names())}"
         )
     return file
 
@@ -200,7 +199,7 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raw = tomllib.loads(profile_text(path))
         return {key: _tuples(item) for key, item in raw.items()}
     except OSError as error:
-        hint = f"; {path.stem} alone names the packaged one" if path.stem in names() else ""
+        hint = f"; `{path.stem}` alone selects the packaged profile" if path.stem in names() else ""
         raise SettingsError(f"{name}: can't be read: {error.strerror}{hint}") from None
     except UnicodeDecodeError as error:
         raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
@@ -262,10 +261,10 @@ def _plugin_problems(settings: Settings) -> Iterator[str]:
             above = ["plugins", each.name]
             yield from (_line(every, above, each.section) for every in error.errors())
         if each.name in tables and each.section is None:
-            yield f"plugins.{each.name}: found settings, but {each.source} has none"
+            yield f"plugins.{each.name}: found settings, but {each.source} has no settings"
     for name in tables:
         if not any(name in known(kind) for kind in BUILT_IN):
-            yield f"plugins.{name}: found settings of a plugin that is not installed"
+            yield f"plugins.{name}: found settings, but this plugin is not installed"
 
 
 def _line(
@@ -277,7 +276,7 @@ def _line(
     key = shown(".".join(location))[1:-1]
     if details["type"] == "extra_forbidden":
         known = list(_model(inside[:-1], model).model_fields)
-        return f"{key}: found an unknown key, expected a known one{nearest(location[-1], known)}"
+        return f"{key}: unknown key{nearest(location[-1], known)}"
     if details["type"] in ("model_type", "model_attributes_type", "dict_type"):
         return f"{key}: found {shown(details['input'])}, expected a table"
     expected = _MESSAGE_START.sub("", details["msg"], count=1)

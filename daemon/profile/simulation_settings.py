@@ -86,7 +86,7 @@ class SimulationSettings(Section):
         0.0, "", "Fraction of the mean of its row and column that is added to each cell."
     )
     tactile_row_noise: NonNegative = setting(
-        0.0, "Pa", "Standard deviation of the noise that all cells of a row share."
+        0.0, "Pa", "Standard deviation of the noise that is common to all cells of a row."
     )
     tactile_drift: NonNegative = setting(
         0.0, "Pa", "Standard deviation of the zero drift of each cell."

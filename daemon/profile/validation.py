@@ -50,7 +50,7 @@ def _wide_sensor(settings: Settings) -> Iterator[str]:
     ):
         yield (
             f"tactile.rows, cols, pitch: found a sensor of {_size(settings)} for a tip of "
-            f"{tip.radius * 2e3:.4g} mm diameter; is it another tip's, or tip.radius wrong?"
+            f"{tip.radius * 2e3:.4g} mm diameter: check these settings and tip.radius"
         )
 
 
@@ -184,7 +184,7 @@ def _backends(settings: Settings) -> Iterator[str]:
         yield f"{both}, expected at least one"
     metal = {backend("servos", servos).metal, backend("tactile", tactile).metal}
     if "none" not in (servos, tactile) and len(metal) > 1:
-        yield f"{both}, expected both real or both simulated (none takes one out)"
+        yield f'{both}, expected both real or both simulated, or "none" for one of them'
 
 
 def _joints(settings: Settings) -> Iterator[str]:
@@ -217,10 +217,10 @@ def _ports(settings: Settings) -> Iterator[str]:
     for key, port in ports:
         place = os.path.realpath(port)
         if place in taken:
-            same = "" if place == port else f", which leads to {shown(place)}"
+            same = "" if place == port else f", a link to {shown(place)}"
             yield (
                 f"{key}: found {shown(port)}{same}, expected another port than {taken[place]}; "
-                "boards without a serial number of their own have names in /dev/serial/by-path"
+                "boards without serial numbers have distinct names in /dev/serial/by-path"
             )
         taken.setdefault(place, key)
 
@@ -230,7 +230,9 @@ def _timing(settings: Settings) -> Iterator[str]:
     for key in ("watchdog", "fault_after"):
         value = getattr(settings.servos, key)
         if 0.0 < value <= 2.0 * period:
-            yield f"servos.{key}: found {value:g} s, expected above two ticks, {2.0 * period:g} s"
+            yield (
+                f"servos.{key}: found {value:g} s, expected more than two ticks, {2.0 * period:g} s"
+            )
 
 
 def _measured_tip(settings: Settings) -> Iterator[str]:
@@ -239,11 +241,11 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
     backend = settings.tactile.backend
     if backend in ("simulated", "none"):
         yield (
-            f'tip.physics: found "measured" with tactile.backend = "{backend}", expected "springs" '
-            'or "solid": measured curves are of frames that a board sends'
+            f'tip.physics: found "measured" with tactile.backend = "{backend}", expected '
+            '"springs" or "solid": measured curves need the frames of a real board'
         )
     else:
-        file = 'the file of `softfinger calibrate law` with tip.physics = "measured"'
+        file = 'a file of `softfinger calibrate law` because of tip.physics = "measured"'
         yield from _missing(settings, "calibration", file)
 
 
@@ -275,7 +277,7 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
     yield from _too_large("safety.d_max", settings.safety.d_max, "m", 0.4 * tip.radius, why)
     if tactile.backend == "none":
         return
-    why = "a quarter of a solid tip's radius: more of it hides θ"
+    why = "a quarter of a solid tip's radius, since a wider blur hides θ"
     blurred = list(_too_large("tactile.blur", tactile.blur, "m", 0.25 * tip.radius, why))
     yield from blurred
     if not [*blurred, *_blur(settings)]:
@@ -292,7 +294,7 @@ def _cells_under(settings: Settings) -> Iterator[str]:
     cells = cells_within_rim(make_grid(settings), make_tip(settings), known).sum()
     if cells < CELLS_MIN:
         yield (
-            f"tactile.pitch, tactile.centre: found {cells} cells well within a solid tip's rim, "
+            f"tactile.pitch, tactile.centre: found {cells} cells inside a solid tip's rim, "
             f"expected at least {CELLS_MIN}"
         )
 
@@ -329,7 +331,7 @@ def _wedge(settings: Settings) -> Iterator[str]:
     if abs(simulation.object_taper) >= limit:
         yield (
             f"simulation.object_taper: found {simulation.object_taper:g} rad, expected less than "
-            f"{limit:.3g}, at which this width and height make the faces meet"
+            f"{limit:.3g} rad, where the faces would meet at this width and height"
         )
 
 
@@ -338,9 +340,9 @@ def _dither(settings: Settings) -> Iterator[str]:
     if control.law != "upright":
         return
     limit = settings.safety.current_max * control.torque_constant
-    why = "what safety.current_max gives"
+    why = "the torque at safety.current_max"
     yield from _too_large("control.dither_torque", control.dither_torque, "N·m", limit, why)
-    limit, why = settings.loop.rate / _DITHER_TICKS_MIN, f"{_DITHER_TICKS_MIN} ticks a period"
+    limit, why = settings.loop.rate / _DITHER_TICKS_MIN, f"{_DITHER_TICKS_MIN} ticks per period"
     yield from _too_large("control.dither_frequency", control.dither_frequency, "Hz", limit, why)
 
 
@@ -358,12 +360,14 @@ def _cells(settings: Settings) -> Iterator[str]:
 def _blur(settings: Settings) -> Iterator[str]:
     tactile = settings.tactile
     limit = 0.5 * min(_sides(settings))
-    yield from _too_large("tactile.blur", tactile.blur, "m", limit, "half the sensor")
+    yield from _too_large(
+        "tactile.blur", tactile.blur, "m", limit, "half of the sensor's shorter side"
+    )
 
 
 def _recordings(settings: Settings) -> Iterator[str]:
     if settings.tactile.backend == "replay":
-        yield from _missing(settings, "recording", "a recording")
+        yield from _missing(settings, "recording", "the path of a recording")
 
 
 def _clock(settings: Settings) -> Iterator[str]:
@@ -385,8 +389,8 @@ def _forces(settings: Settings) -> Iterator[str]:
     low, high = settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
     if low >= high:
         yield (
-            f"control.contact_force: found {low:g} N, expected below {GRIP_FRACTION:g} "
-            f"safety.force_max, {high:g}"
+            f"control.contact_force: found {low:g} N, expected below {GRIP_FRACTION:g} × "
+            f"safety.force_max = {high:g} N"
         )
         return
     for key, force in _set_forces(settings):
@@ -408,7 +412,7 @@ def address_problem(address: str, lacking: str) -> str:
         return ""
     hint = ""
     if lacking and _ANY_TCP.fullmatch(address):
-        hint = f"; other addresses need {lacking}, which `softfinger keys` makes"
+        hint = f"; other addresses need {lacking}, which `softfinger keys` creates"
     return (
         f"found {shown(address)}, expected tcp://127.0.0.1:PORT with a port of 1 to 65535, "
         f"or ipc://PATH{hint}"
@@ -428,7 +432,7 @@ def _addresses(settings: Settings) -> Iterator[str]:
             yield f"{key}: {problem}"
         first = next(other for other in addresses if addresses[other] == address)
         if first != key:
-            yield f"{key}: found {shown(address)}, expected another than {first}"
+            yield f"{key}: found {shown(address)}, expected an address other than {first}"
 
 
 def _folder(settings: Settings) -> Iterator[str]:
@@ -439,7 +443,7 @@ def _folder(settings: Settings) -> Iterator[str]:
         ports += [("tactile.port", port) for port in settings.tactile.port]
     for key, port in ports:
         if "{dir}" in port:
-            yield f"{key}: found {shown(port)}, expected --dir to say which folder {{dir}} is"
+            yield f"{key}: found {shown(port)}, expected the option --dir for the folder {{dir}}"
 
 
 _CHECKS = (

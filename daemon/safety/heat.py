@@ -126,7 +126,7 @@ class HeatWatch:
         if left > self._limits.heat_warn:
             self._error_reported = False
             return ""
-        who = f"{FINGERS[i]} servo at {self._limits.temperature_max:g} °C in {left:.0f} s"
+        who = f"{FINGERS[i]} servo will reach {self._limits.temperature_max:g} °C in {left:.0f} s"
         if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
             return ""  # The last reduction has not taken effect yet.
         now = state.goal.force
@@ -138,7 +138,7 @@ class HeatWatch:
         if eased < _FRACTION_MAX * now:
             self._reduction_time = state.t
             control.limit_force(eased, _ACTION_TIME)
-            text = f"{who}: grip eased from {now:.1f} to {eased:.1f} N"
+            text = f"{who}: grip force reduced from {now:.1f} to {eased:.1f} N"
             events.append(("warning", "servos.heat", text))
             return ""
         if left > _ERROR_TIME:
@@ -146,6 +146,6 @@ class HeatWatch:
         action = self._limits.heat_action
         if not self._error_reported:
             self._error_reported = True
-            text = f"{who}, and the load needs the grip: {action}"
+            text = f"{who}, and the load does not allow a weaker grip: {action}"
             events.append(("error", "servos.heat", text))
         return action if left < _ACTION_TIME and action != "hold" else ""

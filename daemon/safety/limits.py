@@ -216,46 +216,46 @@ LIMITS: list[Limit] = []
 
 # --- servos ---------------------------------------------------------------------------------------
 
-LIMITS.append(Limit("servos.bus", "the port is there, the servos obey and were not stopped by "
-    "their watchdog", "fault", ("servos.watchdog",)))  # fmt: skip
+LIMITS.append(Limit("servos.bus", "lost port, stopped servo or servo that rejects goals", "fault",
+    ("servos.watchdog",)))  # fmt: skip
 
 
-@Limit("servos.silent", "age of the last good servo reading; an error reply is not one", "fault",
+@Limit("servos.silent", "age of the last valid servo reading; error replies do not count", "fault",
     ("servos.fault_after",), "servos")  # fmt: skip
 def _servos_silent(view: View, state: State, _: float) -> str:
     age = state.t - state.reading.t
     if age <= view.settings.servos.fault_after:
         return ""
     lasted = "yet" if age == math.inf else f"for {age:.3f} s"
-    return f"servos: no good reading {lasted}"
+    return f"servos: no valid reading {lasted}"
 
 
-@Limit("servos.silent", "share of the last second's servo readings that failed, with and without "
-    "torque", "warn", ("servos.reply_timeout",), "servos")  # fmt: skip
+@Limit("servos.silent", "fraction of failed readings in the last second, with and without torque",
+    "warn", ("servos.reply_timeout",), "servos")  # fmt: skip
 def _servos_late(view: View, _: State, fraction: float) -> str:
     if view.failed <= fraction * _FAILED_FRACTION_MAX:
         return ""
     allowed = 1e3 * view.settings.servos.reply_timeout
     return (
-        f"servos: {view.failed:.0%} of the last second's readings failed: no sound reply within "
-        f"servos.reply_timeout = {allowed:g} ms; `softfinger doctor` times the replies"
+        f"servos: {view.failed:.0%} of the readings in the last second failed: no valid reply "
+        f"within servos.reply_timeout = {allowed:g} ms; `softfinger doctor` times the replies"
     )
 
 
-@Limit("servos.frozen", "servo whose own clock stands still for 0.1 s: its readings are old",
-    "fault", needs="servos")  # fmt: skip
+@Limit("servos.frozen", "servo whose clock register has not changed for 0.1 s, so its readings are "
+    "old", "fault", needs="servos")  # fmt: skip
 def _servos_frozen(view: View, state: State, _: float) -> str:
     frozen = state.reading.frozen
     if not frozen:
         return ""
-    return f"servos: old readings from {_names(view, frozen)}: its own clock stands still"
+    return f"servos: readings from {_names(view, frozen)} are old: the clock register stands still"
 
 
 def _names(view: View, bits: int) -> str:
     return " and ".join(FINGERS[i] for i in view.fingers if bits >> i & 1)
 
 
-@Limit("servos.alert", "hardware error that a servo reports", "fault", needs="servos")
+@Limit("servos.alert", "hardware error reported by a servo", "fault", needs="servos")
 def _servos_alert(view: View, state: State, _: float) -> str:
     reading = state.reading
     if not reading.alert:
@@ -268,30 +268,36 @@ def _servos_alert(view: View, state: State, _: float) -> str:
     return f"servos: hardware error reported by {' and '.join(parts)}"
 
 
-@Limit("servos.heat", "time until a servo is at its limit of temperature, by its thermal model",
-    "warn", ("safety.heat_warn", "safety.heat_action"), "servos", in_turn=True).each  # fmt: skip
+@Limit("servos.heat", "predicted time until a servo reaches its temperature limit", "warn",
+    ("safety.heat_warn", "safety.heat_action"), "servos", in_turn=True).each  # fmt: skip
 def _servos_warm(view: View, state: State, fraction: float, i: int) -> str:
     left = state.heat[i].time_to_limit
     if left >= view.limits.heat_warn / fraction:
         return ""
-    return f"{FINGERS[i]} servo at {view.limits.temperature_max:g} °C in {left:.0f} s"
+    return f"{FINGERS[i]} servo will reach {view.limits.temperature_max:g} °C in {left:.0f} s"
 
 
 @Limit("servos.temperature", "temperature of a servo", "fault", ("safety.temperature_max",),
     "servos", in_turn=True).each  # fmt: skip
 def _servos_hot(view: View, state: State, fraction: float, i: int) -> str:
     temperature = state.reading.temperature[i]
-    well = temperature < fraction * view.limits.temperature_max
-    return "" if well else f"{FINGERS[i]} servo at {temperature:.0f} °C"
+    bound = fraction * view.limits.temperature_max
+    if temperature < bound:
+        return ""
+    return f"{FINGERS[i]} servo is at {temperature:.0f} °C, above {bound:g} °C"
 
 
-@Limit("servos.voltage", "supply of a servo", "fault", ("safety.voltage_min", "safety.voltage_max"),
-    "servos", in_turn=True, lasts=0.1).each  # fmt: skip
+@Limit("servos.voltage", "supply voltage of a servo", "fault",
+    ("safety.voltage_min", "safety.voltage_max"), "servos", in_turn=True,
+    lasts=0.1).each  # fmt: skip
 def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
     (low, high), voltage = view.voltage, state.reading.voltage[i]
     if not voltage or low <= voltage <= high:
         return ""
-    return f"{FINGERS[i]} servo's supply at {voltage:.1f} V, outside {low:.1f} to {high:.1f} V"
+    return (
+        f"supply voltage of the {FINGERS[i]} servo is {voltage:.1f} V, expected {low:.1f} to "
+        f"{high:.1f} V"
+    )
 
 
 # --- joints ---------------------------------------------------------------------------------------
@@ -299,29 +305,33 @@ def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
 _STOP_TOLERANCE = 0.1  # rad, tolerance for joints pushed beyond their limits
 
 
-@Limit("joint.angle", "joint angle, 0.1 rad past its limits", "fault", ("hand.q_min", "hand.q_max"),
-    "servos").each  # fmt: skip
+@Limit("joint.angle", "joint angle, 0.1 rad beyond its limits", "fault",
+    ("hand.q_min", "hand.q_max"), "servos").each  # fmt: skip
 def _joint_angle(view: View, state: State, _: float, i: int) -> str:
     hand, q = view.settings.hand, state.reading.q[i]
-    inside = hand.q_min[i] - _STOP_TOLERANCE <= q <= hand.q_max[i] + _STOP_TOLERANCE
-    return "" if inside else f"{FINGERS[i]} joint at {q:.3f} rad, outside its limits"
+    low, high = hand.q_min[i], hand.q_max[i]
+    if low - _STOP_TOLERANCE <= q <= high + _STOP_TOLERANCE:
+        return ""
+    return f"{FINGERS[i]} joint is at {q:.3f} rad, outside {low:g} to {high:g} rad"
 
 
 @Limit("joint.velocity", "joint velocity", "fault", ("safety.velocity_max",), "servos").each
 def _joint_velocity(view: View, state: State, _: float, i: int) -> str:
     bound, dq = view.limits.velocity_max, state.reading.dq[i]
-    return "" if -bound <= dq <= bound else f"{FINGERS[i]} joint at {dq:.2f} rad/s, too fast"
+    if -bound <= dq <= bound:
+        return ""
+    return f"{FINGERS[i]} joint moves at {dq:.2f} rad/s, above {bound:g} rad/s"
 
 
-@Limit("joint.jump",
-    "joint angle against its velocity, 0.1 rad within 0.1 s, and against the greatest velocity",
-    "fault", ("safety.velocity_max",), "servos")  # fmt: skip
+@Limit("joint.jump", "joint angle that differs from its integrated velocity by 0.1 rad within 0.1 "
+    "s, or changes faster than the maximum velocity", "fault", ("safety.velocity_max",),
+    "servos")  # fmt: skip
 def _joint_jump(view: View, _: State, __: float) -> str:
     if not view.motion.jumped:
         return ""
     return (
-        f"{_names(view, view.motion.jumped)} joint's angle went where its velocity did not: its "
-        "encoder, or what turns it, has slipped"
+        f"angle of the {_names(view, view.motion.jumped)} joint does not follow its velocity: "
+        "its encoder or coupling has slipped"
     )
 
 
@@ -330,8 +340,8 @@ _EXPECTED_CURRENT_MIN = 0.04  # A, minimum expected current for the check
 _CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 
 
-@Limit("joint.dead", "joint that stands 0.05 rad off its goal without current for 0.05 s", "fault",
-    needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
+@Limit("joint.dead", "joint 0.05 rad from its goal that does not move and draws no current for "
+    "0.05 s", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     """Report a joint that is stationary away from its goal without drawing current.
 
@@ -349,8 +359,9 @@ def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     if not (expected > _EXPECTED_CURRENT_MIN and toward < _CURRENT_FRACTION_MIN * expected):
         return ""
     return (
-        f"{FINGERS[i]} joint stands {math.degrees(abs(error)):.1f}° off its goal and takes "
-        f"{toward:.2f} A of {goal.current[i]:.2f} A to get there: encoder, current sensor or motor"
+        f"{FINGERS[i]} joint stands still {math.degrees(abs(error)):.1f}° from its goal and "
+        f"draws only {toward:.2f} A of {goal.current[i]:.2f} A: check encoder, current sensor "
+        "and motor"
     )
 
 
@@ -359,14 +370,14 @@ def _joint_dead(view: View, state: State, _: float, i: int) -> str:
 def _joint_current(view: View, state: State, _: float, i: int) -> str:
     bound, current = view.limits.current_fault, state.reading.current[i]
     well = -bound <= current <= bound
-    return "" if well else f"{FINGERS[i]} joint takes {current:.2f} A, above {bound:g} A"
+    return "" if well else f"{FINGERS[i]} joint draws {current:.2f} A, more than {bound:g} A"
 
 
 _FULL_CURRENT = 0.9  # fraction of the goal's current limit that counts as saturated
 
 
-@Limit("joint.stall", "current at its bound, off the goal, and standing", "fault",
-    ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
+@Limit("joint.stall", "joint that does not move, at its highest current and away from its goal",
+    "fault", ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
     lasts="stall_time").each  # fmt: skip
 def _joint_stall(view: View, state: State, _: float, i: int) -> str:
     if not state.torque or not state.goal.valid or state.mode in GRIPPING_MODES:
@@ -378,18 +389,18 @@ def _joint_stall(view: View, state: State, _: float, i: int) -> str:
     stands = current >= full and abs(reading.dq[i]) < _STANDSTILL_SPEED
     if not (stands and error > view.limits.stall_error):
         return ""
-    off = f"{math.degrees(error):.1f}° off its goal"
-    return f"{FINGERS[i]} joint has stalled, {off} at {current:.2f} A"
+    off = f"{math.degrees(error):.1f}° from its goal"
+    return f"{FINGERS[i]} joint has stalled {off} at {current:.2f} A"
 
 
-@Limit("joint.swapped", "tip that another finger's joint moves, or a turn against its command",
-    "fault", ("servos.ids",), "sensors")  # fmt: skip
+@Limit("joint.swapped", "joint that moves the other finger's tip, or object that turns against its "
+    "command", "fault", ("servos.ids",), "sensors")  # fmt: skip
 def _joint_swapped(view: View, _: State, __: float) -> str:
     return view.wiring.swapped
 
 
-@Limit("joint.blocked", "joint that stands in an approach with all its current for 0.5 s, and its "
-    "tip feels nothing", "warn", ("servos.direction",), "servos", lasts=0.5).each  # fmt: skip
+@Limit("joint.blocked", "joint that stops in the approach at its highest current for 0.5 s, "
+    "without contact", "warn", ("servos.direction",), "servos", lasts=0.5).each  # fmt: skip
 def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     goal, reading, contact = state.goal, state.reading, state.contacts[i]
     if state.mode != Mode.GRASPING or not goal.valid or not view.sensors or contact.contact:
@@ -401,9 +412,9 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     if not (full and stands):
         return ""
     return (
-        f"{FINGERS[i]} joint stands at {math.degrees(reading.q[i]):.0f}° in the approach, and its "
-        "tip feels nothing: something is in its way, or it opens instead of closing: is "
-        "servos.direction right?"
+        f"{FINGERS[i]} joint has stopped at {math.degrees(reading.q[i]):.0f}° in the approach, "
+        "and its tip has no contact: remove what blocks it; if it opens instead of closing, "
+        "correct servos.direction"
     )
 
 
@@ -438,44 +449,44 @@ def _joint_opens(view: View, state: State, _: float) -> str:
 _CURRENT_FRACTION_MAX = 0.95  # fraction of the maximum current that counts as saturated
 
 
-@Limit("joint.strained", "grip that takes all the current there may be", "warn",
+@Limit("joint.strained", "joint that needs the highest current in a grip", "warn",
     ("safety.current_max",), "servos", in_turn=True, lasts=1.0).each  # fmt: skip
 def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     limit = view.limits.current_max
     well = abs(state.reading.current[i]) < _CURRENT_FRACTION_MAX * fraction * limit
     if not state.torque or state.mode not in GRIPPING_MODES or well:
         return ""
-    return f"{FINGERS[i]} joint grips with all of its {limit:g} A"
+    return f"{FINGERS[i]} joint needs the highest current, {limit:g} A, for this grip"
 
 
-LIMITS.append(Limit("torque.off", "torque off not confirmed within half the watchdog's time: the "
-    "bus is kept silent until the watchdog stops the servos", "fault",
+LIMITS.append(Limit("torque.off", "torque off not confirmed within half of servos.watchdog; the "
+    "bus is then kept silent until the watchdogs stop the servos", "fault",
     ("servos.watchdog",)))  # fmt: skip
 
 
 # --- goals ----------------------------------------------------------------------------------------
 
 
-@Limit("goal.lost", "servo that for 0.05 s holds none of the goals sent to it", "fault", (),
+@Limit("goal.lost", "servo that has not received any goal for 0.05 s", "fault", (),
     "servos")  # fmt: skip
 def _goal_lost(view: View, state: State, _: float) -> str:
     lost = state.reading.lost
     if not lost:
         return ""
-    return f"servos: none of the goals sent lately reached {_names(view, lost)}: check the cable"
+    return f"servos: goals are not received by {_names(view, lost)}: check the cable"
 
 
-@Limit("goal.number", "non-finite goal: it is not sent", "fault", needs="servos")
+@Limit("goal.number", "goal that is not a finite number; it is not sent", "fault", needs="servos")
 def _goal_number(view: View, _: State, __: float) -> str:
-    return "control: a non-finite goal" if view.bad_goal else ""
+    return "control: computed a goal that is not a finite number" if view.bad_goal else ""
 
 
 LIMITS += [
     Limit("goal.angle", "goal angle", "limit", ("hand.q_min", "hand.q_max")),
     Limit("goal.current", "goal current", "limit", ("safety.current_max",)),
-    Limit("goal.step", "goal angle's step in a tick, where it is far from the joint", "limit",
+    Limit("goal.step", "step of a goal angle that is far from the joint", "limit",
         ("safety.goal_reach", "safety.goal_speed")),
-    Limit("goal.slew", "goal current's rise in a tick", "limit", ("safety.current_rate",)),
+    Limit("goal.slew", "rise of a goal current per tick", "limit", ("safety.current_rate",)),
 ]  # fmt: skip
 
 
@@ -489,7 +500,7 @@ def _tip_force(view: View, state: State, fraction: float, i: int) -> str:
     bound, contact = fraction * view.limits.force_max, state.contacts[i]
     if not _touches(contact) or contact.force <= bound:
         return ""
-    return f"{FINGERS[i]} tip at {contact.force:.1f} N, above {bound:g} N"
+    return f"{FINGERS[i]} tip force is {contact.force:.1f} N, above {bound:g} N"
 
 
 @Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors").each
@@ -499,10 +510,10 @@ def _tip_displacement(view: View, state: State, fraction: float, i: int) -> str:
     bound, contact = fraction * view.limits.d_max, state.contacts[i]
     if not _touches(contact) or contact.d <= bound:
         return ""
-    return f"{FINGERS[i]} tip at {contact.d * 1e3:.2f} mm, above {bound * 1e3:g} mm"
+    return f"{FINGERS[i]} tip displacement is {contact.d * 1e3:.2f} mm, above {bound * 1e3:g} mm"
 
 
-_TILT_TEXT = "|θ| against asin(1 − d/a) less a margin"
+_TILT_TEXT = "|θ|, limit asin(1 − d/a) minus a margin"
 
 
 @Limit("tip.tilt", _TILT_TEXT, "fault", ("safety.theta_margin",), "sensors").each
@@ -524,20 +535,20 @@ def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
         return ""
     if not contact.inside and view.settings.tip.physics != "springs":
         tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
-        deep = f"{FINGERS[i]} tip {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°"
-        return f"{deep}: its law ends before"
+        deep = f"{FINGERS[i]} tip is {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°"
+        return f"{deep}, outside the range of its contact model"
     limit = fraction * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
     tilt = math.degrees(contact.theta)
-    return f"{FINGERS[i]} tip at {tilt:.1f}°, past {math.degrees(limit):.1f}° at this depth"
+    return f"{FINGERS[i]} tip tilt is {tilt:.1f}°, above {math.degrees(limit):.1f}° at this depth"
 
 
 # --- sensors --------------------------------------------------------------------------------------
 
-LIMITS.append(Limit("tactile.late", "age of the last sound frame: nothing is moved on", "limit",
-    ("safety.frame_age_hold",), "sensors", gripping=True))  # fmt: skip
+LIMITS.append(Limit("tactile.late", "age of the last valid frame; an older one holds the goal",
+    "limit", ("safety.frame_age_hold",), "sensors", gripping=True))  # fmt: skip
 
 
-@Limit("tactile.silent", "age of the last sound frame", "fault",
+@Limit("tactile.silent", "age of the last valid frame", "fault",
     ("safety.frame_age_fault", "safety.frame_age_action"), "sensors",
     gripping=True).each  # fmt: skip
 def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
@@ -545,19 +556,22 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
     age = state.t - contact.t_valid
     if age <= view.limits.frame_age_fault / view.settings.tactile.rate:
         return ""
-    what = "frame" if contact.t_arrival == contact.t_valid else "sound estimate"
+    what = "frame" if contact.t_arrival == contact.t_valid else "valid estimate"
     cure = ""
     for sensor in (each for each in view.sensors if each.finger == i):
         if sensor.sensor.counters().get("port_lost"):
-            cure = ": its port is gone, and `clear`, or `disarm` and `arm`, opens it again"
+            cure = ": the port is lost; `clear`, or `disarm` and `arm`, opens it again"
         elif what != "frame":
             cure = f": {sensor.estimate.invalid.text}" if sensor.estimate.invalid else ""
             noise = view.settings.tactile.noise
             if sensor.noise > _NOISE_RATIO * noise:
-                cure += f"; its cells' noise is {sensor.noise:.0f} Pa, tactile.noise is {noise:g}"
+                cure += (
+                    f"; the noise of its cells is {sensor.noise:.0f} Pa, tactile.noise is "
+                    f"{noise:g} Pa"
+                )
     return (
         _sensor_fault(view, state, i)
-        or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s{cure}"
+        or f"tactile: no {what} from the {FINGERS[i]} sensor for {age:.3f} s{cure}"
     )
 
 
@@ -566,26 +580,27 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
     side, found = FINGERS[finger], view.grasp
     if found.rejected_count[finger] > REJECTED_MAX:
         turned, deeper = found.angle_innovation[finger], 1e3 * found.d_innovation[finger]
-        what = f"the object turned by {math.degrees(abs(turned)):.0f}°"
+        what = f"{math.degrees(abs(turned)):.0f}° in the object's angle"
         if abs(turned) <= ANGLE_JUMP:
-            what = f"the tip {abs(deeper):.1f} mm {'deeper' if deeper > 0.0 else 'less deep'}"
+            what = f"{deeper:+.1f} mm in d"
         return (
-            f"{side} sensor shows {what} at once, which neither the joints nor the other tip "
-            "explain: its image has moved or is old, or the object ends under it"
+            f"{side} sensor reports a jump of {what}, which neither the joints nor the other tip "
+            "confirm: it has shifted, its frames are old, or its tip is at the object's edge"
         )
     if found.has_bias[finger] and view.holds(state):
         off, turned = 1e3 * found.d_bias[finger], math.degrees(found.angle_bias[finger])
         if abs(found.angle_bias[finger]) > ANGLE_BIAS_MIN:
             return (
-                f"{side} sensor's image has moved: it shows {turned:+.0f}° that no joint has rolled"
+                f"{side} sensor's angle differs by {turned:+.0f}° from the rolling of the "
+                "joints: its image has moved"
             )
         return (
-            f"{side} sensor feels {abs(off):.1f} mm {'less' if off < 0.0 else 'more'} of the tip's "
-            "displacement than its joint's closing and torque say: tare it"
+            f"{side} sensor's displacement is {abs(off):.1f} mm "
+            f"{'less' if off < 0.0 else 'more'} than the joint's angle and torque give: tare it"
         )
     for sensor in view.sensors:
         if sensor.finger == finger and sensor.repeats.is_fault:
-            return f"{side} sensor sends the same {sensor.repeats.period} frames again"
+            return f"{side} sensor repeats its last {sensor.repeats.period} frames"
     return ""
 
 
@@ -599,14 +614,14 @@ def _gain_fault(view: View, finger: int) -> str:
     if not abs(off) - unsure > _GAIN_SIGMA * grasp.gain_prior_std[finger]:
         return ""
     return (
-        f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of what the joints and the other tip "
-        "say: recalibrate or tare it"
+        f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of the pressure that the joints and "
+        "the other tip give: tare or calibrate it"
     )
 
 
 def _add_consistency_checks(finger: int, side: str) -> None:
-    @Limit(f"witness.{side}_sensor", "a tip's frames, by the joints and the other tip", "warn",
-        ("tactile.gain_error",), "sensors", in_turn=True)  # fmt: skip
+    @Limit(f"consistency.{side}_sensor", "frames of a tip, compared with the joints and the other "
+        "tip", "warn", ("tactile.gain_error",), "sensors", in_turn=True)  # fmt: skip
     def _sensor(view: View, state: State, _: float) -> str:
         if finger not in view.fingers:
             return ""
@@ -616,14 +631,14 @@ def _add_consistency_checks(finger: int, side: str) -> None:
             _gain_fault(view, finger) if view.holds(state) else ""
         )
 
-    @Limit(f"witness.{side}_current", "a joint's current in a grip, by its goal", "warn",
-        (), "servos", in_turn=True)  # fmt: skip
+    @Limit(f"consistency.{side}_current", "measured current of a joint in a grip, compared with "
+        "its goal", "warn", (), "servos", in_turn=True)  # fmt: skip
     def _current(view: View, state: State, _: float) -> str:
         if not view.grasp.current_off_time[finger] > CURRENT_OFF_TIME_MAX:
             return ""
         return (
-            f"{side} joint's current reads {state.reading.current[finger]:.2f} A where its goal is "
-            f"{state.goal.current[finger]:.2f} A: its reading is not used"
+            f"{side} joint's measured current is {state.reading.current[finger]:.2f} A, its goal "
+            f"{state.goal.current[finger]:.2f} A: the measured current is not used"
         )
 
 
@@ -631,29 +646,29 @@ for _finger, _side in enumerate(FINGERS):
     _add_consistency_checks(_finger, _side)
 
 
-@Limit("witness.force", "the force felt, for 0.3 s after the one asked for rose", "fault", (),
-    "sensors", in_turn=True)  # fmt: skip
+@Limit("consistency.force", "measured force that does not follow the commanded force for 0.3 s",
+    "fault", (), "sensors", in_turn=True)  # fmt: skip
 def _force_response(view: View, state: State, _: float) -> str:
     if not state.t - view.rise_t > _RESPONSE_TIME:
         return ""
     return (
-        f"the force asked for rose to {state.goal.force:.1f} N and the tips feel "
-        f"{view.rise_felt:.1f} N as before"
+        f"commanded force rose to {state.goal.force:.1f} N, measured force stayed at "
+        f"{view.rise_felt:.1f} N"
     )
 
 
-@Limit("tactile.frozen", "frames that are the same again and again while something touches",
-    "fault", ("safety.frozen_after",), "sensors", in_turn=True)  # fmt: skip
+@Limit("tactile.frozen", "time of identical frames during contact", "fault",
+    ("safety.frozen_after",), "sensors", in_turn=True)  # fmt: skip
 def _tactile_frozen(view: View, state: State, _: float) -> str:
     for sensor in view.sensors:
         same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed_time
         if same > view.limits.frozen_after > 0.0 and state.contacts[sensor.finger].contact:
             side = FINGERS[sensor.finger]
-            return f"tactile: {side} sensor frozen, the same frame for {same:.2f} s"
+            return f"tactile: {side} sensor is frozen: it has sent the same frame for {same:.2f} s"
     return ""
 
 
-@Limit("tactile.saturated", "share of full cells", "warn", ("safety.saturated",), "sensors",
+@Limit("tactile.saturated", "fraction of saturated cells", "warn", ("safety.saturated",), "sensors",
     in_turn=True, lasts=0.1)  # fmt: skip
 def _tactile_saturated(view: View, _: State, fraction: float) -> str:
     limit = fraction * view.limits.saturated
@@ -664,26 +679,27 @@ def _tactile_saturated(view: View, _: State, fraction: float) -> str:
         saturated = np.count_nonzero(data >= sensor.full_count) / data.size
         if saturated > limit:
             return (
-                f"tactile: {saturated:.0%} of the {FINGERS[sensor.finger]} sensor's cells are full"
+                f"tactile: {saturated:.0%} of the cells of the {FINGERS[sensor.finger]} sensor "
+                "are saturated"
             )
     return ""
 
 
-@Limit("tactile.misfit", "frames that fit no contact of the model", "warn", ("tactile.noise",),
-    "sensors", in_turn=True, lasts=0.5).each  # fmt: skip
+@Limit("tactile.misfit", "frames that do not fit any contact of the model", "warn",
+    ("tactile.noise",), "sensors", in_turn=True, lasts=0.5).each  # fmt: skip
 def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
     if not state.contacts[i].misfit:
         return ""
     return (
-        f"tactile: what the {FINGERS[i]} tip feels fits no contact of the model; d and theta may "
-        "be biased (another material, unequal cells, more noise than set)"
+        f"tactile: the {FINGERS[i]} sensor's frames do not fit the contact model, so d and theta "
+        "may be biased: check tip material, cell gains and tactile.noise"
     )
 
 
 # --- the hand and its grip ------------------------------------------------------------------------
 
 _ANGLE_SIGMA = 4.0  # minimum significant difference, in summed tilt standard deviations
-_ANGLE_TEXT = "object's angle by one finger against the other's"
+_ANGLE_TEXT = "difference between the two fingers' estimates of the object's angle"
 _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
 
@@ -704,36 +720,36 @@ def _hand_angle(view: View, state: State, fraction: float) -> str:
     if abs(apart) <= bound:
         return ""
     return (
-        f"the fingers see the object's angle {math.degrees(abs(apart)):.1f}° apart: a joint's zero "
-        "is wrong (servos.zero, or its servo's homing offset), the object lies askew between the "
-        "tips or tapers (object.taper), a sensor has shifted, or its centre or rotation is wrong"
+        "the two fingers' estimates of the object's angle differ by "
+        f"{math.degrees(abs(apart)):.1f}°: check the joints' zeros (servos.zero and homing "
+        "offsets), the object's taper (object.taper) and position, and each sensor's mounting, "
+        "centre and rotation"
     )
 
 
-@Limit("hand.width", "held object's width by joints and sensors, since it was gripped", "fault",
-    ("safety.residual_width",), "sensors", in_turn=True,
-    lasts=0.2)  # fmt: skip
+@Limit("hand.width", "change of the held object's width since it was gripped", "fault",
+    ("safety.residual_width",), "sensors", in_turn=True, lasts=0.2)  # fmt: skip
 def _hand_width(view: View, state: State, fraction: float) -> str:
     changed = state.object.width - view.grip_width
     if not (view.holds(state) and abs(changed) > fraction * view.limits.residual_width):
         return ""
     return (
-        f"the held object's width changed by {changed * 1e3:+.1f} mm since it was gripped: "
-        "a sensor has shifted, or a joint's zero"
+        f"the held object's width has changed by {changed * 1e3:+.1f} mm since it was gripped: a "
+        "sensor or a joint's zero has shifted"
     )
 
 
-@Limit("hand.force", "one tip's force against the other's", "warn", ("safety.residual_force",),
+@Limit("hand.force", "difference of the two tips' forces", "warn", ("safety.residual_force",),
     "sensors", in_turn=True, lasts=0.3)  # fmt: skip
 def _hand_force(view: View, state: State, fraction: float) -> str:
     left, right = (contact.force for contact in state.contacts)
     bound = fraction * view.limits.residual_force * max(left, right)
     if not view.holds(state) or abs(left - right) <= bound:
         return ""
-    return f"the left tip feels {left:.1f} N and the right one {right:.1f} N of one grip"
+    return f"the forces of the two tips differ: left {left:.1f} N, right {right:.1f} N"
 
 
-@Limit("grip.slip", "shear against friction less a margin", "warn",
+@Limit("grip.slip", "shear over normal force, limit: friction minus a margin", "warn",
     ("control.tip_friction", "control.slip_margin"), "sensors", in_turn=True,
     lasts=0.1)  # fmt: skip
 def _grip_slip(view: View, state: State, fraction: float) -> str:
@@ -741,16 +757,16 @@ def _grip_slip(view: View, state: State, fraction: float) -> str:
     usable = control.tip_friction * (1.0 - control.slip_margin)
     if not view.holds(state) or shear <= fraction * usable:
         return ""
-    return f"shear is {shear:.2f} of the grip's force, above {usable:.2f}: may slip"
+    return f"shear is {shear:.2f} of the grip force, above {usable:.2f}: the object may slip"
 
 
 # --- commands and the loop ------------------------------------------------------------------------
 
-LIMITS.append(Limit("commands.pace", "a client's commands a second; a stop counts, and is always "
-    "heard", "limit", ("commands.per_second",)))  # fmt: skip
+LIMITS.append(Limit("commands.pace", "rate of a client's commands; `stop` is always accepted",
+    "limit", ("commands.per_second",)))  # fmt: skip
 
 
-@Limit("loop.overruns", "late ticks in a row", "fault", ("safety.overruns_fault",))
+@Limit("loop.overruns", "consecutive late ticks", "fault", ("safety.overruns_fault",))
 def _loop_overruns(view: View, state: State, _: float) -> str:
     late = state.timing.late_in_row
-    return "" if late < view.limits.overruns_fault else f"loop: {late} overruns in a row"
+    return "" if late < view.limits.overruns_fault else f"loop: {late} consecutive ticks were late"

@@ -161,9 +161,7 @@ class TorqueState:
         if self._reported:
             self._reported = False
             waited = state.t - self._first
-            self._emit(
-                "info", TORQUE_OFF, f"torque off confirmed by the servos after {waited:.2f} s"
-            )
+            self._emit("info", TORQUE_OFF, f"servos confirmed torque off after {waited:.2f} s")
 
     def _is_silent(self) -> bool:
         """Return True if the bus must stay silent on this tick to trip the servo watchdogs."""
@@ -183,11 +181,11 @@ class TorqueState:
             return
         self._reported = True
         state = self._state
-        text = f"torque off not confirmed by the servos for {state.t - self._first:.2f} s: "
+        text = f"servos have not confirmed torque off for {state.t - self._first:.2f} s: "
         if not self._silence:
-            text += "cut their power (servos.watchdog = 0: nothing else stops them)"
+            text += "cut their power; servos.watchdog = 0, so nothing else stops them"
         elif self._port_gone:
-            text += "the port is gone, their watchdogs stop them"
+            text += "the port is lost; their watchdogs stop them"
         else:
             text += "the bus is kept silent until their watchdogs stop them"
         if state.fault:

@@ -75,8 +75,8 @@ class WiringWatch:
         pressed = contact.force - self._force > _FORCE_RISE_MIN
         if turned or pressed:
             self.swapped = (
-                f"the {FINGERS[finger]} tip is moved while the {FINGERS[finger]} joint stands and "
-                f"the {FINGERS[other]} one closes: are servos.ids swapped?"
+                f"the {FINGERS[finger]} tip moves with the {FINGERS[other]} joint while the "
+                f"{FINGERS[finger]} joint stands still: are servos.ids swapped?"
             )
 
     def _check_turn(self, state: State) -> None:
@@ -90,6 +90,6 @@ class WiringWatch:
         against = self._sense * (self._turn - angle)
         if state.object.valid and against > _WRONG_ROTATION:
             self.swapped = (
-                f"the object turned by {math.degrees(against):.0f}° against its commanded turn: "
-                "are servos.ids swapped?"
+                f"the object turned by {math.degrees(against):.0f}° against the commanded "
+                "direction: are servos.ids swapped?"
             )

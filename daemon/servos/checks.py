@@ -23,12 +23,12 @@ from softfinger.daemon.types import FINGERS
 CHECKED = reg.BACKUP_READY  # number of registers to read, 0 … 146
 DRIVE_REVERSE = 0b0001
 FIX = "`softfinger doctor --fix`"
-REBOOT_FIX = "remove the cause, then `softfinger doctor --fix` reboots it"
-LOST_TURN_FIX = "reboot it: switch its supply off and on, or `softfinger doctor --fix`"
+REBOOT_FIX = "remove the cause, then reboot it with `softfinger doctor --fix`"
+LOST_TURN_FIX = "reboot it: switch its supply off and on, or run `softfinger doctor --fix`"
 OLD_PROTOCOL = (
     "answers Protocol 1.0, expected 2.0",
-    "set its protocol to 2.0 with the maker's DYNAMIXEL Wizard (register 13; an MX needs firmware "
-    "for 2.0), or use one that speaks it",
+    "set its protocol to 2.0 with the manufacturer's DYNAMIXEL Wizard (register 13; an MX needs "
+    "firmware for 2.0), or use another servo",
 )
 _WATCHDOG_FIRMWARE = 38
 _FAULT_AFTER_LONG = 0.5  # s, value of servos.fault_after above which a notice is given
@@ -143,7 +143,7 @@ def check_servo(
     if not low <= volts <= high:
         fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
         fix = FIX if fits else "check the supply"  # its own limits are too narrow
-        wrong(f"supply is {volts:.1f} V, not in {low:.1f} … {high:.1f} V", fix)
+        wrong(f"supply is {volts:.1f} V, expected {low:.1f} to {high:.1f} V", fix)
     firmware = table[reg.FIRMWARE_VERSION]
     if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:
         wrong(
@@ -165,7 +165,7 @@ def other_model(number: int, model: ServoModel) -> tuple[str, str]:
         return f"is an {reg.name_of(number)}, not an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
     return (
-        f"has the unknown model number {number}, not {model.number} of an {model.name}",
+        f"has the unknown model number {number}, expected {model.number} of an {model.name}",
         f"use one of the known models: {known}",
     )
 
@@ -197,21 +197,24 @@ def notice_servo(
         return []
     limit, present = table[reg.TEMPERATURE_LIMIT], table[reg.PRESENT_TEMPERATURE]
     notices = (
-        (servos.mode == "position", "in position mode nothing bounds its current"),
-        (not servos.watchdog, "servos.watchdog = 0: nothing stops it if daemon or line fail"),
+        (servos.mode == "position", "position mode does not limit its current"),
+        (
+            not servos.watchdog,
+            "servos.watchdog = 0: it keeps moving if the daemon or the line fails",
+        ),
         (
             servos.fault_after > _FAULT_AFTER_LONG,
-            f"servos.fault_after = {servos.fault_after:g} s: without an answer its last reading is "
-            "used for so long",
+            f"servos.fault_after = {servos.fault_after:g} s: without replies its last reading is "
+            "used for this long",
         ),
         (
             table[reg.DRIVE_MODE] & DRIVE_REVERSE,
-            "its drive mode is reversed; servos.direction applies in addition",
+            "its drive mode is reversed, in addition to servos.direction",
         ),
-        (table[reg.TORQUE_ENABLE], "torque is on already; it stays so until disarm or arm"),
+        (table[reg.TORQUE_ENABLE], "torque is already on, and stays on until disarm or arm"),
         (
             table[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR,
-            "its bus watchdog had stopped it; arming clears that",
+            "its bus watchdog has stopped it; arming clears the watchdog",
         ),
         (
             not model.fast_read(firmware),
@@ -234,10 +237,13 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
     found = []
     given = settings.control.torque_constant
     if constant and not 1.0 / _CONSTANT_RATIO_MAX < given / constant < _CONSTANT_RATIO_MAX:
-        text = f"control.torque_constant is {given:g} N·m/A, its data sheet's {constant:.3g}"
+        text = f"control.torque_constant is {given:g} N·m/A, its data sheet gives {constant:.3g}"
         found.append(Finding("warn", name, text, f"control.torque_constant = {constant:.3g}"))
     if model.gear_loss and not settings.control.joint_load_friction:
-        text = f"its gears take {model.gear_loss:g} of their torque, so a grip may never settle"
+        text = (
+            f"its gears lose {model.gear_loss:g} of their torque to friction, so a grip may "
+            "never settle"
+        )
         fix = f"control.joint_load_friction = {model.gear_loss:g}"
         found.append(Finding("warn", name, text, fix))
     return found
@@ -261,12 +267,12 @@ def check_angle(
     found, lowest, highest = (
         f"{math.degrees(angle):.0f}°" for angle in (scale.angle(counts), low, high)
     )
-    problem = f"the joint is at {found}, not in {lowest} … {highest}"
+    problem = f"the joint is at {found}, expected {lowest} to {highest}"
     turns = counts // reg.COUNTS_PER_TURN
     if turns and is_inside(counts - turns * reg.COUNTS_PER_TURN):
         problem += f": its servo has counted {turns} turn{'' if turns in (1, -1) else 's'} too many"
         return Finding("FAIL", name, problem, LOST_TURN_FIX)
-    cure = "turn it there by hand, or `softfinger calibrate joints`, which finds its zero"
+    cure = "turn it there by hand, or find its zero with `softfinger calibrate joints`"
     return Finding("FAIL", name, problem, cure)
 
 

@@ -313,7 +313,7 @@ def by_name(name: str) -> ServoModel:
     plain = name.upper().removesuffix("-T").removesuffix("-R")
     model = MODELS.get(plain)
     if model is None:
-        raise KeyError(f"unknown servo model {name!r}; known: {', '.join(MODELS)}")
+        raise KeyError(f"unknown servo model {name!r}; expected one of {', '.join(MODELS)}")
     return model
 
 

@@ -79,15 +79,14 @@ def choose_reads(
         reads = TickReads(port, handler, ids, FastGroupRead)
         if reads.answered():
             return reads, notices
-        text = "the firmware should answer a fast sync read and does not"
-        notices.append(Finding("warn", "servos", text, "the slower sync read is used instead"))
+        text = "the firmware should answer fast sync reads but does not"
+        notices.append(Finding("warn", "servos", text, "the slower sync read is used"))
     reads = TickReads(port, handler, ids, GroupRead)
     if not reads.answered():
         listed = ", ".join(map(str, ids))
         raise ServoError(
-            f"{port.port_name}: the servos (IDs {listed}) answer alone, but a sync read of all "
-            "stays without a reply: check the cable from one servo to the next, and lower "
-            "servos.baud"
+            f"{port.port_name}: the servos (IDs {listed}) answer single reads, but not a sync "
+            "read of all: check the cables between the servos, and lower servos.baud"
         )
     return reads, notices
 
@@ -173,7 +172,7 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
     if least * rate <= _REPLY_FRACTION_MAX:
         return []
     text = (
-        f"a reply of the servos takes at least {_ms(least)}, {least * rate:.0%} of a tick of "
+        f"the servos take at least {_ms(least)} to reply, {least * rate:.0%} of a tick of "
         f"{_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
     )
     fix = f"{_remedy(least, settings)}; `softfinger doctor` times {EXCHANGE_COUNT} exchanges"
@@ -189,7 +188,7 @@ def _remedy(duration: float, settings: Settings) -> str:
         parts.append(f"servos.reply_timeout = {1.5 * duration:.2g}")
     if duration * settings.loop.rate > _REPLY_FRACTION_MAX:
         parts.append(f"loop.rate = {max(rate // digit * digit, 1.0):g}")
-    return f"set {' and '.join(parts)}; or an adapter that waits less (latency timer 1 ms)"
+    return f"set {' and '.join(parts)}; or use a faster adapter (latency timer 1 ms)"
 
 
 def _ms(seconds: float) -> str:

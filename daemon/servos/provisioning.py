@@ -36,8 +36,8 @@ from softfinger.daemon.types import FINGERS
 SEARCH_TIME = 0.8  # s of listening per rate, enough for 253 servos at 1 Mbaud
 FACTORY_ID = 1
 ONE_SERVO_ONLY = (
-    "connect one servo alone, then `softfinger doctor --fix`; then the next one beside it, and the "
-    "same again"
+    "connect one servo alone and run `softfinger doctor --fix`; then add the next one and run it "
+    "again"
 )
 _READ_COUNT = 8  # number of full-table reads
 _REBOOT_TIMEOUT = 2.0  # s, maximum time until a servo responds after a reboot
@@ -73,9 +73,9 @@ class Garbled:
     baud: int
 
     def __str__(self) -> str:
-        factory = ", as all have from the factory" if self.id == FACTORY_ID else ""
+        factory = " (the factory setting)" if self.id == FACTORY_ID else ""
         return (
-            f"replies of ID {self.id} at {self.baud} baud come damaged: several servos have that "
+            f"replies of ID {self.id} at {self.baud} baud are damaged: several servos have this "
             f"ID{factory}, or the line is bad"
         )
 
@@ -265,7 +265,7 @@ def provision(settings: Settings) -> list[Finding]:
             elif number != model.number:
                 result.append(Finding("warn", name, *other_model(number, model)))
             elif is_garbled(line, servo_id):
-                result.append(Finding("warn", name, "its replies come damaged", ONE_SERVO_ONLY))
+                result.append(Finding("warn", name, "its replies are damaged", ONE_SERVO_ONLY))
             else:
                 _set_up(line, settings, finger, model, result)
     return result
@@ -281,7 +281,10 @@ def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
     if not fit:
         fix = "check its power and cable"
         return [Finding("warn", name, "no answer at any rate", fix) for name in names]
-    return [Finding("warn", name, f"may be any of {fit}", ONE_SERVO_ONLY) for name in names]
+    return [
+        Finding("warn", name, f"may be any of these servos: {fit}", ONE_SERVO_ONLY)
+        for name in names
+    ]
 
 
 def _identify(path: str, change: Change, model: ServoModel, result: list[Finding]) -> None:
@@ -373,14 +376,14 @@ def _reboot_if_needed(
     if error := table[reg.HARDWARE_ERROR_STATUS]:
         why = f"it had a hardware error: {reg.hardware_error_names(error)}"
     elif misplaced is not None and misplaced.fix == LOST_TURN_FIX:
-        why = f"its position was a turn off: {table.long(reg.PRESENT_POSITION)} counts"
+        why = f"its position was off by a turn: {table.long(reg.PRESENT_POSITION)} counts"
     else:
         return None
     match _reboot(line, servo_id):
         case None:
-            return result.append(Finding("warn", name, f"no answer after a reboot, since {why}"))
+            return result.append(Finding("warn", name, f"no answer after a reboot because {why}"))
         case 0:
-            return result.append(Finding("fixed", name, f"rebooted, since {why}"))
+            return result.append(Finding("fixed", name, f"rebooted because {why}"))
         case error:
             text = f"hardware error after a reboot: {reg.hardware_error_names(error)}"
             return result.append(Finding("warn", name, text, "remove the cause"))
@@ -390,7 +393,7 @@ def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]
     if line.store(reg.TORQUE_ENABLE, {servo_id: b"\x00"}):
         result.append(Finding("warn", name, "torque could not be switched off"))
         return False
-    result.append(Finding("fixed", name, "torque off, since EEPROM is locked while it is on"))
+    result.append(Finding("fixed", name, "torque switched off, because it locks the EEPROM"))
     return True
 
 

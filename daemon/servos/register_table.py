@@ -112,7 +112,7 @@ def _exactly(
         register,
         lambda found: found == value,
         lambda _: value,
-        lambda found: f"{register.name} is {found}, not {value}: {why}",
+        lambda found: f"{register.name} is {found}, expected {value}: {why}",
         status,
         armed,
     )
@@ -121,12 +121,12 @@ def _exactly(
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
     """Return the row for a limit at which the servo stops itself; ``high`` is the factory value."""
     register = _AT[address]
-    expected = f"{low}" if low == high else f"{low} … {high}"
+    expected = f"{low}" if low == high else f"{low} to {high}"
     return Requirement(
         register,
         lambda found: low <= found <= high,
         lambda _: high,
-        lambda found: f"{register.name} is {found} {unit}, not {expected} {unit}",
+        lambda found: f"{register.name} is {found} {unit}, expected {expected} {unit}",
         "warn",
     )
 
@@ -145,7 +145,9 @@ def required_registers(
             _AT[reg.RETURN_DELAY_TIME],
             lambda found: found <= RETURN_DELAY_MAX,
             lambda _: 0,
-            lambda found: f"return delay is {2 * found} µs, more than {2 * RETURN_DELAY_MAX} µs",
+            lambda found: (
+                f"return delay is {2 * found} µs, expected at most {2 * RETURN_DELAY_MAX} µs"
+            ),
             "FAIL",
         ),
         Requirement(
@@ -153,8 +155,8 @@ def required_registers(
             lambda found: not found & DRIVE_UNFIT,
             lambda found: found & ~DRIVE_UNFIT,
             lambda found: (
-                f"drive mode {found} switches torque on with any goal, or has it follow another "
-                "servo"
+                f"drive mode {found} switches torque on with any goal, or makes it follow "
+                "another servo"
             ),
             "FAIL",
         ),
@@ -162,7 +164,9 @@ def required_registers(
             _AT[reg.SHADOW_ID],
             lambda found: found not in servos.ids,
             lambda _: 255,
-            lambda found: f"shadow ID is {found}: it obeys what the servo with that ID is sent",
+            lambda found: (
+                f"shadow ID is {found}: it also obeys the commands for the servo with this ID"
+            ),
             "FAIL",
         ),
         Requirement(
@@ -170,7 +174,7 @@ def required_registers(
             lambda found: found == 0,
             lambda _: 0,
             lambda found: (
-                f"homing offset is {found} counts, not 0: it turns this joint's zero by "
+                f"homing offset is {found} counts, expected 0: it shifts this joint's zero by "
                 f"{math.degrees(abs(found) * scale.radian):.1f}°"
             ),
             "FAIL",
@@ -179,14 +183,14 @@ def required_registers(
         _within(reg.TEMPERATURE_LIMIT, hot, model.temperature_limit, "°C"),
         _within(reg.MAX_VOLTAGE_LIMIT, model.voltage_max, model.voltage_max, "× 0.1 V"),
         _within(reg.MIN_VOLTAGE_LIMIT, 0, model.voltage_min, "× 0.1 V"),
-        _exactly(reg.PWM_LIMIT, PWM_FULL, "the motor does not get all of the supply's voltage"),
+        _exactly(reg.PWM_LIMIT, PWM_FULL, "the motor does not get the full supply voltage"),
         Requirement(
             _AT[reg.VELOCITY_LIMIT],
             lambda found: found >= slow,
             lambda _: model.velocity_limit,
             lambda found: (
-                f"velocity limit is {found * scale.velocity:.2g} rad/s at the joint, less than "
-                f"{slow * scale.velocity:.2g} rad/s"
+                f"velocity limit is {found * scale.velocity:.2g} rad/s at the joint, expected at "
+                f"least {slow * scale.velocity:.2g} rad/s"
             ),
             "warn",
         ),
@@ -195,8 +199,8 @@ def required_registers(
             lambda found: found & model.shutdown == model.shutdown,
             lambda found: found | model.shutdown,
             lambda found: (
-                f"shutdown is {found}, not {model.shutdown}: it does not stop itself after "
-                f"{reg.hardware_error_names(model.shutdown & ~found)}"
+                f"shutdown is {found}, expected {model.shutdown}: it does not switch torque off "
+                f"after {reg.hardware_error_names(model.shutdown & ~found)}"
             ),
             "warn",
         ),
@@ -204,7 +208,7 @@ def required_registers(
             _AT[reg.STATUS_RETURN_LEVEL],
             lambda found: found > 0,
             lambda _: 2,
-            lambda _: "status return level is 0, so reads stay unanswered",
+            lambda _: "status return level is 0, so it does not answer reads",
             "FAIL",
         ),
     ]
@@ -216,8 +220,8 @@ def required_registers(
                 lambda found: found == mode,
                 lambda _: mode,
                 lambda found: (
-                    f"operating mode is {told.get(found, str(found))} ({found}), not {told[mode]} "
-                    f"({mode})"
+                    f"operating mode is {told.get(found, str(found))} ({found}), expected "
+                    f"{told[mode]} ({mode})"
                 ),
                 "FAIL",
             )
@@ -230,7 +234,7 @@ def required_registers(
         why = "at power-up it switches torque on (1) or restores a backup of its RAM (2)"
         rows.append(_exactly(reg.STARTUP_CONFIGURATION, 0, why))
     if model.pwm_slope is not None:
-        why = "the motor's voltage rises at another rate"
+        why = "the motor's voltage ramps at another rate"
         row = _exactly(reg.PWM_SLOPE, slope := model.pwm_slope, why, "warn")
         rows.append(row._replace(holds=lambda found: found in (0, slope)))  # 0: not implemented
     rows += armed_registers(model)
@@ -239,7 +243,7 @@ def required_registers(
 
 def armed_registers(model: ServoModel) -> list[Requirement]:
     """Return the rows for RAM registers written by `arm`."""
-    why = "another program's; `arm` sets it"
+    why = "set by another program; `arm` corrects it"
     d, i, p = model.position_gains
     values = (
         (reg.POSITION_D_GAIN, d),
@@ -272,9 +276,9 @@ def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iter
     """Return the rows for position mode, where servos silently reject goals beyond their limits."""
     ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
     first, last = sorted(scale.position_counts(q) for q in ends)
-    needed = f"the joint needs {first} … {last}"
+    needed = f"the joint needs {first} to {last}"
     if not 0 <= first <= last <= _POSITION_MAX:
-        needed += ", more than a turn has: `softfinger calibrate joints` finds zero and range"
+        needed += ", more than one turn: `softfinger calibrate joints` finds zero and range"
     yield Requirement(
         _AT[reg.MIN_POSITION_LIMIT],
         lambda found: found <= first,

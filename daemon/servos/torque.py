@@ -156,8 +156,8 @@ class Torque:
             found.add(raw[0])
         if len({self._model.indirect_blocks(version)[0] for version in found}) > 1:
             raise ServoError(
-                "servos: their firmwares place indirect data differently: bring both to the same "
-                "version"
+                "servos: their firmware versions differ in the addresses of indirect data: "
+                "update both to the same version"
             )
         return max(found)
 
@@ -182,7 +182,7 @@ class Torque:
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.PRESENT_POSITION, 4)
             if raw is None:
-                raise ServoError(f"{joint.name}: position not read")
+                raise ServoError(f"{joint.name}: its position could not be read")
             positions[servo_id] = int.from_bytes(raw, "little", signed=True)
         return positions
 
@@ -215,12 +215,12 @@ class Torque:
         watchdog = table[reg.BUS_WATCHDOG - start]
         if watchdog == reg.WATCHDOG_ERROR:
             raise ServoError(
-                f"{joint.name}: its bus watchdog stopped it, since no packet came in time: "
+                f"{joint.name}: its bus watchdog stopped it because no packet arrived in time: "
                 "clear, then arm"
             )
         if watchdog != self._ticks:
             raise ServoError(
-                f"{joint.name}: its bus watchdog is off, as after a reboot: check its supply, "
+                f"{joint.name}: its bus watchdog is off; it may have rebooted: check its supply, "
                 "then clear and arm"
             )
         return goal_in(self._mode, table, start) in joint.sent
@@ -236,4 +236,4 @@ class Torque:
             failed = self._line.store(address, values)
         if failed:
             names = ", ".join(self._joints[servo_id].name for servo_id in failed)
-            raise ServoError(f"{names}: {what} could not be set or not be verified")
+            raise ServoError(f"{names}: {what} could not be set or verified")

@@ -226,23 +226,23 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
         raise refused(f"{text!r} is not a number")
     after = 0.0 if start is None else _number(start)
     if not 0.0 <= after < math.inf:
-        raise refused(f"{start!r} is no time of 0 s or more")
+        raise refused(f"start {start!r} is not a time of at least 0 s")
     until = after if end is None else _number(end)
     if not after <= until < math.inf:
-        raise refused(f"{end!r} is no time of {start} s or more")
+        raise refused(f"end {end!r} is not a time of at least {start} s")
     form = next((each for each in _FORMS if each.fits(side, kind, value is not None)), None)
     if form is None:
         known = (f"{', '.join(each.kinds)} {each.value}".strip() for each in _FORMS)
         raise refused(f"expected one of {'; '.join(known)}")
     if end is not None and (kind not in MEASUREMENT_FAULTS or kind in SWITCHED_FAULTS):
-        raise refused(f"{kind} comes at once, at {start}")
+        raise refused(f"{kind} changes at once; give one start time such as @{start}")
     if form.value == _ID and value not in ids:
-        raise refused("no servo has that ID")
+        raise refused("no servo has this ID")
     if value is None:
         value = BOARD_FAULTS.get(kind, 1.0)
     low, high = form.bounds(kind)
     if not low <= value <= high:
-        raise refused(f"a {form.value.strip('[=]').lower()} lies in {low:g} … {high:g}")
+        raise refused(f"expected a {form.value.strip('[=]').lower()} of {low:g} to {high:g}")
     return [
         FaultEvent(after, part, kind, value, until - after)
         for part in ((side,) if side else form.parts)

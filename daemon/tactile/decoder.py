@@ -142,6 +142,6 @@ class DelimitedDecoder(Decoder):
 
     def diagnosis(self) -> str:
         if self._reason:
-            return f"{self._reason}; {self._grid()} expected"
+            return f"{self._reason}; expected {self._grid()}"
         end = self._delimiter.hex().upper()
-        return f"no packet that ends with {end} among them; another board or baud?"
+        return f"no packet that ends with {end}; check the board and its baud rate"

@@ -97,12 +97,12 @@ class FlexiTacDecoder(Decoder):
         if found:
             side = round(found**0.5)
             shape = f"{found} cells" + (f" ({side} × {side} if square)" if side**2 == found else "")
-            return f"frames of {shape}, {expected} expected: set tactile.rows and tactile.cols"
+            return f"frames of {shape}, expected {expected}: set tactile.rows and tactile.cols"
         if self._ambiguous:
-            return f"AA 55 stands at several places of every frame of {expected}: move the sensor"
+            return f"several places in each frame of {expected} contain AA 55: move the sensor"
         if self._markers:
-            return f"some markers AA 55, but not at the spacing of {expected}"
-        return f"no marker AA 55 among them; frames of {expected} expected: another board or baud?"
+            return f"markers AA 55, but not at the spacing of {expected}"
+        return f"no marker AA 55; expected frames of {expected}: check the board and its baud rate"
 
     def _search(self) -> bool:
         """Move the buffer start to a confirmed marker; return False if more bytes are needed."""

@@ -125,9 +125,9 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
         else:
             parts.append(_frames(file))
     if not parts:
-        raise ValueError("no .npy file with a frame in this folder")
+        raise ValueError("found no .npy file with a frame in this folder")
     if len({part.shape[1:] for part in parts}) > 1:
-        raise ValueError("frames of different shapes in this folder")
+        raise ValueError("found frames of different shapes in this folder")
     return {"frames": np.concatenate(parts), **arrays}
 
 
@@ -153,7 +153,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
             part = _part(archive, name)
             left -= part.file_size
             if left < 0:
-                raise ValueError(f"{name}: unpacks to more than a recording of this size does")
+                raise ValueError(f"{name}: unpacks to more data than its size allows")
             with archive.open(part) as unpacked:
                 held[ours] = _read_array(unpacked, part.file_size)
     return held
@@ -166,13 +166,13 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
     shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
     stacks = [name for name, (shape, kind) in shapes.items() if len(shape) == 3 and kind in "uif"]
     if len(stacks) == 1:
-        notes.append(f"no array 'frames' in it; the frames are {stacks[0]!r}, its only 3-d array")
+        notes.append(f"found no array 'frames'; uses {stacks[0]!r}, the only 3-d array")
         return stacks[0]
     described = [f"{name} {shape}" for name, (shape, _) in [*shapes.items()][:_LISTED_COUNT_MAX]]
     described += ["…"] * (len(names) > _LISTED_COUNT_MAX)
     raise ValueError(
-        f"no array 'frames' in it; found {', '.join(described) or 'no array'}: name the one "
-        "[n, rows, cols] frames"
+        f"found no array 'frames', but {', '.join(described) or 'no other array'}: name the "
+        "array [n, rows, cols] frames"
     )
 
 
@@ -180,7 +180,7 @@ def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     part = archive.getinfo(f"{name}.npy")
     # NumPy uses only these methods; other methods may unpack to more than the stated size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{name}: found another compression than deflate")
+        raise ValueError(f"{name}: found an unsupported compression, expected deflate")
     return part
 
 
@@ -209,7 +209,9 @@ def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
     """Read the array in a .npy file. Raises ValueError if it claims more than ``size`` bytes."""
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
-        raise ValueError(f"claims to hold {shape} of {kind}, more than the file has")
+        raise ValueError(
+            f"its header states the shape {shape} of {kind}, more than the file contains"
+        )
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
@@ -291,15 +293,15 @@ def _check_below(
     noise = max(noise, 1.4826 * float(np.median(np.abs(sample - middle))))
     k, i, j = np.unravel_index(int(frames.argmin()), frames.shape)
     if middle < -noise:
-        expected = f"0 or noise; half of the cells read {middle:.3g} or less: tare them"
+        expected = f"0 or noise; half of the readings are {middle:.3g} or less: tare them"
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     if lowest < -_NOISE_SIGMA_MAX * noise:
-        expected = f"0 or more, or noise, which reaches to {-_NOISE_SIGMA_MAX * noise:.3g}"
+        expected = f"at least {-_NOISE_SIGMA_MAX * noise:.3g}, the range of noise around 0"
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     share = np.count_nonzero(frames < 0) / (len(frames) * np.count_nonzero(live))
     notes.append(
-        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: noise round a tared zero, "
-        "taken as 0"
+        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: noise around a tared "
+        "zero, set to 0"
     )
 
 
@@ -330,7 +332,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
     steps = np.diff(since)
     if (steps <= 0.0).any():
         k = int(np.argmax(steps <= 0.0))
-        raise ValueError(f"t: the times must rise; t[{k}] is {t[k]}, t[{k + 1}] is {t[k + 1]}")
+        raise ValueError(f"t: the times must increase; t[{k}] is {t[k]}, t[{k + 1}] is {t[k + 1]}")
     if not steps.size:
         return since
     step = float(np.median(steps))
@@ -341,12 +343,12 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
         factor = _factor(t, step, rate)
     if factor in _UNITS:
         notes.append(
-            f"t: taken as {_UNITS[factor]}: a frame comes every {step * factor:.4g} s, by "
-            f"tactile.rate every {1.0 / rate:.4g} s"
+            f"t: read as {_UNITS[factor]}, which gives {step * factor:.4g} s between frames; "
+            f"tactile.rate gives {1.0 / rate:.4g} s"
         )
     elif not 1.0 / _INTERVAL_RATIO_NOTED < step * rate < _INTERVAL_RATIO_NOTED:
         notes.append(
-            f"t: taken as s: a frame comes every {step:.4g} s, by tactile.rate every "
+            f"t: read as s, which gives {step:.4g} s between frames; tactile.rate gives "
             f"{1.0 / rate:.4g} s"
         )
     return np.multiply(since, factor)
@@ -358,7 +360,7 @@ def _factor(t: NDArray[Any], step: float, rate: float) -> float:
     if len(t) > 2 and (t % 1 == 0).all() and (np.diff(t) == 1).all():
         if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # a frame per second
             return 1.0
-        raise ValueError("t: whole numbers that rise by 1, expected times in s, or no t")
+        raise ValueError("t: whole numbers that increase by 1, expected times in s, or no t")
     if not whole and step * rate <= _INTERVAL_RATIO_MAX:
         return 1.0
     return min((1.0, *_UNITS)[whole:], key=lambda factor: abs(math.log(step * factor * rate)))
@@ -379,5 +381,5 @@ def _clipped(found: FrameRecording, scale: float, full: int) -> str:
     unit = "counts" if found.whole else f"counts of {scale:g} Pa"
     return (
         f"{cells} cells share the largest reading, {top} {unit}: if they are saturated, set "
-        f"tactile.full_count = {top}; d is too large otherwise"
+        f"tactile.full_count = {top}; otherwise d is too large"
     )

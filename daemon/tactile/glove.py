@@ -36,7 +36,9 @@ class GloveDecoder(DelimitedDecoder):
         halves = np.frombuffer(packet, np.uint8, len(packet) - 1, 1) - np.uint8(_OFFSET)
         # Bytes below the offset wrap around to large values.
         if packet[0] < _OFFSET or halves.max() >= self._values:
-            self._reason = "a byte that is no half of a count (tactile.full_count = 4095?)"
+            self._reason = (
+                "a byte that is not half of a count; tactile.full_count = 4095 may be needed"
+            )
             return None
         counts = halves[0::2].astype(np.uint16)
         counts *= self._values

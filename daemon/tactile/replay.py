@@ -31,8 +31,8 @@ def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> s
         return ""
     x, y = (each * 1e3 for each in recording.pitch)
     return (
-        f"its header has cells of {x:.4g} × {y:.4g} mm, tactile.pitch of {wanted[0] * 1e3:.4g} × "
-        f"{wanted[1] * 1e3:.4g} mm: set tactile.pitch = {x * 1e-3:.6g}, "
+        f"its header gives cells of {x:.4g} × {y:.4g} mm, tactile.pitch gives "
+        f"{wanted[0] * 1e3:.4g} × {wanted[1] * 1e3:.4g} mm: set tactile.pitch = {x * 1e-3:.6g}, "
         f"tactile.pitch_y = {y * 1e-3:.6g}"
     )
 
@@ -93,8 +93,8 @@ class ReplayTactile:
         if recording.counts.shape[1:] != (settings.rows, settings.cols):
             rows, cols = recording.counts.shape[1:]
             raise TactileError(
-                f"{path}: frames of {rows} × {cols} cells, {settings.rows} × {settings.cols} "
-                f"expected: set tactile.rows and tactile.cols"
+                f"{path}: frames of {rows} × {cols} cells, expected {settings.rows} × "
+                f"{settings.cols}: set tactile.rows and tactile.cols"
             )
         if wrong := pitch_difference(recording, (settings.pitch, settings.pitch_y)):
             raise TactileError(f"{path}: {wrong}")

@@ -104,7 +104,7 @@ class SerialReader:
     def open(self) -> None:
         """Open the port, start reading, and wait for a valid frame. Raises TactileError."""
         if self._port is not None:
-            raise TactileError(f"{self._path}: is open already")
+            raise TactileError(f"{self._path}: is already open")
         self._decoder = self.make_decoder()
         self._sensor_clock = SensorClock()
         self._latest, self._bytes = None, 0
@@ -169,8 +169,8 @@ class SerialReader:
         within = f"within tactile.open_timeout = {self.settings.open_timeout:g} s"
         if self._bytes == 0:
             return (
-                f"no byte came {within}; is the board powered, is it this port, does it talk at "
-                f"{self.settings.baud} baud?"
+                f"no data {within}: check the board's power, tactile.port and its rate of "
+                f"{self.settings.baud} baud"
             )
         return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
 
@@ -192,9 +192,9 @@ class SerialReader:
                 timeout = None
                 continue
             except OSError as error:
-                return self._end(f"the port is gone ({os.strerror(error.errno or errno.EIO)})")
+                return self._end(f"the port is lost ({os.strerror(error.errno or errno.EIO)})")
             if not data:
-                return self._end("the port is gone (it reports data and has none)")
+                return self._end("the port is lost (it reports data but has none)")
             self._bytes += len(data)
             decoded = decoder.feed(data, self._clock.now())
             self._hand_over(decoded)

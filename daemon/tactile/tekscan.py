@@ -138,9 +138,9 @@ def _live_cells(
     wrong = np.argwhere(unknown & live)
     if wrong.size:
         k, i, _ = wrong[0].tolist()
-        raise TekscanError(f"line {places[k][i]}: a cell that is no number")
+        raise TekscanError(f"line {places[k][i]}: a cell is not a number")
     if not live.any():
-        raise TekscanError("no cell in it")
+        raise TekscanError("contains no cells")
     return np.where(live, values, 0.0), live
 
 
@@ -168,7 +168,7 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
             header[key] = value
             in_comments = key.startswith("COMMENT")
     raise TekscanError(
-        "no line ASCII_DATA: this is no Tekscan-style export; expected one, .npz or .npy files"
+        "found no line ASCII_DATA, expected a Tekscan-style export, .npz or .npy file"
     )
 
 
@@ -211,7 +211,7 @@ def _frames(
         frames[-1].append(_row(line, separator, cols, number))
         places[-1].append(number)
     if not frames:
-        raise TekscanError("no frame in it")
+        raise TekscanError("contains no frames")
     if len(frames[-1]) < rows:
         raise TekscanError(
             f"the file ends in frame {numbers[-1]}: {len(frames[-1])} rows of {rows}"
@@ -250,8 +250,8 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
         elif cols < len(cells) < 2 * cols and all(each.isdigit() or each == "B" for each in cells):
             raise TekscanError(
-                f"line {number}: {len(cells)} cells, expected {cols}: commas stand between the "
-                "cells and in the numbers; export with decimal points or another separator"
+                f"line {number}: {len(cells)} cells, expected {cols}: commas separate the cells "
+                "and their decimals; export with decimal points or another separator"
             )
     if len(cells) != cols:
         raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
@@ -260,7 +260,7 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
     except ValueError as error:
         raise TekscanError(f"line {number}: {error}") from None
     if np.count_nonzero(np.isneginf(values)) != missing:
-        raise TekscanError(f"line {number}: a cell that is no number")
+        raise TekscanError(f"line {number}: a cell is not a number")
     return values
 
 
@@ -327,8 +327,8 @@ def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
         area = pitch[0] * pitch[1] if math.isnan(area) else area
         if area > 0.0:
             return _FORCES[unit] / area
-        raise TekscanError(f"UNITS: found {text!r}, a force, which needs SENSEL_AREA")
-    raise TekscanError(f"UNITS: found {text!r}, expected RAW or a pressure's unit")
+        raise TekscanError(f"UNITS: found {text!r}, a unit of force, which requires SENSEL_AREA")
+    raise TekscanError(f"UNITS: found {text!r}, expected RAW or a unit of pressure")
 
 
 def _per_area() -> dict[str, float]:

@@ -103,7 +103,7 @@ class CommandServer:
             try:
                 request = decode(ask.payload)
                 if ask.urgent and request["command"] != "stop":  # two keys are named "command"
-                    raise _malformed('expected one text under "command"')
+                    raise _malformed('expected one string under "command"')
             except Refused as refused:
                 self._link.reply(ask, refusal(str(refused), refused.reason))
                 continue
@@ -118,7 +118,7 @@ class CommandServer:
             mine = [other for other in waiting if other[0].route[0] == ask.route[0]]
             if mine and _replaces(request, mine[-1][1]):
                 waiting.remove(mine[-1])
-                text = "hold: a newer one of this connection replaced it"
+                text = "hold: replaced by a newer hold of the same connection"
                 self._link.reply(mine[-1][0], refusal(text, Reason.SUPERSEDED))
             waiting.append((ask, request))
 
@@ -132,10 +132,10 @@ class CommandServer:
         if not reply:
             try:
                 if first.stops != self._stops or (ask.stops != self._stops and name != "status"):
-                    text = "not carried out: it came before a stop, or too soon after it"
+                    text = "rejected: received before the last stop, or too soon after it"
                     raise Refused(text, Reason.STOPPED)
                 if first.changes != self._changes:
-                    text = f"{name}: another command was carried out since this one was late"
+                    text = f"{name}: another command has been carried out since the first attempt"
                     raise Refused(text, Reason.SUPERSEDED)
                 reply = accepted(handler(request, self._clock() - ask.came))
                 self._changes += name != "status"
@@ -192,7 +192,7 @@ def decode(payload: bytes) -> dict[str, Any]:
     if not isinstance(request, dict):
         raise _malformed(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):
-        raise _malformed('expected a text under "command"')
+        raise _malformed('expected a string under "command"')
     # Requests are published unchanged, so nested values are rejected.
     plain = {
         key: value
@@ -202,10 +202,10 @@ def decode(payload: bytes) -> dict[str, Any]:
     if request["command"] == "stop":
         return plain
     if len(plain) < len(request):
-        raise _malformed("expected texts as keys, and numbers and texts as values")
+        raise _malformed("expected strings as keys, and numbers or strings as values")
     key = plain.get("key", "-")
     if not isinstance(key, str) or not 0 < len(key) <= _KEY_LENGTH_MAX:
-        raise _malformed(f"key: expected a text of 1 to {_KEY_LENGTH_MAX} characters")
+        raise _malformed(f"key: expected a string of 1 to {_KEY_LENGTH_MAX} characters")
     return plain
 
 

@@ -82,7 +82,7 @@ KINDS: dict[str, EventKind] = {
     "short": EventKind(
         "warning",
         "A joint stopped before its goal.",
-        "Remove what blocks it; check `control.joint_friction` and `safety.current_move`.",
+        "Remove the obstacle; check `control.joint_friction` and `safety.current_move`.",
     ),
     "lost": EventKind(
         "warning",
@@ -191,7 +191,7 @@ KINDS: dict[str, EventKind] = {
     "joint.stall": EventKind(
         "error",
         "A joint does not reach its goal at maximum current.",
-        f"Remove what blocks it. {_CALIBRATE_JOINTS}",
+        f"Remove the obstacle. {_CALIBRATE_JOINTS}",
     ),
     "joint.swapped": EventKind(
         "error",
@@ -206,7 +206,7 @@ KINDS: dict[str, EventKind] = {
     "joint.blocked": EventKind(
         "warning",
         "A joint has stopped in the approach at maximum current, and its tip has no contact.",
-        f"Remove what blocks it, or correct `servos.direction`. {_CALIBRATE_JOINTS}",
+        f"Remove the obstacle, or correct `servos.direction`. {_CALIBRATE_JOINTS}",
     ),
     "joint.strained": EventKind(
         "warning",
@@ -259,10 +259,11 @@ KINDS: dict[str, EventKind] = {
     ),
     "tare": EventKind(
         "info, warning",
-        "A tare ended: the median change of the cells' zeros, and the largest. The warning says "
-        "that the zero was not changed, since most cells are saturated without contact.",
-        "After the warning, check the board's gain and `tactile.full_count`. A large change at "
-        "every start is worth a new `softfinger calibrate tare`.",
+        "A tare has ended; the text gives the median and the largest change of the zeros. The "
+        "warning means that the sensor was not tared, because most cells are saturated without "
+        "contact.",
+        "After the warning, check the board's gain and `tactile.full_count`. If the change is "
+        "large at every start, repeat `softfinger calibrate tare`.",
     ),
     # Consistency checks between the hand's parts
     "hand.angle": EventKind(
@@ -278,27 +279,27 @@ KINDS: dict[str, EventKind] = {
     "hand.force": EventKind(
         "warning", "The two tips measure different forces in the same grip.", _CHECK_SENSOR
     ),
-    "witness.left_sensor": EventKind(
+    "consistency.left_sensor": EventKind(
         "warning",
         "The left sensor is inconsistent with the joints and the other tip.",
         _CHECK_SENSOR,
     ),
-    "witness.right_sensor": EventKind(
+    "consistency.right_sensor": EventKind(
         "warning",
         "The right sensor is inconsistent with the joints and the other tip.",
         _CHECK_SENSOR,
     ),
-    "witness.left_current": EventKind(
+    "consistency.left_current": EventKind(
         "warning",
         "The left joint's measured current differs from its goal.",
         "Check the supply and the current sensor of the servo.",
     ),
-    "witness.right_current": EventKind(
+    "consistency.right_current": EventKind(
         "warning",
         "The right joint's measured current differs from its goal.",
         "Check the supply and the current sensor of the servo.",
     ),
-    "witness.force": EventKind(
+    "consistency.force": EventKind(
         "error",
         "The commanded force increased, but the measured force did not follow.",
         f"Remove what blocks the joints. {_CHECK_SENSOR}",

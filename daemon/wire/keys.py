@@ -87,8 +87,8 @@ def check_curve() -> None:
     """Raise KeyFileError if the installed libzmq does not support CURVE."""
     if not zmq.has("curve"):
         raise KeyFileError(
-            f"libzmq {zmq.zmq_version()} of this Python was built without CURVE: install a pyzmq "
-            "that has it (its published wheels do), or keep to addresses on this machine"
+            f"libzmq {zmq.zmq_version()} was built without CURVE: install one of pyzmq's "
+            "published wheels, or use addresses on this machine only"
         )
 
 
@@ -113,13 +113,16 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     for name in wanted:
         if not _NAME.fullmatch(name) or name == "server":
             raise KeyFileError(
-                f"{name!r} is no name of a client: letters, digits, dots, dashes, at most 64"
+                f"{name!r} is not a client name: expected letters, digits, dots and dashes, at "
+                "most 64"
             )
         there = [server / "clients" / f"{name}.key", folder / name]
         if any(path.exists() for path in there) or wanted.count(name) > 1:
-            raise KeyFileError(f"{folder}: client {name} is there already; take another name")
+            raise KeyFileError(f"{folder}: client {name} already exists; choose another name")
     if not wanted:
-        raise KeyFileError(f"{folder}: the server's keys are there already; name clients to add")
+        raise KeyFileError(
+            f"{folder}: the server's keys already exist; give names of clients to add"
+        )
     try:
         return _write_keys(folder, server, wanted, new)
     except OSError as error:
@@ -160,7 +163,9 @@ def load_server(folder: Path) -> ServerKeys:
         raise _unreadable(place / "clients", error) from None
     clients = {_keys(path)[0]: path.stem for path in files}
     if not clients:
-        raise KeyFileError(f"{place / 'clients'}: no client's key; `softfinger keys` makes them")
+        raise KeyFileError(
+            f"{place / 'clients'}: found no client keys; create them with `softfinger keys`"
+        )
     return ServerKeys(public, secret, clients)
 
 
@@ -182,14 +187,14 @@ def _place(folder: Path) -> Path:
 
 def _unreadable(path: Path, error: OSError) -> KeyFileError:
     kind = NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
-    return kind(f"{path}: can't be read: {error.strerror}; `softfinger keys` makes such files")
+    return kind(f"{path}: can't be read: {error.strerror}; `softfinger keys` creates key files")
 
 
 def _pair(path: Path) -> tuple[bytes, bytes]:
     _check_above(path)
     public, secret = _keys(path, secret=True)
     if secret is None:
-        raise KeyFileError(f"{path}: holds no secret key")
+        raise KeyFileError(f"{path}: contains no secret key")
     return public, secret
 
 
@@ -199,11 +204,11 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
         keys = zmq.auth.load_certificate(path)
         for key in filter(None, keys):
             if len(zmq.utils.z85.decode(key)) != _LENGTH:
-                raise ValueError("a key of another length")
+                raise ValueError("a key has the wrong length")
     except OSError as error:
         raise _unreadable(path, error) from None
     except (ValueError, LookupError, struct.error):  # struct.error: value exceeds the Z85 range
-        raise KeyFileError(f"{path}: no key file") from None
+        raise KeyFileError(f"{path}: not a key file") from None
     return keys
 
 
@@ -211,7 +216,7 @@ def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
     """Raise KeyFileError if another user owns or may write a file, or may read a secret key."""
     mode = stat.S_IMODE(status.st_mode)
     if secret and mode & 0o077:
-        raise KeyFileError(f"{path}: may be read by others ({mode:04o}): chmod 600 {path}")
+        raise KeyFileError(f"{path}: other users may read it ({mode:04o}): chmod 600 {path}")
     if wrong := fault(path, status):
         raise KeyFileError(wrong)
 

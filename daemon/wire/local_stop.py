@@ -50,7 +50,7 @@ class LocalStop:
         except OSError as error:
             self._socket.close()
             raise AddressError(
-                f"commands.address: the local socket for stop: {error.filename or ''} "
+                f"commands.address: can't create the local stop socket: {error.filename or ''} "
                 f"{error.strerror or error}"
             ) from None
         self._senders: deque[Any] = deque(maxlen=_SENDER_COUNT_MAX)
@@ -121,7 +121,7 @@ def _name(address: str) -> str:
     host, _, port = place.rpartition(":")
     host = "127.0.0.1" if host in _LOCAL_HOSTS else host.strip("[]")
     if not ipaddress.ip_address(host).is_loopback:
-        raise ValueError(f"{address} is not of this machine")
+        raise ValueError(f"{address} is not an address of this machine")
     return f"stop-{host}-{port}"
 
 
@@ -154,10 +154,10 @@ def _own_folder() -> tuple[Path, str]:
             refused = error
             continue
         if _is_ours(folder):
-            return folder, notice and f"{notice}; the local stop is in {folder}"
-        refused = PermissionError(1, "is not this user's alone", str(folder))
+            return folder, notice and f"{notice}; the local stop socket is in {folder}"
+        refused = PermissionError(1, "is not private to this user", str(folder))
         ours = folder.lstat().st_uid == os.geteuid()
-        notice = f"{folder} is not this user's alone{f' (chmod 700 {folder})' * ours}"
+        notice = f"{folder} is not private to this user{f' (chmod 700 {folder})' * ours}"
     assert refused is not None
     raise refused
 

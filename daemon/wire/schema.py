@@ -361,7 +361,8 @@ class TactileFrame:
     def __post_init__(self) -> None:
         if min(self.rows, self.cols) < 1 or len(self.data) != 2 * self.rows * self.cols:
             raise ValueError(
-                f"hand/tactile: {len(self.data)} bytes are no {self.rows} × {self.cols} uint16 grid"
+                f"hand/tactile: found {len(self.data)} bytes, expected a {self.rows} × "
+                f"{self.cols} uint16 grid"
             )
 
     def __repr__(self) -> str:

@@ -85,11 +85,13 @@ def tare(frames: ArrayLike) -> Tare:
     """
     stack = _stack(frames, "tare")
     if len(stack) < 2:
-        raise CalibrationError("tare: one frame is too few, expected at least two")
+        raise CalibrationError("tare: found one frame, expected at least two")
     noise = stack.std(axis=0, ddof=1)
     restless = np.count_nonzero(noise > _UNREST_SIGMA * max(float(np.median(noise)), 0.5))
     if restless >= _UNREST_CELL_COUNT:
-        raise CalibrationError(f"tare: {restless} cells don't rest; does something touch the tip?")
+        raise CalibrationError(
+            f"tare: the readings of {restless} cells change; is the tip in contact?"
+        )
     zero = stack.mean(axis=0)
     excess = float(np.maximum(stack - zero, 0.0).mean())
     return Tare(zero, noise, *noise_correlation(stack), excess)
@@ -152,16 +154,16 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     if the frames show no pressure.
     """
     if not loads:
-        raise CalibrationError("equilibrate: no uniform pressure was given")
+        raise CalibrationError("equilibrate: expected at least one uniform pressure")
     readings = np.stack([_stack(load, "equilibrate").mean(axis=0) - zero for load in loads])
     response = readings.sum(axis=0)
     typical = float(np.median(response))
     if not typical > 0.0:
-        raise CalibrationError("equilibrate: most cells read nothing above their zero")
+        raise CalibrationError("equilibrate: most cells read no pressure above their zero")
     active = response > DEAD_RESPONSE * typical
     target = np.array([reading[active].mean() for reading in readings])
     if (target <= 0.0).any():
-        raise CalibrationError("equilibrate: a pressure reads nothing above the zero")
+        raise CalibrationError("equilibrate: one of the pressures reads nothing above the zero")
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = np.tensordot(target, readings, 1) / (readings**2).sum(axis=0)
     gain = np.where(active, gain, 0.0)
@@ -216,12 +218,12 @@ def fit_curve(
     x = x.reshape(len(x), -1)
     known = np.asarray(force, np.float64)
     if known.shape != (len(x),) or not (np.isfinite(known).all() and (known > 0.0).all()):
-        raise CalibrationError("curve: each load needs its force, above 0")
+        raise CalibrationError("curve: each load needs a force above 0")
     need = 2 if kind == "power" else 3
     if len(np.unique(known)) < need:
         raise CalibrationError(f"curve: a {kind} needs at least {need} different forces")
     if (x.max(axis=1) <= 0.0).any():
-        raise CalibrationError("curve: a load reads nothing above the zero")
+        raise CalibrationError("curve: one of the loads reads nothing above the zero")
     if kind == "power":
         coefficients, errors = _power(x, known, area, full)
     else:
@@ -236,10 +238,10 @@ def _cubic(
     rows = np.stack([(u**j).sum(axis=1) * area / force for j in (1, 2, 3)], axis=1)
     c, _, rank, _ = np.linalg.lstsq(rows, np.ones(len(force)), rcond=1e-10)
     if rank < 3:
-        raise CalibrationError("curve: the loads are too alike for a cubic; try a power")
+        raise CalibrationError("curve: the loads are too similar for a cubic; try a power")
     at = np.linspace(0.0, 1.0, 201)
     if (c[0] + 2 * c[1] * at + 3 * c[2] * at**2 <= 0.0).any():
-        raise CalibrationError("curve: the cubic through these loads falls; try a power")
+        raise CalibrationError("curve: the cubic through these loads decreases; try a power")
     scaled = (1.0, float(c[0] / full), float(c[1] / full**2), float(c[2] / full**3))
     return scaled, rows @ c - 1.0
 
@@ -265,7 +267,7 @@ def _power(
     low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
     exponent = golden_section(cost, low, high, 1e-9)
     if not _EXPONENTS[0] + 0.02 < exponent < _EXPONENTS[1] - 0.02:
-        raise CalibrationError(f"curve: these loads want an exponent beyond {_EXPONENTS}")
+        raise CalibrationError(f"curve: these loads need an exponent outside {_EXPONENTS}")
     factor, errors = fit(exponent)
     return (exponent, factor / full**exponent, 0.0, 0.0), errors
 
@@ -339,12 +341,12 @@ def fit_centre(
     tilted = float(np.ptp(s)) > math.sin(_TILT_MIN)
     if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT_ERROR):
         raise CalibrationError(
-            f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so that tilt "
-            "can't be separated from place; press upright alone, or upright and tilted further"
+            f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so tilt and "
+            "position can't be separated; press upright alone, or upright and tilted further"
         )
     for k, frame in enumerate(stack):
         if not frame.max() > _PRESSED_SIGMA * noise:
-            raise CalibrationError(f"centre: press {k + 1} is no clean contact")
+            raise CalibrationError(f"centre: press {k + 1} gives no valid contact")
     used = np.broadcast_to(True if active is None else active, stack.shape)
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
@@ -382,7 +384,9 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
         raise CalibrationError("modulus: each frame needs its d and its force")
     used = (depth > 0.0) & (load > 0.0)
     if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
-        raise CalibrationError("modulus: expected at least three frames of different d, pressed")
+        raise CalibrationError(
+            "modulus: expected at least three frames of different d with contact"
+        )
     depth, tilt, load = depth[used], tilt[used], load[used]
     if not np.polyfit(depth, load, 1)[0] > 0.0:
         raise CalibrationError("modulus: the force does not rise with d")
@@ -485,7 +489,7 @@ def _stack(frames: ArrayLike, step: str) -> FloatArray:
     if stack.ndim != 3 or not len(stack):
         raise CalibrationError(f"{step}: expected frames [n, rows, cols], got {stack.shape}")
     if not np.isfinite(stack).all():
-        raise CalibrationError(f"{step}: readings that are not finite")
+        raise CalibrationError(f"{step}: found readings that are not finite")
     return stack
 
 

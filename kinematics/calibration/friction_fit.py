@@ -110,13 +110,13 @@ def fit_friction(
 
 def duration_error(seconds: float) -> str:
     """Return the error message for an overlong recording of ``seconds``."""
-    return f"found {seconds:.0f} s of data, expected {DURATION_MAX:g} s at most"
+    return f"found {seconds:.0f} s of data, expected at most {DURATION_MAX:g} s"
 
 
 def _too_little(closing: float, opening: float) -> str:
     return (
         f"found {closing:.1f} s of closing and {opening:.1f} s of opening above "
-        f"{_SLIDING_SPEED:g} rad/s in air, expected {_MOTION_TIME_MIN:g} s of each at least"
+        f"{_SLIDING_SPEED:g} rad/s in air, expected at least {_MOTION_TIME_MIN:g} s of each"
     )
 
 

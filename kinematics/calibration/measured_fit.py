@@ -67,9 +67,9 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
         or not (np.abs(theta) < _UPRIGHT_TILT).any()
     ):
         raise CurvesError(
-            f"found {len(d)} presses of {len(np.unique(d))} depths, {tilted.sum()} of them tilted; "
-            f"expected at least {_PRESS_COUNT_MIN} of 3 depths, upright ones, and 2 tilted by 5° "
-            f"or more"
+            f"found {len(d)} presses at {len(np.unique(d))} depths, {tilted.sum()} of them "
+            f"tilted; expected at least {_PRESS_COUNT_MIN} at 3 depths, some upright and 2 "
+            "tilted by 5° or more"
         )
     frames = [each for each, use in zip(presses.frames, used, strict=True) if use]
     first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
@@ -99,7 +99,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
             (t, q, times), y, np.hypot(sigma, _STAGE_ERROR * np.abs(y)), powers, squares, valid
         )
         if best is None:
-            raise CurvesError(f"no smooth curve that rises goes through the presses' {name}")
+            raise CurvesError(f"no smooth increasing curve fits the {name} of the presses")
         return tuple(map(tuple, best.tolist()))
 
     one = np.ones(len(d))
@@ -138,8 +138,8 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     force_error, lever_error = max(missed[:2]), max(missed[2:])
     if max(force_error, lever_error / radius) > _CURVE_ERROR_MAX:
         raise CurvesError(
-            f"every smooth curve that rises misses the presses' force by {force_error:.1%} or "
-            f"their centroid by {lever_error * 1e3:.2f} mm"
+            "the best smooth increasing curve deviates from the presses' force by "
+            f"{force_error:.1%} or from their centroid by {lever_error * 1e3:.2f} mm"
         )
     return replace(law, force_error=force_error, lever_error=lever_error)
 
@@ -159,7 +159,7 @@ def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """Return the covariance [4, 4] of one frame's sums, from the frames of each press."""
     if min(map(len, frames)) < 5:
-        raise CurvesError("expected at least five frames of each press: their noise counts")
+        raise CurvesError("expected at least five frames of each press, to measure their noise")
     each = [weights @ every.reshape(len(every), -1).T for every in frames]
     return np.asarray(np.mean([np.cov(sums) for sums in each], axis=0))
 

@@ -79,8 +79,11 @@ class Trend:
     def cause(self) -> str:
         """Probable cause of the drift."""
         if self.drift > 0.0:
-            return "the tip stiffens more than this law: another base or face, or springs"
-        return "the tip stiffens less than this law: another base or face, or solid, or it softens"
+            return "the tip stiffens more than this model: try another base or face, or springs"
+        return (
+            "the tip stiffens less than this model: try another base or face, or solid; or it "
+            "softens"
+        )
 
 
 def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:

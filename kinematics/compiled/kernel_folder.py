@@ -51,8 +51,8 @@ def kernel_folder() -> OwnFolder | None:
         return find_kernel_folder()
     except (OSError, RuntimeError) as error:
         warnings.warn(
-            f"compiled kernels can't be kept, so every start compiles anew: {error} "
-            "(NUMBA_CACHE_DIR names another folder)",
+            f"compiled kernels can't be stored, so every start compiles them again: {error} "
+            "(NUMBA_CACHE_DIR selects another folder)",
             RuntimeWarning,
             stacklevel=2,
         )
@@ -82,7 +82,7 @@ def keep(folder: OwnFolder, name: str, content: bytes) -> None:
     try:
         folder.write(name + _KERNEL, hashlib.sha256(content).digest() + content)
     except OSError as error:
-        warnings.warn(f"{folder.path}: a kernel can't be kept: {error}", RuntimeWarning, 2)
+        warnings.warn(f"{folder.path}: a kernel can't be stored: {error}", RuntimeWarning, 2)
 
 
 def kept(folder: OwnFolder, name: str) -> bytes | None:
@@ -92,7 +92,7 @@ def kept(folder: OwnFolder, name: str) -> bytes | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        warnings.warn(f"{folder.path}: compiled anew: {error}", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{folder.path}: compiling again: {error}", RuntimeWarning, stacklevel=2)
         return None
 
 

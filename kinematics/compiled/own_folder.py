@@ -35,7 +35,7 @@ def fault(path: Path, found: os.stat_result) -> str:
     if not HAS_OWNERS:
         return ""
     if found.st_uid not in (0, os.geteuid()):
-        return f"{path}: belongs to user {found.st_uid}, expected {os.geteuid()}, who runs this"
+        return f"{path}: belongs to user {found.st_uid}, expected the current user {os.geteuid()}"
     if found.st_mode & stat.S_ISVTX and stat.S_ISDIR(found.st_mode):
         return ""
     return _written_by_others(path, found)
@@ -46,7 +46,9 @@ def _written_by_others(path: Path, found: os.stat_result) -> str:
         return ""
     others = stat.S_IWOTH | (0 if _alone_in(found.st_gid) else stat.S_IWGRP)
     mode = stat.S_IMODE(found.st_mode)
-    return f"{path}: may be written by others ({mode:04o}): chmod go-w {path}" * bool(mode & others)
+    return f"{path}: other users may write to it ({mode:04o}): chmod go-w {path}" * bool(
+        mode & others
+    )
 
 
 @cache
@@ -134,7 +136,7 @@ class OwnFolder:
         try:
             _check_owner(path, os.fstat(self.descriptor))
             if not os.access(path, os.W_OK | os.X_OK):
-                raise PermissionError(f"{path}: may not be written to")
+                raise PermissionError(f"{path}: is not writable")
         except OSError:
             self.close()
             raise

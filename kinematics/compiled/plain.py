@@ -39,7 +39,7 @@ class InnerKernel:
         """Raise TypeError; only kernels can call inner kernels."""
         raise TypeError(
             f"{self.__module__}.{self.__name__} is an inner kernel, which only kernels may call; "
-            "what Python calls is marked @kernel"
+            "mark it with @kernel to call it from Python"
         )
 
 

@@ -81,7 +81,10 @@ class Fingertip:
             low, high = POISSON
             raise ValueError(f"poisson must be {low} to {high}, not {self.poisson!r}")
         if (self.physics == "measured") != (self.law is not None):
-            raise ValueError(f"a measured tip, and no other, has a law; physics: {self.physics!r}")
+            raise ValueError(
+                "a law is required for a measured tip, and allowed for no other; "
+                f"physics: {self.physics!r}"
+            )
         radius = float(self.radius)
         if not (radius > 0.0 and math.isfinite(radius)):
             raise ValueError(f"the tip's radius must be positive and finite, not {self.radius!r}")

@@ -38,7 +38,7 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
     y = np.asarray(stress, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape:
         raise MaterialError(
-            f"strain and stress must be two lists of one length, not {x.shape} and {y.shape}"
+            f"strain and stress must be two lists of equal length, not {x.shape} and {y.shape}"
         )
     wrong = []
     bad = np.flatnonzero(~(np.isfinite(x) & np.isfinite(y)))
@@ -92,7 +92,7 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
     misfit, modulus = next(one for one in tried if one[0] <= enough)
     if misfit > _MISFIT_MAX:
         raise MaterialError(
-            f"no smooth monotone law comes near the points: the best misses one by "
+            "no smooth monotone law fits the points: the best deviates from one by "
             f"{misfit * top:.4g} Pa of {top:.4g} Pa"
         )
     rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])

@@ -272,8 +272,8 @@ class ContactEstimator:
     ) -> None:
         if tip.physics == "measured":
             raise ValueError(
-                "a measured tip has no model of its frames: expected a tip of springs or solid; "
-                "softfinger.kinematics.estimation.measured.MeasuredEstimator is for a measured one"
+                "a measured tip has no frame model: use "
+                "softfinger.kinematics.estimation.measured.MeasuredEstimator"
             )
         if active is not None and np.shape(active) != grid.shape:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")

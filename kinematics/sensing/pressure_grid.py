@@ -173,5 +173,5 @@ def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float
         raise ValueError(f"d = {d} m is more than the tip's radius {radius} m")
     n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
     if abs(tilt_x) >= 0.5 * math.pi or abs(tilt_y) >= 0.5 * math.pi or n_x**2 + n_y**2 >= 1.0:
-        raise ValueError(f"tilts {tilt_x}, {tilt_y} rad don't make a normal out of the tip")
+        raise ValueError(f"tilts {tilt_x}, {tilt_y} rad give no normal that points out of the tip")
     return n_x, n_y

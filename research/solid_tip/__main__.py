@@ -79,12 +79,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m research.solid_tip", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write, .npz")
     parser.add_argument("--rings", type=int, default=64, help="elements along the arc")
-    parser.add_argument("--sticking", type=int, default=48, help="the same where the face sticks")
-    parser.add_argument("--coarser", type=int, default=32, help="elements to tell the mesh's error")
-    parser.add_argument("--held-out", type=int, default=32, help="elements of presses not fitted")
+    parser.add_argument(
+        "--sticking", type=int, default=48, help="elements along the face if it sticks"
+    )
+    parser.add_argument(
+        "--coarser", type=int, default=32, help="elements for estimating the error of the mesh"
+    )
+    parser.add_argument(
+        "--held-out", type=int, default=32, help="elements of presses that are not fitted"
+    )
     parser.add_argument("--nodes", type=int, default=4, help="values of ν")
     parser.add_argument("--tolerance", type=float, default=1.2e-3, help="of the modes")
-    parser.add_argument("--folder", type=Path, required=True, help="where presses are kept")
+    parser.add_argument(
+        "--folder", type=Path, required=True, help="folder for the results of presses"
+    )
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)

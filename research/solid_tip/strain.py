@@ -218,7 +218,9 @@ def main() -> None:
     )
     parser.add_argument("linear", type=Path, help="file of the linear law")
     parser.add_argument("out", type=Path, help="file to write, .npz")
-    parser.add_argument("--folder", type=Path, required=True, help="where presses are kept")
+    parser.add_argument(
+        "--folder", type=Path, required=True, help="folder for the results of presses"
+    )
     parser.add_argument("--tolerance", type=float, default=3e-3, help="of the modes")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)

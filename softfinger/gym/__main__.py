@@ -82,7 +82,9 @@ if __name__ == "__main__":
     # Worker processes cannot unpickle functions from ``__main__``, so import this module by name.
     from softfinger.gym.__main__ import main
 
-    parser = argparse.ArgumentParser(description="Returns of a random agent and of the law.")
+    parser = argparse.ArgumentParser(
+        description="Compare the returns of a random agent and of the grip law."
+    )
     parser.add_argument("episodes", type=int, nargs="?", default=20)
     parser.add_argument("profile", nargs="?", default="sim")
     add_sweep(parser)

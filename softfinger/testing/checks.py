@@ -51,17 +51,23 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
     kept = np.zeros(shape, np.uint16)
     for count in range(frames):
         while (frame := sensor.latest()) is last or frame is None:
-            assert time.monotonic() < deadline, f"found {count} frames, expected {frames} in time"
+            assert time.monotonic() < deadline, f"found {count} frames in time, expected {frames}"
             time.sleep(_POLL)
         assert isinstance(frame, Frame), f"found {type(frame).__name__}, expected a Frame"
         found = f"{frame.data.dtype} {frame.data.shape}"
         assert found == f"uint16 {shape}", f"found data {found}, expected uint16 {shape}"
-        assert frame.t_sample <= frame.t_arrival, "found a frame that came before its scan"
-        assert frame.t_arrival <= time.monotonic(), "found a frame that comes in the future"
+        assert frame.t_sample <= frame.t_arrival, "found a frame that arrived before its scan"
+        assert frame.t_arrival <= time.monotonic(), (
+            "found a frame with an arrival time in the future"
+        )
         if last is not None:
             assert frame.seq > last.seq, f"found seq {frame.seq} after {last.seq}"
-            assert frame.t_arrival >= last.t_arrival, "found a frame that came before the last"
-            assert (last.data == kept).all(), "found a frame written to after it was handed over"
+            assert frame.t_arrival >= last.t_arrival, (
+                "found a frame that arrived before the last one"
+            )
+            assert (last.data == kept).all(), (
+                "found a frame that was modified after it was returned"
+            )
         last, kept = frame, frame.data.copy()
 
 
@@ -81,7 +87,7 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
             first, seq = list(reading.q), reading.seq
             _read(servos, reading, patience)
             assert reading.seq > seq, f"found seq {reading.seq} after {seq}"
-            assert reading.t <= time.monotonic(), "found a reading of the future"
+            assert reading.t <= time.monotonic(), "found a reading with a time in the future"
             assert np.isfinite([*reading.q, *reading.dq, *reading.current]).all(), "found NaN"
             _check_counters(servos)
             if torque:
@@ -89,7 +95,9 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
                 servos.write(Goal(q=list(reading.q), current=[0.1, 0.1], valid=True))
                 _read(servos, reading, patience)
                 moved = np.abs(np.subtract(reading.q, first)).max()
-                assert moved < 0.05, f"found joints that moved by {moved:.3g} rad when stiffened"
+                assert moved < 0.05, (
+                    f"found joints that moved by {moved:.3g} rad when torque was switched on"
+                )
             deadline = time.monotonic() + patience
             while not servos.torque_off(reading):
                 assert time.monotonic() < deadline, "torque off is not confirmed in time"
@@ -122,7 +130,9 @@ def check_shape(settings: Settings) -> None:
         return
     sound = polygon(shape.corners)
     away = float(np.abs(sound.corners - shape.corners).max())
-    assert away <= 1e-9, f"found a centre of mass {away:.3g} m off the origin"
+    assert away <= 1e-9, f"found a centre of mass {away:.3g} m from the origin"
     for name in ("gyration", "mean_radius"):
         found, expected = getattr(shape, name), getattr(sound, name)
-        assert abs(found - expected) <= 1e-6 * expected, f"{name}: {found:g}, not {expected:g} m"
+        assert abs(found - expected) <= 1e-6 * expected, (
+            f"{name}: found {found:g} m, expected {expected:g} m"
+        )

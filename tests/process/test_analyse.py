@@ -104,7 +104,7 @@ def test_a_recording_without_frames_is_an_error(inline, tmp_path):
     path.write_bytes(b"\x89MCAP0\r\n")
     done = inline("analyse", path)
     assert (done.returncode, "cut short" in done.stderr) == (1, True)
-    assert done.stderr.splitlines()[-1] == f"analyse: {path}: no tactile frames in it"
+    assert done.stderr.splitlines()[-1] == f"analyse: {path}: contains no tactile frames"
 
 
 def test_frames_without_settings_need_matching_settings(inline, counts, tmp_path):
@@ -112,7 +112,10 @@ def test_frames_without_settings_need_matching_settings(inline, counts, tmp_path
     np.save(path, counts[:3, :5, :5])
     done = inline("analyse", path)
     assert (done.returncode, done.stdout) == (2, "")
-    assert "small.npy: no settings in it: name the tip and the sensor by --config" in done.stderr
+    assert (
+        "small.npy: contains no settings: describe the tip and the sensor with --config"
+        in done.stderr
+    )
     done = inline("analyse", path, "--config", "paper")
     assert done.returncode == 2
     assert "small.npy: frames of 5 × 5 cells, expected 44 × 44: set tactile.rows" in done.stderr

@@ -64,7 +64,7 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
     [
         ("left={pose} right={pose}", "servos 1 and 2 turned, expected one: move it alone"),
         ("left={pose}", "servo 2 turned for both fingers"),
-        ("left=ajar", "it ended with 1"),
+        ("left=ajar", "ended with status 1"),
     ],
 )
 def test_moving_the_wrong_finger_is_refused(hand, tmp_path, capsys, turn, told):
@@ -93,7 +93,7 @@ def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
     assert "left finger: found 0.0° between closed and open" in capsys.readouterr().err
     monkeypatch.setattr(emulator._servos.bus.servos[0]._joint, "shift", 4000)
     assert calibrate(folder, *words) == 1
-    assert "past the encoder's wrap" in capsys.readouterr().err
+    assert "is outside one turn" in capsys.readouterr().err
 
 
 def test_only_calibrated_values_change_in_a_profile():

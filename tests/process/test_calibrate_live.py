@@ -115,7 +115,7 @@ def test_missing_loads_change_nothing(tmp_path, capsys, monkeypatch):
     file = tmp_path / "a.json"
     words = ["calibrate", "centre", str(file), "--theta", "0", "5", "--config", str(profile)]
     assert main([*words, "--no-plot", "--frames", "8"]) == 1
-    assert "ended before all loads were on" in capsys.readouterr().err
+    assert "ended before all loads were applied" in capsys.readouterr().err
     assert not file.exists()
 
 
@@ -129,5 +129,5 @@ def test_without_matplotlib_the_step_succeeds_and_reports_the_missing_plot(
     np.savez(frames, frames=MadeUp().counts(np.zeros((N, N)), 10))
     words = ["--config", str(live / "profile.toml"), "--recording", str(frames)]
     assert main(["calibrate", "tare", str(tmp_path / "a.json"), *words]) == 0
-    assert "no picture is drawn: pictures need matplotlib" in capsys.readouterr().err
+    assert "no picture was drawn: pictures need matplotlib" in capsys.readouterr().err
     assert load_calibration(tmp_path / "a.json").tare.frames == 10

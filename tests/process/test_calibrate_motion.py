@@ -62,7 +62,7 @@ def test_friction_is_calibrated_by_sweeping_a_joint(hand, calibrate, capsys):
     profile, client = hand
     assert calibrate("friction", "--set", 'scene.fingers=["left"]') == 0
     told = capsys.readouterr()
-    assert "nothing may be between or beside the fingers; sweeps left 0° to -23°" in told.err
+    assert "keep the space around the fingers free; sweeps left 0° to -23°" in told.err
     # At the sweep's velocities, a tenth of the additional static friction remains.
     found = load(profile, profile.parent)
     assert found.control.joint_friction == pytest.approx(FRICTION, abs=2 * COUNT)
@@ -75,8 +75,8 @@ def test_latency_is_calibrated_by_grasps_at_several_forces(hand, calibrate, caps
     profile, client = hand
     assert calibrate("latency", "--force", "8") == 0
     told = capsys.readouterr()
-    assert "put an object between the fingers, for 8 N" in told.err
-    assert "(the daemon had 15 ms), by " in told.out
+    assert "put an object between the fingers; it is grasped with 8 N" in told.err
+    assert "(the daemon used 15 ms) from " in told.out
     assert load(profile, profile.parent).tactile.latency == pytest.approx(LATENCY, abs=4e-3)
     assert client.state().mode == "disarmed"
 
@@ -85,7 +85,7 @@ def test_a_contact_during_the_sweep_turns_torque_off(hand, calibrate, capsys):
     profile, client = hand
     before = profile.read_text(encoding="utf-8")
     assert calibrate("friction", "--set", "hand.q_min=[-0.1,-0.1]") == 1
-    assert "friction: left: a tip touches something" in capsys.readouterr().err
+    assert "friction: left: a tip is in contact" in capsys.readouterr().err
     assert client.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
     assert profile.read_text(encoding="utf-8") == before
 
@@ -97,7 +97,7 @@ def test_a_hand_in_use_is_not_moved(hand, calibrate, capsys):
     client.wait_for(lambda state: state.mode == "holding", 120.0)
     try:
         assert calibrate("friction") == 1
-        assert "found the hand holding, expected it disarmed or armed" in capsys.readouterr().err
+        assert "found mode holding, expected disarmed or armed" in capsys.readouterr().err
         assert client.state().mode == "holding"
     finally:
         client.stop()

@@ -29,7 +29,7 @@ def test_a_daemon_starts_with_factors_from_earlier_grips(
     with Hand(*addresses, timeout=60.0) as hand:
         hand.state()
         assert calibrate(0) == 1
-        assert "grasp something firmly first" in capsys.readouterr().err
+        assert "grasp an object firmly first" in capsys.readouterr().err
         assert not Path(files[0]).exists()
         hand.arm()
         hand.grasp(force=10.0)
@@ -47,7 +47,7 @@ def test_a_daemon_starts_with_factors_from_earlier_grips(
         assert first[-250:].mean() == pytest.approx(8.0, rel=0.05)
         assert first.max() < 1.12 * 8.0
         assert after.contacts[0].sensor_gain == pytest.approx(0.6, rel=0.1)
-        assert not [event for event in after.events if event[1].startswith("witness")]
+        assert not [event for event in after.events if event[1].startswith("consistency")]
 
 
 def test_factors_can_be_taken_from_the_last_state_of_a_recording(tmp_path, capsys):
@@ -67,4 +67,4 @@ def test_factors_can_be_taken_from_the_last_state_of_a_recording(tmp_path, capsy
     without = tmp_path / "without.mcap"
     record_hand(without, {}, 0.1, ("stream.state_rate=1",))
     assert main([*words, str(without)]) == 1
-    assert f"{without}: no hand/state in it" in capsys.readouterr().err
+    assert f"{without}: contains no hand/state" in capsys.readouterr().err

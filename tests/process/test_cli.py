@@ -26,7 +26,7 @@ def test_arm_grasp_and_stop_from_the_command_line(daemon, inline):
     )
     assert refused.returncode == 1
     reply = json.loads(refused.stdout)
-    assert reply["error"] == "grasp: not while disarmed; arm first"
+    assert reply["error"] == "grasp: not accepted in mode disarmed; arm first"
     assert reply["reason"] == "mode"
     assert send("arm") == (0, {"ok": True, "mode": "armed"})
     assert send("grasp", "force=5") == (0, {"ok": True, "mode": "grasping"})
@@ -185,7 +185,7 @@ def test_an_ipc_address_never_replaces_a_file(tmp_path, profile, inline):
     words = ("--set", f"stream.address=ipc://{file}", "--duration", "0.2")
     done = inline("run", "--config", profile(""), *words)
     assert done.returncode == 1
-    assert "is there already and is no socket" in done.stderr
+    assert "exists and is not a socket" in done.stderr
     assert file.read_text(encoding="utf-8") == "kept"
 
 
@@ -204,5 +204,5 @@ def test_a_disabled_compiler_is_reported_in_one_line():
     assert done.returncode == 1
     assert done.stdout == ""
     assert done.stderr == (
-        "limits: NUMBA_DISABLE_JIT is set: the kernels run compiled only; unset it to go on\n"
+        "limits: NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset it\n"
     )

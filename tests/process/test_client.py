@@ -53,7 +53,7 @@ def hand(fake: FakeDaemon) -> Iterator[Hand]:
 def test_grasp_turn_and_release_on_a_running_daemon(daemon):
     with Hand(*daemon.addresses, timeout=60.0) as hand:
         assert hand.state().mode == "disarmed"
-        with pytest.raises(Refused, match="grasp: not while disarmed; arm first"):
+        with pytest.raises(Refused, match="grasp: not accepted in mode disarmed; arm first"):
             hand.grasp(force=5.0)
         hand.arm()
         with hand.events(timeout=60.0) as events, hand.frames(timeout=60.0) as frames:
@@ -107,7 +107,7 @@ def test_a_fault_ends_a_wait(fake, hand):
 
 
 def test_a_wait_times_out_with_the_last_state(hand):
-    with pytest.raises(NotInTime, match="not within 6 s; the last state: mode holding"):
+    with pytest.raises(NotInTime, match="not met within 6 s; last state: mode holding"):
         hand.wait_for(lambda state: state.mode == "released", IN_VAIN)
 
 
@@ -179,8 +179,16 @@ def test_a_value_that_is_not_a_number_is_refused_by_parameter_name(fake, hand, g
     assert all(request == {"command": "status"} for request in fake.requests)
 
 
-LATE = {"ok": False, "error": "arm: 0.40 s old when its turn came", "reason": "late"}
-MODE = {"ok": False, "error": "arm: not while fault; clear the fault first", "reason": "mode"}
+LATE = {
+    "ok": False,
+    "error": "arm: the command was 0.40 s old when it was handled",
+    "reason": "late",
+}
+MODE = {
+    "ok": False,
+    "error": "arm: not accepted in mode fault; clear the fault first",
+    "reason": "mode",
+}
 
 
 def arm_blocking(fake: FakeDaemon, timeout: float) -> None:
@@ -211,7 +219,7 @@ def test_a_late_command_is_repeated_with_its_key_and_a_refused_one_is_not(fake, 
     # No time remains for a second attempt.
     monkeypatch.setattr(command_client, "RETRY_DELAY", 100.0)
     fake.replies["arm"] = LATE
-    with pytest.raises(Refused, match="old when its turn came") as caught:
+    with pytest.raises(Refused, match="old when it was handled") as caught:
         arm(fake, 60.0)
     assert caught.value.reason == "late"
     assert len(fake.requests) == 5
@@ -273,7 +281,7 @@ def test_an_unknown_schema_is_reported_once_and_known_fields_are_kept(fake, hand
     fake.changes = {"schema": 7, "news": [1, 2], "overruns": "many"}
     until(lambda: fake.published > 2)
     with hand.stream(timeout=60.0) as states:
-        with pytest.warns(UserWarning, match=r"schema 7, this client knows 1") as told:
+        with pytest.warns(UserWarning, match="schema 7, this client supports 1") as told:
             state = [next(states), next(states)][-1]
         assert len(told) == 1
         assert (state.schema, state.mode, state.overruns) == (7, "holding", 0)
@@ -356,7 +364,7 @@ def test_synchronous_and_asyncio_hands_have_the_same_methods():
 
 def test_commands_that_are_already_fulfilled_succeed(fake, hand):
     fake.replies = {
-        name: {"ok": False, "error": f"{name}: not while it is so"}
+        name: {"ok": False, "error": f"{name}: not accepted in mode it is so"}
         for name in ("arm", "disarm", "clear")
     }
     fake.replies["status"] = {"ok": True, "mode": "holding", "torque": True}
@@ -366,7 +374,7 @@ def test_commands_that_are_already_fulfilled_succeed(fake, hand):
     hand.disarm()
     fake.replies["status"] = {"ok": True, "mode": "fault", "torque": True}
     for refused in (hand.arm, hand.disarm, hand.clear):
-        with pytest.raises(Refused, match="not while it is so"):
+        with pytest.raises(Refused, match="not accepted in mode it is so"):
             refused()
 
 
@@ -387,7 +395,7 @@ def test_a_closed_hand_raises_a_clear_error(hand):
     hand.close()
     hand.close()
     for use in (hand.arm, hand.state, hand.stream, lambda: next(states)):
-        with pytest.raises(HandClosed, match="is closed: make another"):
+        with pytest.raises(HandClosed, match="is closed: create a new one"):
             use()
 
     async def after() -> None:

@@ -92,7 +92,7 @@ def test_compilation_by_plain_numba_is_explained_in_one_line(monkeypatch):
     told: list[str] = []
     kernels.build_kernels(Settings(), lambda *event: told.append(event[2]), bar=False)
     assert [text for text in told if "99.0" in text] == [
-        "compiled by Numba alone, in twice the time: Numba 99.0 is new"
+        "compiling with Numba alone, which takes twice as long: Numba 99.0 is new"
     ]
 
 

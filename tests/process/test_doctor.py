@@ -99,7 +99,7 @@ def test_servos_with_factory_settings_fail_and_are_only_repaired_on_request(hand
     assert hand.registers() == before
     failed = with_status(lines, "FAIL")
     assert len(failed) == 4
-    assert "servo 2 (right): return delay is 500 µs, more than 50 µs" in failed
+    assert "servo 2 (right): return delay is 500 µs, expected at most 50 µs" in failed
     assert lines.count("       → softfinger doctor --fix") == 4
     status, lines = hand.doctor(capsys, "--fix")
     assert status == 0, lines
@@ -149,7 +149,7 @@ def test_boards_are_checked(hands, capsys):
     ]
     assert main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "note   servos: simulated: no servo to ask" in lines
+    assert "note   servos: simulated: no servo to check" in lines
     assert lines[-1].endswith(" 0 failed")
 
 
@@ -162,14 +162,12 @@ def test_a_tip_model_other_than_the_calibrated_one_is_reported(tmp_path):
     save_calibration(tmp_path / "left.json", made)
     untried = devices.check_law(tips(), 0)
     assert (untried.status, untried.fix) == ("note", "`softfinger calibrate law`")
-    assert "'springs', which no presses have tried" in untried.text
+    assert "'springs', not verified by presses" in untried.text
     wants = {"physics": "solid", "base": "bonded", "face": "frictionless", "poisson": 0.48}
     save_calibration(tmp_path / "left.json", made.model_copy(update={"wants": wants}))
     told = devices.check_law(tips(), 0)
     assert told.status == "warn"
-    assert (
-        "tip.physics is 'springs', where the presses of `calibrate law` want 'solid'" in told.text
-    )
+    assert "tip.physics is 'springs', but the presses of `calibrate law` fit 'solid'" in told.text
     assert devices.check_law(tips(physics="solid", poisson=0.47), 0).status == "pass"
     assert devices.check_law(tips(physics="solid", poisson=0.45), 0).fix == "set tip.poisson"
     (tmp_path / "left.json").write_text("{}")
@@ -186,8 +184,8 @@ def test_a_missing_port_and_a_missing_servo_fail(hands, capsys):
     silent = "servo 2 (right): no answer at 2000000 baud within servos.open_timeout = 0.1 s"
     assert silent in failed
     (at,) = [k for k, line in enumerate(lines) if "no other servo answers at any rate; " in line]
-    assert lines[at].endswith(" V at those that do")
-    assert "likely the power or cable" in lines[at + 1]
+    assert lines[at].endswith(" V at the servos that answer")
+    assert "replace the cable between the servos" in lines[at + 1]
 
 
 @pytest.mark.waits
@@ -221,7 +219,7 @@ def test_a_servo_id_is_only_changed_on_request(hands, capsys):
     status, lines = hand.doctor(capsys)
     assert (status, servo.id) == (1, 7)
     assert found in lines
-    fix = "softfinger doctor --fix makes it servo 2 (right): ID 7 → 2; or set servos.ids as it is"
+    fix = "softfinger doctor --fix makes it servo 2 (right): ID 7 → 2; or set the other servos.ids"
     assert f"       → {fix}" in lines
     status, lines = hand.doctor(capsys, "--fix")
     assert (status, servo.id) == (0, 2)
@@ -229,9 +227,9 @@ def test_a_servo_id_is_only_changed_on_request(hands, capsys):
     servo.table.set(reg.ID, 1)
     status, lines = hand.doctor(capsys)
     assert status == 1
-    (garbled,) = [line for line in with_status(lines, "FAIL") if "come damaged" in line]
-    assert garbled.startswith("servos: replies of ID 1 at 2000000 baud come damaged: several ser")
-    assert [line for line in lines if line.startswith("       → connect one servo alone, then")]
+    (garbled,) = [line for line in with_status(lines, "FAIL") if "are damaged" in line]
+    assert garbled.startswith("servos: replies of ID 1 at 2000000 baud are damaged: several ser")
+    assert [line for line in lines if line.startswith("       → connect one servo alone and")]
 
 
 # Ports.
@@ -252,7 +250,7 @@ def test_unusable_ports_fail(tmp_path, terminal, monkeypatch):
     assert "servos.port" in missing.fix
     dangling = tmp_path / "dangling"
     dangling.symlink_to(tmp_path / "gone")
-    assert ports.check_port(str(dangling), "servos.port").text == "leads nowhere"
+    assert ports.check_port(str(dangling), "servos.port").text == "the link has no target"
     plain = tmp_path / "plain"
     plain.touch()
     assert ports.check_port(str(plain), "servos.port").text == "is not a serial port"
@@ -286,7 +284,8 @@ def test_the_process_using_a_port_is_named(terminal, locked):
     assert found.fix == f"kill {other.pid}"
     assert well.status == "warn", "a responding daemon must not be killed"
     assert (
-        f"the softfinger daemon that runs here has it (holding, process {other.pid})" in well.text
+        f"in use by the softfinger daemon that runs here (holding, process {other.pid})"
+        in well.text
     )
     assert "kill" not in well.fix
     assert ports.check_port(path, "servos.port").status == "pass"
@@ -365,7 +364,7 @@ def test_missing_damaged_and_writable_kernel_files_cause_warnings(tmp_path, monk
     folder.chmod(0o777)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"
-    assert "may be written by others" in found.text
+    assert "other users may write to it" in found.text
     assert "NUMBA_CACHE_DIR" in found.fix
 
 
@@ -387,7 +386,7 @@ def test_unused_and_used_sockets(addresses, monkeypatch):
     with socket.create_server((host, int(port))):
         taken, free = ports.check_addresses(settings)
     assert taken.status == "FAIL"
-    assert "not a softfinger daemon" in taken.text
+    assert "a program other than a softfinger daemon" in taken.text
     assert "stream.address" in taken.fix
     assert free.status == "pass"
 
@@ -396,7 +395,7 @@ def test_a_running_daemon_is_detected(addresses):
     with Served(commands=addresses[1]) as served, served.serving(lambda *_: {"mode": "holding"}):
         _, found = ports.check_addresses(profile(addresses))
     assert found.status == "warn"
-    assert "runs here already (holding)" in found.text
+    assert "already running here (holding)" in found.text
 
 
 def test_ipc_addresses(tmp_path):

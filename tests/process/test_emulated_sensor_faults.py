@@ -88,7 +88,7 @@ def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
 
 @pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])
 def test_a_sensor_fault_has_a_bounded_effect_and_is_the_only_one_reported(rig, lie):
-    false = f"witness.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
+    false = f"consistency.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
     gripped(rig)
     before = len(rig.log())
     rig.send(lie)
@@ -96,7 +96,7 @@ def test_a_sensor_fault_has_a_bounded_effect_and_is_the_only_one_reported(rig, l
     assert max(max(report["force"]) for report in reports) < 1.3 * FORCE
     if lie != GAIN:  # a gain error may be partly accepted and need not be reported
         until(lambda: any(false in line for line in rig.log()[before:]))
-    assert not [line for line in rig.log()[before:] if "witness." in line and false not in line]
+    assert not [line for line in rig.log()[before:] if "consistency." in line and false not in line]
     if lie == REFUSED:
         until(lambda: mode(rig) == "fault")
         return
@@ -138,4 +138,4 @@ def test_a_hand_that_differs_from_its_settings_does_not_grip_too_hard(
         end = reports[-1]["t"] - SETTLED
         last = [m for m, report in zip(means, reports, strict=True) if report["t"] > end]
         assert least < fmean(last) < 1.2
-        assert any("witness." in line for line in rig.log()) == says
+        assert any("consistency." in line for line in rig.log()) == says

@@ -122,7 +122,7 @@ def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues
 @pytest.mark.parametrize("name", ["servos", "control"])
 def test_other_files_in_place_of_links_or_the_control_socket_are_not_replaced(tmp_path, name):
     (tmp_path / name).write_text("mine")
-    with pytest.raises(EmulatorError, match=f"{name}: .*in the way"):
+    with pytest.raises(EmulatorError, match=f"{name}: .*exists"):
         Emulator(Settings(), tmp_path)
     assert (tmp_path / name).read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -149,8 +149,8 @@ def test_links_that_were_redirected_are_not_removed(tmp_path):
     ("options", "status", "told"),
     [
         (["--fault", "melted"], 1, "wrong-size"),
-        (["--fault", "silent=9"], 1, "no servo has that ID"),
-        (["--fault", "lose=2"], 1, "a probability lies in 0 … 1"),
+        (["--fault", "silent=9"], 1, "no servo has this ID"),
+        (["--fault", "lose=2"], 1, "expected a probability of 0 to 1"),
         (["--model", "AX-12"], 2, "XM430-W350"),
         (["--baud", "1234"], 1, "baud"),
         (["--ids", "1"], 2, "expected two IDs of 0 to 252"),
@@ -300,7 +300,7 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
 
 def test_sending_without_an_emulator_fails(tmp_path, capsys):
     assert send(tmp_path, "unplug") == 1
-    assert "no emulator answers here" in capsys.readouterr().err
+    assert "no emulator is running here" in capsys.readouterr().err
     assert send(tmp_path / "nowhere", "unplug") == 1
 
 

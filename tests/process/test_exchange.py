@@ -48,7 +48,7 @@ def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running)
     bus.bus.exchange = lambda data, *rest: heard.extend(data) or exchanged(data, *rest)
     found = exchange(bus, 5.0)
     assert found.status == "pass", found
-    assert found.text.startswith("50 of a tick's reads and writes: p50 ")
+    assert found.text.startswith("50 read and write cycles: p50 ")
     until(lambda: len(re.findall(rb"\xff\xff\xfd\x00\xfe..\x83", heard, re.DOTALL)) == 50)
     reads = re.findall(rb"\xff\xff\xfd\x00\xfe..\x8a", heard, re.DOTALL)
     assert len(reads) == 54  # each of the four spans is tested first
@@ -99,7 +99,7 @@ def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bu
         bus.servo(i).fast_reads = False  # contrary to its firmware version
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
-    assert notice.fix == "the slower sync read is used instead"
+    assert notice.fix == "the slower sync read is used"
     assert not isinstance(backend._reads.errors, FastGroupRead)
     reading = Reading()
     backend.read(reading)
@@ -112,7 +112,7 @@ def test_servos_without_group_reads_are_refused(bus):
         bus.servo(i).fast_reads = False
     answers = bus.servo(1).answers_reads
     bus.servo(1).answers_reads = lambda servo_id, fast: False
-    with pytest.raises(ServoError, match="answer alone, but a sync read of all stays without"):
+    with pytest.raises(ServoError, match="answer single reads, but not a sync read of all"):
         connected(bus, reply_timeout=0.3)
     bus.servo(1).answers_reads = answers
     connected(bus).close()
@@ -216,8 +216,8 @@ def test_two_fingers_on_one_port_are_detected_by_the_real_path(tmp_path):
     ("group", "mode", "advice"),
     [
         ("uucp", 0o660, "sudo usermod -aG uucp $USER, then log in again"),
-        ("root", 0o660, "sudo chmod a+rw {}, until it is plugged in again; for good, a udev rule"),
-        ("uucp", 0o600, "sudo chmod a+rw {}, until it is plugged in again; for good, a udev rule"),
+        ("root", 0o660, "sudo chmod a+rw {} until it is unplugged; permanently, add a udev rule"),
+        ("uucp", 0o600, "sudo chmod a+rw {} until it is unplugged; permanently, add a udev rule"),
     ],
 )
 def test_membership_in_the_group_of_the_port_is_recommended(
@@ -247,7 +247,7 @@ def test_run_reports_late_replies_at_start_up_and_while_disarmed(tmp_path, addre
             told = []
             for line in daemon.stderr:
                 told.append(line)
-                if "of the last second's readings failed" in line:
+                if "of the readings in the last second failed" in line:
                     break
             assert any("ticks will be late: set servos.reply_timeout" in line for line in told)
             assert "within servos.reply_timeout = 4 ms; `softfinger doctor`" in told[-1]

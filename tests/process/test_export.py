@@ -141,4 +141,4 @@ def test_invalid_exports_are_refused(tmp_path, inline):
     RecordingWriter(empty).close()
     done = inline("export", empty)
     assert done.returncode == 1
-    assert "no messages in it" in done.stderr
+    assert "contains no messages" in done.stderr

@@ -113,7 +113,7 @@ def test_a_port_that_cannot_be_opened_is_reported(tmp_path, board):
 def test_a_silent_port_is_reported_with_its_name_and_time_out(own_threads, board):
     tactile = sensor(board.path, timeout=0.05)
     with pytest.raises(
-        TactileError, match=rf"{board.path}: no byte came within tactile.open_timeout = 0\.05 s"
+        TactileError, match=rf"{board.path}: no data within tactile.open_timeout = 0\.05 s"
     ):
         tactile.open()
     assert not own_threads()

@@ -164,7 +164,7 @@ def test_a_stopped_gateway_is_replaced(addresses):
         stopped = gateway.process
         os.kill(stopped, signal.SIGSTOP)
         until(lambda: gateway.process != stopped)
-        assert "the process that serves clients was stopped" in gateway.link.notices
+        assert "the gateway process was suspended" in gateway.link.notices
     finally:
         gateway.close()
 
@@ -248,11 +248,11 @@ def test_the_local_socket_is_private_to_the_user(own_folder, addresses):
 def test_a_folder_accessible_to_others_is_refused(own_folder, addresses, monkeypatch, tmp_path):
     own_folder.mkdir(mode=0o755)
     monkeypatch.setattr("softfinger.daemon.wire.local_stop._folders", lambda: iter([own_folder]))
-    with pytest.raises(AddressError, match="is not this user's alone"):
+    with pytest.raises(AddressError, match="is not private to this user"):
         LocalStop(addresses[1])
     own_folder.rmdir()
     own_folder.symlink_to(tmp_path)
-    with pytest.raises(AddressError, match="is not this user's alone"):
+    with pytest.raises(AddressError, match="is not private to this user"):
         LocalStop(addresses[1])
     assert stop_locally(addresses[1], 0.1) is None
 

@@ -132,7 +132,7 @@ def test_own_folder_refuses_links_files_and_other_users(tmp_path, monkeypatch):
     if os.geteuid() == 0:
         os.chown(tmp_path / "new", 54321, 54321)
     monkeypatch.setattr(own_folder.os, "geteuid", lambda: 12345)
-    with pytest.raises(PermissionError, match="expected 12345"):
+    with pytest.raises(PermissionError, match="expected the current user 12345"):
         OwnFolder(tmp_path / "new")
 
 
@@ -165,12 +165,12 @@ def test_the_folder_is_private_and_the_least_recently_used_ones_are_removed(pack
     (base / new).chmod(0o777)
     found, told = package.run()
     assert found == ["3.0", "0"], "the kernel must be compiled, not loaded from the cache"
-    assert f"{base / new}: may be written by others (0777): chmod go-w" in told
+    assert f"{base / new}: other users may write to it (0777): chmod go-w" in told
     (base / new).chmod(0o700)
     package.cache.chmod(0o777)  # a parent folder
     found, told = package.run()
     assert found == ["3.0", "0"]
-    assert f"{package.cache}: may be written by others (0777): chmod go-w" in told
+    assert f"{package.cache}: other users may write to it (0777): chmod go-w" in told
 
 
 def flipped(file: Path) -> None:
@@ -193,7 +193,7 @@ def test_a_damaged_kernel_is_recompiled_with_a_warning(package, tmp_path):
     (file,) = package.cache.rglob("*.kernel")
     flipped(file)
     found, told = package.run()
-    assert (found, told.count("compiled anew")) == (["3.0", "0"], 1)
+    assert (found, told.count("compiling again")) == (["3.0", "0"], 1)
     assert package.run() == (["3.0", "1"], "")
     with OwnFolder(tmp_path / "kept") as folder:
         for name, spoil in SPOILT.items():
@@ -202,7 +202,7 @@ def test_a_damaged_kernel_is_recompiled_with_a_warning(package, tmp_path):
             kernel_folder.keep(folder, "one", b"machine code")
             assert kernel_folder.kept(folder, "one") == b"machine code"
             spoil(folder.path / "one.kernel")
-            with pytest.warns(RuntimeWarning, match="compiled anew"):
+            with pytest.warns(RuntimeWarning, match="compiling again"):
                 assert kernel_folder.kept(folder, "one") is None, name
 
 
@@ -229,5 +229,5 @@ def test_a_folder_that_is_renamed_is_still_used_as_opened(tmp_path):
         theirs.rename(path)
         assert kernel_folder.kept(folder, "one") == b"ours"
         (tmp_path / "away" / "two.kernel").symlink_to(path / "one.kernel")
-        with pytest.warns(RuntimeWarning, match="compiled anew"):
+        with pytest.warns(RuntimeWarning, match="compiling again"):
             assert kernel_folder.kept(folder, "two") is None

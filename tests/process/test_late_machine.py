@@ -48,7 +48,7 @@ def test_a_simulated_hand_survives_a_suspended_machine(start, profile, hand):
         assert state.behind_s >= before.behind_s + 0.9 * STILL
         passed = 1e-9 * (state.mono_ns - before.mono_ns)
         assert passed == pytest.approx((state.seq - before.seq) / 100.0)
-        assert told(events, "late", "the hand waited")
+        assert told(events, "late", "the simulated hand waited")
     assert running.end() == 0
 
 
@@ -61,6 +61,6 @@ def test_on_real_time_a_stall_is_a_fault_and_the_task_restarts(start, profile, h
         stand_still(running)
         fault = told(events, "servos.bus", "watchdog")
         assert fault.startswith("this machine was busy for ")
-        told(events, "task", "the task clears it and begins again")
+        told(events, "task", "the task clears the fault and restarts")
         told(events, "mode", "armed → grasping")
     assert running.end() in (0, 1)  # a busy machine may cause a fault at any time

@@ -96,15 +96,15 @@ def test_a_signal_ends_it_while_the_terminal_is_blocked(fake):
 
 
 def test_keys_command_the_hand(fake):
-    fake.replies["clear"] = {"ok": False, "error": "clear: not while holding"}
+    fake.replies["clear"] = {"ok": False, "error": "clear: not accepted in mode holding"}
     fake.replies["arm"] = b"not what a reply is"
     with TerminalProcess(command(fake, "--client", "bench")) as page:
         page.shows("HOLDING")
         for key, sent, shown in (
             (b"g", {"command": "grasp"}, "✓ grasp: ok"),
-            (b"c", {"command": "clear"}, "✗ clear: not while holding"),
+            (b"c", {"command": "clear"}, "✗ clear: not accepted in mode holding"),
             (b"r", {"command": "release"}, "✓ release: ok"),
-            (b"a", {"command": "arm"}, "✗ arm: an answer that can't be read"),
+            (b"a", {"command": "arm"}, "✗ arm: invalid answer"),
             (b"w", {"command": "demo"}, "✓ demo: ok"),
             (b" ", {"command": "stop"}, "✓ stop: ok"),
         ):
@@ -112,7 +112,7 @@ def test_keys_command_the_hand(fake):
             page.shows(shown)
             assert fake.requests[-1] == sent | {"client": "bench"}
         page.type(b"d")
-        page.shows("✗ disarm: it lets the object fall; d again to do it")
+        page.shows("✗ disarm: the object would fall; press d again to disarm")
         assert fake.requests[-1]["command"] == "stop"
         page.press(b"d", "✓ disarm: ok")
         page.type(b"?")
@@ -183,7 +183,11 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
 
 
 def test_a_late_command_is_repeated_with_its_key(fake):
-    late = {"ok": False, "error": "arm: 0.40 s old when its turn came", "reason": "late"}
+    late = {
+        "ok": False,
+        "error": "arm: the command was 0.40 s old when it was handled",
+        "reason": "late",
+    }
     fake.replies["arm"] = [late, late, {"ok": True}]
     fake.changes = {"mode": "disarmed"}
     with TerminalProcess(command(fake)) as page:
@@ -204,7 +208,7 @@ def test_the_page_shows_another_commander_of_a_real_daemon(start, profile, addre
         with Hand(stream, commands, client="notebook", timeout=60.0) as hand:
             hand.arm()
             page.shows("ARMED", "notebook commands the hand")
-            page.press(b"g", "✗ grasp: notebook commands the hand (")
+            page.press(b"g", "✗ grasp: notebook has the lease for another")
             page.type(b" ")  # stop requires no lease
             page.shows("✓ stop: ok", "DISARMED")
         assert daemon.end() == 0
@@ -218,7 +222,7 @@ def test_commands_without_a_daemon():
         page.type(b"a" * 12 + b" ")
         page.shows("stop: no answer")
         page.type(b"\x1b[C")
-        page.shows("rotate: the object's angle is not known")
+        page.shows("rotate: the object's angle is unknown")
         page.type(b"q")
         assert page.ended() == 0
 

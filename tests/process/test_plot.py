@@ -123,11 +123,11 @@ def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
     assert ElementTree.parse(files[0]).getroot().tag.endswith("svg")
     status, said = call(path, "--to", "0.2", "--out", tmp_path / "none")
     assert status == 1
-    assert "plot: no contact in it" in said
+    assert "plot: contains no contact" in said
     RecordingWriter(tmp_path / "nothing.mcap").close()
     status, said = call(tmp_path / "nothing.mcap", "--out", tmp_path / "none")
     assert status == 1
-    assert "plot: no hand/state in it" in said
+    assert "plot: contains no hand/state" in said
 
 
 def test_without_settings_no_model_is_drawn(path, run):

@@ -42,7 +42,7 @@ def test_the_example_meets_the_backend_interface(caplog):
     check_servos(settings, torque=True)
     check_shape(load(changes=["simulation.object_shape=hexagon"]))
     found = {each.subject: each for each in doctor.results(settings, False)}
-    assert found["servos"].text.startswith("following: a plugin's")
+    assert found["servos"].text.startswith("following: a plugin;")
     assert "44 × 44 cells" in found["tactile left"].text
     assert "/dev/ttyUSB0" not in found  # ports of plugin backends are not checked
 
@@ -59,15 +59,15 @@ def test_plugin_errors_are_part_of_the_report():
     with pytest.raises(SettingsError) as caught:
         load(changes=wrong)
     report = str(caught.value)
-    with pytest.raises(SettingsError, match=r"broken of softfinger-example 1\.0 fails to load"):
+    with pytest.raises(SettingsError, match=r"broken of softfinger-example 1\.0 can't be loaded"):
         load(changes=["tactile.backend=broken"])
     with pytest.raises(PluginError):
         backend("tactile", "broken")
     for part in (
         "plugins.pulsing.height: found -1",
-        "plugins.pulsing.hight: found an unknown key, expected a known one; nearest: height",
-        "plugins.following: found settings, but following of softfinger-example 1.0 has none",
-        "plugins.nobody: found settings of a plugin that is not installed",
+        "plugins.pulsing.hight: unknown key; nearest: height",
+        "plugins.following: found settings, but following of softfinger-example 1.0 has no ",
+        "plugins.nobody: found settings, but this plugin is not installed",
     ):
         assert part in report
     with pytest.raises(SettingsError, match="'disc', 'wedge', 'none' or 'hexagon'"):

@@ -98,7 +98,7 @@ def test_permitted_measures_are_applied_and_reverted():
     assert during["cpus"] == [answer["cpu"]]
     assert during["others"] == before["others"]
     assert (during["locked"] > 0) == ("memory locked" in had[2])
-    assert during["latency"] == ("idle states held off" in had[2])
+    assert during["latency"] == ("deep idle states disabled" in had[2])
     assert during["switch"] == pytest.approx(2e-4)
     assert after == before
 
@@ -111,7 +111,7 @@ def test_refused_measures_are_reported_with_their_effect_and_remedy():
     refused = [text for level, kind, text in events[1:] if (level, kind) == ("warning", "realtime")]
     assert len(refused) == len(events) - 1
     for words in (
-        ("SCHED_FIFO 7 refused", "other processes can hold up a tick", "rtprio"),
+        ("SCHED_FIFO 7 refused", "other processes can delay a tick", "rtprio"),
         ("processor 1023 refused", "may move between processors"),
         ("memory lock refused", "can be swapped out", "memlock unlimited"),
     ):
@@ -136,7 +136,7 @@ def test_disabled_measures_are_not_requested():
     )
     affinity = os.sched_getaffinity(0)
     with RealTime(settings) as measures:  # virtual time never waits
-        assert (measures.granted, measures.refused) == (["collector frozen"], [])
+        assert (measures.granted, measures.refused) == (["garbage collector frozen"], [])
         assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
         assert os.sched_getaffinity(0) == affinity
 

@@ -80,7 +80,7 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     rig.until(lambda: rig.torque() == [1, 1])
     rig.unplug()
     rig.until(lambda: loop.state.mode == "fault")
-    assert "the port is gone" in loop.state.fault
+    assert "the port is lost" in loop.state.fault
     assert rig.torque() == [1, 1]  # they could not be reached
     # From here on, `clear` reopens the port.
     rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
@@ -92,7 +92,7 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     assert not loop.state.reading.valid
     assert rig.does("clear")["mode"] == "disarmed"
     assert rig.torque() == [0, 0]
-    assert ("info", "servos", "connected anew") in rig.events
+    assert ("info", "servos", "reconnected") in rig.events
     rig.until(lambda: loop.state.reading.valid)
     assert loop.state.reading.seq > seq
     assert (loop.state.mode, loop.state.fault) == ("disarmed", "")
@@ -105,7 +105,7 @@ def test_clearing_another_fault_does_not_reopen_the_port(rig):
     assert rig.emulator.request("overload=1") == "ok"
     rig.until(lambda: rig.loop.state.mode == "fault")
     rig.refuses("clear", "hardware error reported by left")
-    assert ("info", "servos", "connected anew") not in rig.events
+    assert ("info", "servos", "reconnected") not in rig.events
 
 
 def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
@@ -135,7 +135,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)
         assert rig.does("clear")["mode"] == "disarmed"
-        assert ("info", "tactile", "left sensor opened anew") in rig.events
+        assert ("info", "tactile", "left sensor reopened") in rig.events
         seq = loop.state.contacts[0].seq
         rig.until(lambda: loop.state.contacts[0].seq > seq and loop.state.contacts[0].valid)
 
@@ -146,7 +146,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         assert rig.events[-1][:2] != ("info", "tactile")
         assert any("no such port" in text for level, _, text in rig.events if level == "warning")
         rig.until(lambda: loop.state.t - loop.state.contacts[0].t_valid > 0.9)
-        rig.refuses("grasp", "its port is gone, and `clear`, or `disarm` and `arm`, opens it again")
+        rig.refuses("grasp", "the port is lost; `clear`, or `disarm` and `arm`, opens it again")
         rig.does("disarm")
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)

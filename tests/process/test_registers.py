@@ -23,17 +23,42 @@ LEFT = "servo 1 (left)"
 FIX = "`softfinger doctor --fix`"
 # Values that another program may leave: register, value, status and text of the finding.
 EEPROM = [
-    (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, more than 50 µs"),
-    (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: it obeys what the servo with that ID is sent"),
-    (reg.HOMING_OFFSET, 100, "FAIL", "homing offset is 100 counts, not 0: it turns this joint's"),
-    (reg.TEMPERATURE_LIMIT, 50, "warn", "temperature limit is 50 °C, not 70 … 80 °C"),
-    (reg.MAX_VOLTAGE_LIMIT, 130, "warn", "max voltage limit is 130 × 0.1 V, not 160 × 0.1 V"),
-    (reg.MIN_VOLTAGE_LIMIT, 110, "warn", "min voltage limit is 110 × 0.1 V, not 0 … 95 × 0.1 V"),
-    (reg.PWM_LIMIT, 300, "FAIL", "PWM limit is 300, not 885: the motor does not get all of"),
+    (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, expected at most 50 µs"),
+    (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: it also obeys the commands for the servo"),
+    (
+        reg.HOMING_OFFSET,
+        100,
+        "FAIL",
+        "homing offset is 100 counts, expected 0: it shifts this joint's",
+    ),
+    (reg.TEMPERATURE_LIMIT, 50, "warn", "temperature limit is 50 °C, expected 70 to 80 °C"),
+    (reg.MAX_VOLTAGE_LIMIT, 130, "warn", "max voltage limit is 130 × 0.1 V, expected 160 × 0.1 V"),
+    (
+        reg.MIN_VOLTAGE_LIMIT,
+        110,
+        "warn",
+        "min voltage limit is 110 × 0.1 V, expected 0 to 95 × 0.1 V",
+    ),
+    (reg.PWM_LIMIT, 300, "FAIL", "PWM limit is 300, expected 885: the motor does not get"),
     (reg.CURRENT_LIMIT, 100, "FAIL", "current limit is 0.269 A, below safety.current_max 1.2 A"),
-    (reg.VELOCITY_LIMIT, 5, "warn", "velocity limit is 0.12 rad/s at the joint, less than 3 rad"),
-    (reg.STARTUP_CONFIGURATION, 1, "FAIL", "startup configuration is 1, not 0: at power-up it sw"),
-    (reg.SHUTDOWN, 20, "warn", "shutdown is 20, not 52: it does not stop itself after overload"),
+    (
+        reg.VELOCITY_LIMIT,
+        5,
+        "warn",
+        "velocity limit is 0.12 rad/s at the joint, expected at least 3 rad",
+    ),
+    (
+        reg.STARTUP_CONFIGURATION,
+        1,
+        "FAIL",
+        "startup configuration is 1, expected 0: at power-up it sw",
+    ),
+    (
+        reg.SHUTDOWN,
+        20,
+        "warn",
+        "shutdown is 20, expected 52: it does not switch torque off after overload",
+    ),
 ]
 RAM = [
     (reg.POSITION_D_GAIN, 3000),
@@ -83,7 +108,9 @@ def test_arm_overwrites_changed_ram_registers(bus, connect, reboots):
             put(bus, address, value)
         notes = [each for each in told(bus) if each.status == "note"]
         assert len(notes) == len(RAM)
-        assert notes[-1].text == "profile velocity is 5, not 0: another program's; `arm` sets it"
+        assert notes[-1].text == (
+            "profile velocity is 5, expected 0: set by another program; `arm` corrects it"
+        )
     backend = connect(bus)
     if reboots:
         backend.torque_on()
@@ -171,9 +198,9 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
     bus.call(lambda: setattr(bus.servo(0)._joint, "_turns", -2))
     (found,) = [each for each in told(bus) if each.status == "FAIL"]
     assert "its servo has counted 2 turns too many" in found.text
-    assert found.fix == "reboot it: switch its supply off and on, or `softfinger doctor --fix`"
+    assert found.fix == "reboot it: switch its supply off and on, or run `softfinger doctor --fix`"
     (fixed,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
-    assert "rebooted, since its position was a turn off" in fixed.text
+    assert "rebooted because its position was off by a turn" in fixed.text
     assert [each.status for each in told(bus)] == ["pass"]
 
 
@@ -185,7 +212,7 @@ def test_an_error_that_a_wrong_limit_causes_is_corrected_with_the_limit(bus):
     fixed = [each.text for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
     assert fixed == [
         "min voltage limit 140 → 95",
-        "rebooted, since it had a hardware error: input voltage out of limits",
+        "rebooted because it had a hardware error: input voltage out of limits",
     ]
     assert [each.status for each in told(bus)] == ["pass"]
 
@@ -219,5 +246,5 @@ def test_a_servo_with_protocol_1_is_recognised(bus):
 def test_an_unknown_model_lists_the_known_ones(bus):
     put(bus, reg.MODEL_NUMBER, 9999)
     (found,) = [each for each in told(bus) if each.status == "FAIL"]
-    assert found.text == "has the unknown model number 9999, not 1020 of an XM430-W350"
+    assert found.text == "has the unknown model number 9999, expected 1020 of an XM430-W350"
     assert all(name in found.fix for name in ("XH540-W270", "MX-64", "XC330-M181"))

@@ -57,7 +57,7 @@ def test_connecting_changes_nothing_and_leaves_torque_off(bus):
 
 LEFT, RIGHT = "servo 1 (left): ", "servo 2 (right): "
 FIX = ": `softfinger doctor --fix`"
-REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
+REBOOT = ": remove the cause, then reboot it with `softfinger doctor --fix`"
 
 
 @pytest.mark.parametrize(
@@ -68,10 +68,10 @@ REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
             ["overload=2"],
             {},
             [
-                f"{LEFT}return delay is 500 µs, more than 50 µs{FIX}",
-                f"{LEFT}operating mode is position (3), not current-based position (5){FIX}",
-                f"{RIGHT}return delay is 500 µs, more than 50 µs{FIX}",
-                f"{RIGHT}operating mode is position (3), not current-based position (5){FIX}",
+                f"{LEFT}return delay is 500 µs, expected at most 50 µs{FIX}",
+                f"{LEFT}operating mode is position (3), expected current-based position (5){FIX}",
+                f"{RIGHT}return delay is 500 µs, expected at most 50 µs{FIX}",
+                f"{RIGHT}operating mode is position (3), expected current-based position (5){FIX}",
                 f"{RIGHT}hardware error: overload{REBOOT}",
             ],
         ),
@@ -80,7 +80,7 @@ REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
             ["undervoltage=1"],
             {reg.CURRENT_LIMIT: 100},
             [
-                f"{LEFT}supply is 8.5 V, not in 9.5 … 16.0 V: check the supply",
+                f"{LEFT}supply is 8.5 V, expected 9.5 to 16.0 V: check the supply",
                 f"{RIGHT}current limit is 0.269 A, below safety.current_max 1.2 A{FIX}",
             ],
         ),
@@ -89,8 +89,8 @@ REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
             [],
             {reg.DRIVE_MODE: 0b1000},
             [
-                f"{RIGHT}drive mode 8 switches torque on with any goal, or has it follow another "
-                f"servo{FIX}"
+                f"{RIGHT}drive mode 8 switches torque on with any goal, or makes it follow "
+                f"another servo{FIX}"
             ],
         ),
         (
@@ -158,10 +158,13 @@ def test_minor_findings_are_notices(bus):
     backend = connected(bus, watchdog=0.0, fault_after=60.0)
     notices = [str(each) for each in backend.notices]
     for finger in (LEFT, RIGHT):
-        assert f"{finger}servos.watchdog = 0: nothing stops it if daemon or line fail" in notices
+        assert (
+            f"{finger}servos.watchdog = 0: it keeps moving if the daemon or the line fails"
+            in notices
+        )
         assert [n for n in notices if n.startswith(f"{finger}servos.fault_after = 60 s: without")]
     assert [n for n in notices if n.startswith(f"{LEFT}its drive mode is reversed")]
-    assert [n for n in notices if n.startswith(f"{LEFT}torque is on already")]
+    assert [n for n in notices if n.startswith(f"{LEFT}torque is already on")]
     span = slice(reg.GOAL_CURRENT, reg.GOAL_POSITION + 4)
     goal = bus.memory(0)[span]
     backend.write(Goal(q=[0.5, 0.5], current=[1.0, 1.0]))
@@ -173,8 +176,8 @@ def test_minor_findings_are_notices(bus):
 def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     bus = running(servos={"model": "XL330-M288"})
     backend = connected(bus, model="XL330-M288")
-    constant = "control.torque_constant is 1.78 N·m/A, its data sheet's 0.354"
-    gears = "its gears take 0.25 of their torque, so a grip may never settle"
+    constant = "control.torque_constant is 1.78 N·m/A, its data sheet gives 0.354"
+    gears = "its gears lose 0.25 of their torque to friction, so a grip may never settle"
     assert [each.text for each in backend.notices] == 2 * [constant, gears]
     backend.close()
     for name in ("hil", "small"):  # profiles whose forces match their servos

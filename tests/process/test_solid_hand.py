@@ -30,7 +30,7 @@ def test_the_recording_recomputes_bitwise(recorded, capsys):
 @pytest.mark.extended
 def test_analyse_and_plot_read_the_recording(recorded, capsys):
     assert main(["analyse", str(recorded)]) == 0
-    assert ", 0 not usable" in capsys.readouterr().out
+    assert ", 0 invalid" in capsys.readouterr().out
     out = recorded.parent / "plots"
     assert main(["plot", str(recorded), "--out", str(out)]) == 0
     assert sorted(each.name for each in out.iterdir()) == ["angle.png", "landscape.png"]

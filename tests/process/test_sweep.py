@@ -47,7 +47,7 @@ def test_results_do_not_depend_on_the_number_of_processes_or_a_crash(tmp_path):
 
 @pytest.mark.extended
 def test_a_case_that_kills_each_worker_ends_the_sweep():
-    with pytest.raises(SweepError, match="each worker dies at 5"):
+    with pytest.raises(SweepError, match="all worker processes ended at 5"):
         list(Sweep("drawn", dies, CASES).run(2))
 
 
@@ -95,12 +95,12 @@ def test_an_interrupted_sweep_continues_from_its_journal(tmp_path):
 def test_a_journal_of_another_sweep_is_refused(tmp_path):
     journal = tmp_path / "map.toml.part"
     next(Sweep("drawn", drawn, CASES, journal).run(1))
-    with pytest.raises(SweepError, match=r"map\.toml\.part: of another sweep"):
+    with pytest.raises(SweepError, match=r"map\.toml\.part: belongs to another sweep"):
         list(Sweep("drawn", drawn, CASES[1:], journal).run(1))
 
 
 ENVELOPE = "envelope --shape rectangle --size 3 40 --mass 1 --friction 0.6 --keep"
-CAMPAIGN = "bench faults --only '6 N: honest' --trials 2 --json"
+CAMPAIGN = "bench faults --only '6 N: no fault' --trials 2 --json"
 
 
 @pytest.mark.extended

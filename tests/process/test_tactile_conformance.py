@@ -167,4 +167,4 @@ def test_an_unplugged_board_gives_an_invalid_frame_with_the_old_data(backend, tm
         assert last.seq > before.seq
         assert last.t_arrival >= before.t_arrival
         assert rig.sensor.counters()["port_lost"] == 1
-        assert "port is gone" in rig.sensor.error
+        assert "port is lost" in rig.sensor.error

@@ -126,7 +126,9 @@ def test_an_invalid_command_gets_a_reply(served, odd):
     with connect(address, proxy=None, open_timeout=WAIT) as line:
         for _ in range(2):  # the page may continue
             line.send(odd)
-            assert str(line.recv(timeout=WAIT)).startswith("✗ no command: expected a JSON object")
+            assert str(line.recv(timeout=WAIT)).startswith(
+                "✗ invalid command: expected a JSON object"
+            )
     assert fake.requests == []
 
 
@@ -359,14 +361,17 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
             return ask(viewed.host, token, {**grasp, "seen": page.next()["now"]})
 
         assert press() == "✓ grasp: ok"
-        fake.replies["grasp"] = {"ok": False, "error": "grasp: not while disarmed; arm first"}
-        assert press() == "✗ grasp: not while disarmed; arm first"
+        fake.replies["grasp"] = {
+            "ok": False,
+            "error": "grasp: not accepted in mode disarmed; arm first",
+        }
+        assert press() == "✗ grasp: not accepted in mode disarmed; arm first"
         assert fake.requests == [grasp, grasp]
         late = {"seen": page.next()["now"] - 8.0}
         assert ask(viewed.host, token, {**grasp, **late}).endswith("s behind")
         assert ask(viewed.host, token, grasp).startswith('✗ grasp: expected "seen"')
         for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):
-            assert ask(viewed.host, token, odd).startswith("✗ no command")
+            assert ask(viewed.host, token, odd).startswith("✗ invalid command")
         fake.close()
         assert "✗ grasp: no answer" in press()
         assert len(fake.requests) == 2
@@ -523,7 +528,7 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
         (("text.mcap",), "not an MCAP file"),
         (("text.mcap", "--port", "-1"), "expected a port"),
         (("--address", "nowhere"), "nowhere: Invalid"),
-        (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "nothing came"),
+        (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "received nothing to show"),
         (("--address", "tcp://127.0.0.1:9", "--no-wait"), "no stream from tcp"),
         (("--rate", "fast"), "expected 0.1 to 100 Hz"),
     ],

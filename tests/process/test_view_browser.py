@@ -369,7 +369,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
             page.key("Equal", "+", text="+")
         before = page("lanes.grasp.next !== null")
         page.key("Space", " ", text=" ")
-        until(lambda: "was not sent: a stop came first" in page.text("#force output"))
+        until(lambda: "was not sent: stop was sent first" in page.text("#force output"))
         assert before
         fake.deaf.clear()
         until(lambda: [each["command"] for each in fake.requests].count("stop") == 1)

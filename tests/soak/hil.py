@@ -272,7 +272,7 @@ def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
                 each.terminate()
             said = recorder.communicate()[0]
             account.received = [tuple(json.loads(each.communicate()[0])) for each in subscribers]
-    lost = said.partition("lost on the way: ")[2].splitlines()[0]
+    lost = said.partition("lost: ")[2].splitlines()[0]
     of_states = [part for part in lost.split(", ") if part.endswith(" of hand/state")]
     count = sum(Recording(each).counts["hand/state"] for each in rig.folder.glob("soak*.mcap"))
     account.recorded = count, int(of_states[0].split()[0]) if of_states else 0

@@ -97,8 +97,8 @@ CALM = "force ≤ 1.3 × asked: nothing calls for more"
 LIED = "force ≤ 1.3 × asked, with or after a false measurement"
 RAISED = "force ≤ what it may be raised to, loaded"
 MOST = "force ≤ safety.force_max, as well as it is known"
-HONEST = {mode: f"nothing named while {mode}, honest" for mode in _GRIPPING}
-LOADED = "nothing named while loaded, honest"
+HONEST = {mode: f"nothing named while {mode}, no fault" for mode in _GRIPPING}
+LOADED = "nothing named while loaded, no fault"
 NAMED = {kind: f"only what lies is named: {kind}" for kind in LIES}
 ASSERTIONS = (
     *STOPPED.values(), OFF, WATCHDOG, STAYS, GOAL, READING, FRAME, STATE, CALM, LIED, RAISED,
@@ -176,14 +176,14 @@ class FaultyServos:
 
     def connect(self) -> None:
         if self.fault == "gone":
-            raise ServoError("the port is gone")
+            raise ServoError("the port is lost")
         self._servos.connect()
         self.torque = False
 
     def read(self, reading: Reading) -> None:
         fault, finger = self.fault, self.finger
         if fault == "gone":
-            raise ServoError("the port is gone")
+            raise ServoError("the port is lost")
         if fault == "silent":
             reading.seq += 1
             reading.valid = False
@@ -230,7 +230,7 @@ class FaultyServos:
             )
             self._current[i] = current
         if self.fault == "gone":
-            raise ServoError("the port is gone")
+            raise ServoError("the port is lost")
         self._unheard += 1
         if self.fault not in ("silent", "deaf"):
             self._unheard = 0
@@ -245,7 +245,7 @@ class FaultyServos:
 
     def torque_off(self, reading: Reading) -> bool:
         if self.fault == "gone":
-            raise ServoError("the port is gone")
+            raise ServoError("the port is lost")
         if self.fault in ("silent", "deaf"):
             self.read(reading)
             return False
@@ -579,8 +579,8 @@ class Soak:
     # Requirements
 
     def _hear(self, level: str, kind: str, _: str) -> None:
-        if kind.startswith("witness.") and level != "info":
-            self._names(kind.removeprefix("witness."))
+        if kind.startswith("consistency.") and level != "info":
+            self._names(kind.removeprefix("consistency."))
 
     def _judge(self) -> None:
         state, servos, must = self.daemon.loop.state, self.servos, self.must

@@ -94,8 +94,8 @@ def test_a_missed_aim_is_not_a_success(monkeypatch, capsys):
 
     monkeypatch.setattr(faults, "measure", measure)
     assert cli.main(["bench", "faults"]) == 0
-    assert cli.main(["bench", "faults", "--trials", "7", "--only", "honest"]) == 1
-    assert asked == [(None, ""), (7, "honest")]
+    assert cli.main(["bench", "faults", "--trials", "7", "--only", "no fault"]) == 1
+    assert asked == [(None, ""), (7, "no fault")]
     capsys.readouterr()
 
 
@@ -103,9 +103,9 @@ def test_a_missed_aim_is_not_a_success(monkeypatch, capsys):
     ("words", "text"),
     [
         (["tik"], "found 'tik', expected one of estimator"),
-        (["faults", "--only", "no such lie"], "no case of faults has this in its name"),
-        (["tick", "--full"], "--full: for reflex alone"),
-        (["--trials", "3"], "--trials: for faults or robustness alone"),
+        (["faults", "--only", "no such fault"], "no case of faults contains this text"),
+        (["tick", "--full"], "--full: only for reflex"),
+        (["--trials", "3"], "--trials: only for faults or robustness"),
     ],
 )
 def test_invalid_options_are_refused_before_measuring(words, text, capsys):
@@ -161,13 +161,13 @@ def test_an_object_that_is_not_held_is_counted_separately():
 
 def test_a_failed_part_does_not_affect_the_others(monkeypatch, capsys):
     def let_go(title: str, **_: object) -> Report:
-        raise RigError("the hand does not hold: grasping")
+        raise RigError("the hand did not grip the object: grasping")
 
     monkeypatch.setattr(tick, "_in_turns", let_go)
     monkeypatch.setattr(tick, "in_the_loop", lambda title, **_: Report(title, [{"name": "x"}]))
     assert cli.main(["bench", "tick", "--brief"]) == 1
     printed = capsys.readouterr()
-    assert "bench: tick: tick: the hand does not hold: grasping\n" in printed.err
+    assert "bench: tick: tick: the hand did not grip the object: grasping\n" in printed.err
     assert "the simulated hand" in printed.out
     assert printed.out.count("hardware in the loop") == 2
 
@@ -204,12 +204,12 @@ def holding(force: float = 8.0) -> VirtualGrip:
 
 @pytest.mark.extended
 def test_an_ideal_hand_meets_its_aim():
-    (table,) = measure(trials=2, only="6 N: honest")
+    (table,) = measure(trials=2, only="6 N: no fault")
     (row,) = table.rows
     assert (row["met"], row["trials"], table.failed) == (2, 2, False)
-    assert row["least"] == pytest.approx(1.0, abs=0.08)  # torque constants are off by up to 10 %
+    assert row["lowest"] == pytest.approx(1.0, abs=0.08)  # torque constants are off by up to 10 %
     assert row["peak"] < 1.15
-    assert (row["named"], row["missed"], row["events"]) == ("", "", "")
+    assert (row["reported"], row["missed"], row["events"]) == ("", "", "")
 
 
 def test_a_watch_measures_forces_times_and_positions():
@@ -229,17 +229,17 @@ def test_a_watch_measures_forces_times_and_positions():
         (SETTLES, {}, []),
         (SETTLES, {"settled": 1.25}, ["force"]),
         (SETTLES, {"settled": math.nan}, ["force"]),
-        (SETTLES, {"events": [(1.0, "slip")]}, ["raised"]),
+        (SETTLES, {"events": [(1.0, "slip")]}, ["increased"]),
         (SETTLES, {"held": False}, ["not held"]),
-        (SETTLES, {"events": [(1.0, "witness.right_sensor")]}, ["named wrongly"]),
-        (BOUNDED, {"above": 0.06, "settled": 2.0}, ["too strong"]),
-        (BOUNDED, {"events": []}, ["not named"]),
-        (BOUNDED, {"events": [(1.31, "witness.left_sensor")]}, ["not named"]),
-        (BOUNDED, {"events": [(0.2, "hand.width")]}, ["not named"]),
+        (SETTLES, {"events": [(1.0, "consistency.right_sensor")]}, ["wrong report"]),
+        (BOUNDED, {"above": 0.06, "settled": 2.0}, ["too much force"]),
+        (BOUNDED, {"events": []}, ["not reported"]),
+        (BOUNDED, {"events": [(1.31, "consistency.left_sensor")]}, ["not reported"]),
+        (BOUNDED, {"events": [(0.2, "hand.width")]}, ["not reported"]),
     ],
 )
 def test_missed_aims_are_listed(aim, changes, missed):
     case = FaultCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",), comes=2.0)
-    met = GripTrial(("left_sensor",), settled=1.0, events=[(1.29, "witness.left_sensor")])
+    met = GripTrial(("left_sensor",), settled=1.0, events=[(1.29, "consistency.left_sensor")])
     assert met.missed(case) == []
     assert replace(met, **changes).missed(case) == missed

@@ -178,7 +178,11 @@ def test_a_nan_reading_is_reported_with_its_position(press, tmp_path, value):
 
 def test_a_negative_zero_offset_is_not_treated_as_noise(tared, tmp_path):
     np.save(tmp_path / "a.npy", tared - 4.0 * NOISE)
-    with pytest.raises(RecordingError, match=r"half of the cells read -1\.\d+e\+03 or less: tare"):
+    with pytest.raises(
+        RecordingError,
+        match=r"half of the readings are -1\.\d+e\+03 or less: "
+        "tare",
+    ):
         load_recording(tmp_path / "a.npy", SCALE, 100.0, NOISE)
 
 
@@ -244,7 +248,9 @@ def test_all_locales_give_the_same_readings(press, tmp_path, form):
 def test_commas_as_separator_and_decimal_sign_are_reported_if_ambiguous(tmp_path):
     text = "ROWS 1\nCOLS 3\nUNITS kPa\nASCII_DATA @@\nFrame 1\n0,0,0\nFrame 2\n0,1,25,0\n@@\n"
     (tmp_path / "a.asf").write_text(text)
-    with pytest.raises(RecordingError, match="line 8: 4 cells, expected 3: commas stand between"):
+    with pytest.raises(
+        RecordingError, match="line 8: 4 cells, expected 3: commas separate the cells"
+    ):
         load_recording(tmp_path / "a.asf", SCALE, 100.0)
 
 
@@ -269,13 +275,13 @@ def test_units_of_pressure_and_of_force_per_cell(press, tmp_path, unit, encoding
 @pytest.mark.parametrize("unit", ["stone", "mm", "N/m"])
 def test_an_unknown_unit_is_reported(press, tmp_path, unit):
     (tmp_path / "a.asf").write_bytes(export(press[:1], unit))
-    with pytest.raises(RecordingError, match=f"UNITS: found '{unit}', expected RAW or a pressure"):
+    with pytest.raises(RecordingError, match=f"UNITS: found '{unit}', expected RAW or a unit"):
         load_recording(tmp_path / "a.asf", SCALE, 100.0)
 
 
 def test_other_files_are_refused_with_the_supported_types(tmp_path):
     (tmp_path / "a.csv").write_text("t,force\n0,1\n")
-    with pytest.raises(RecordingError, match=r"expected one, \.npz or \.npy"):
+    with pytest.raises(RecordingError, match=r"expected a Tekscan-style export, \.npz or \.npy"):
         load_recording(tmp_path / "a.csv", SCALE, 100.0)
 
 
@@ -296,7 +302,7 @@ def test_times_in_other_units_are_converted_and_reported_once(
     read = load_recording(tmp_path / "a.npz", SCALE, rate)
     assert read.t == pytest.approx(STEPS * 1e-3, abs=1e-6)
     (note,) = read.notes
-    assert note.startswith(f"t: taken as {name}: a frame comes every 0.01 s")
+    assert note.startswith(f"t: read as {name}, which gives 0.01 s between frames")
 
 
 @pytest.mark.parametrize("key", ["t", "time", "timestamps"])
@@ -319,13 +325,15 @@ def test_a_slow_recording_is_read_unchanged_and_reported(press, tmp_path):
     np.savez(tmp_path / "a.npz", frames=press, t=np.arange(8) * 0.5)
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t.tolist() == (np.arange(8) * 0.5).tolist()
-    assert read.notes == ("t: taken as s: a frame comes every 0.5 s, by tactile.rate every 0.01 s",)
+    assert read.notes == (
+        "t: read as s, which gives 0.5 s between frames; tactile.rate gives 0.01 s",
+    )
 
 
 @pytest.mark.parametrize("t", [np.arange(8), np.arange(1.0, 9.0)])
 def test_frame_numbers_are_not_used_as_times(press, tmp_path, t):
     np.savez(tmp_path / "a.npz", frames=press, t=t)
-    with pytest.raises(RecordingError, match="t: whole numbers that rise by 1, expected times"):
+    with pytest.raises(RecordingError, match="t: whole numbers that increase by 1, expected times"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert load_recording(tmp_path / "a.npz", SCALE, 1.0).t.tolist() == list(range(8))
 
@@ -338,7 +346,7 @@ def test_times_as_texts_are_reported(press, tmp_path):
 
 def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_path):
     np.savez(tmp_path / "a.npz", frames=press, t=np.array([0, 1, 2, 3, 3, 4, 5, 6]) * 0.01)
-    with pytest.raises(RecordingError, match=r"must rise; t\[3\] is 0\.03, t\[4\] is 0\.03"):
+    with pytest.raises(RecordingError, match=r"must increase; t\[3\] is 0\.03, t\[4\] is 0\.03"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
 
 
@@ -352,7 +360,7 @@ def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_
         (1e-3, np.float64, "convert kPa"),
         (1.0 / 200.0, np.uint8, "counts of 8 bits"),
         (1.0 / 200.0, np.uint16, "counts of 8 bits"),
-        (1.0 / 40.0, np.uint16, "tactile.pascal_per_count is not this sensor's"),
+        (1.0 / 40.0, np.uint16, "tactile.pascal_per_count belongs to another sensor"),
         (0.0, np.uint16, "sensor's cable"),
     ],
 )
@@ -399,17 +407,17 @@ def test_the_only_stack_of_an_archive_is_used_and_reported(press, tmp_path, name
     np.savez(tmp_path / "a.npz", **held)
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t == pytest.approx(STEPS * 1e-3)
-    assert read.notes == (f"no array 'frames' in it; the frames are {name!r}, its only 3-d array",)
+    assert read.notes == (f"found no array 'frames'; uses {name!r}, the only 3-d array",)
     check(tmp_path / "a.npz")
 
 
 def test_the_contents_of_an_archive_without_frames_are_listed(press, tmp_path):
     np.savez(tmp_path / "a.npz", left=press, right=press, note=np.array("x"))
-    with pytest.raises(RecordingError, match=r"found left \(8, 44, 44\), right .*, note \(\)"):
+    with pytest.raises(RecordingError, match=r"but left \(8, 44, 44\), right .*, note \(\)"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
     many = {f"a{k}": np.zeros(k + 1) for k in range(30)}
     np.savez(tmp_path / "b.npz", **many)
-    with pytest.raises(RecordingError, match=r"a7 \(8,\), …: name the one"):
+    with pytest.raises(RecordingError, match=r"a7 \(8,\), …: name the array"):
         load_recording(tmp_path / "b.npz", SCALE, 100.0)
 
 
@@ -420,15 +428,17 @@ def test_a_pitch_that_contradicts_the_header_is_reported(press, tmp_path, inline
     path = tmp_path / "a.asf"
     path.write_bytes(export(press))
     tactile = {"rows": 44, "cols": 44, "recording": (str(path), ""), "pitch": 0.00127}
-    wanted = r"cells of 1\.318 × 1\.318 mm, tactile\.pitch of 1\.27 × 1\.27 mm: set tactile\.pitch"
+    wanted = (
+        r"cells of 1\.318 × 1\.318 mm, tactile\.pitch gives 1\.27 × 1\.27 mm: set tactile\.pitch"
+    )
     with pytest.raises(TactileError, match=wanted):
         ReplayTactile(TactileSettings.model_validate(tactile), VirtualClock(), 0)
     done = inline("analyse", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
-    assert "its header has cells of 1.318 × 1.318 mm" in done.stderr
-    assert "6 with contact, 0 not usable" in done.stdout
+    assert "its header gives cells of 1.318 × 1.318 mm" in done.stderr
+    assert "6 with contact, 0 invalid" in done.stdout
     words = ("--recording", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words, "--no-plot")
-    assert (done.returncode, "its header has cells of" in done.stderr) == (1, True)
+    assert (done.returncode, "its header gives cells of" in done.stderr) == (1, True)
 
 
 def test_a_calibration_reports_suspicious_recordings(tared, tmp_path, inline):
@@ -436,7 +446,7 @@ def test_a_calibration_reports_suspicious_recordings(tared, tmp_path, inline):
     words = ("--recording", tmp_path / "a.npy", "--config", "paper", "--no-plot")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words)
     assert done.returncode == 0
-    assert "noise round a tared zero, taken as 0" in done.stderr
+    assert "noise around a tared zero, set to 0" in done.stderr
 
 
 def test_generators_differ():
@@ -504,7 +514,7 @@ def test_the_noise_of_a_sensor_as_small_as_its_tip_is_measured_between_frames(ze
 
 
 def test_a_recording_needs_an_existing_folder(tmp_path):
-    with pytest.raises(RecordingError, match="its folder does not exist; make it first"):
+    with pytest.raises(RecordingError, match="its folder does not exist; create it first"):
         RecordingWriter(tmp_path / "no" / "a.mcap")
     assert not list(tmp_path.iterdir())
 

@@ -39,7 +39,7 @@ def test_the_closest_subcommand_is_suggested(inline):
     ):
         wrong = inline(*words)
         assert wrong.returncode == 2
-        assert f"found {word!r}, expected a known word; nearest: {near}" in wrong.stderr
+        assert f"unknown word {word!r}; nearest: {near}" in wrong.stderr
     assert max(map(len, inline("limits").stdout.splitlines())) <= 120
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
     # Names the missing command only, not missing options.
@@ -49,12 +49,12 @@ def test_the_closest_subcommand_is_suggested(inline):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("grasp force=5deg", "found 'force=5deg' in 'deg', expected N or mN"),
-        ("rotate angle=8N", "found 'angle=8N' in 'N', expected rad or deg or °"),
-        ("grasp force=5 mm", "found 'force=5 mm' in 'mm', expected N or mN"),
+        ("grasp force=5deg", "force=5deg: found the unit 'deg', expected N or mN"),
+        ("rotate angle=8N", "angle=8N: found the unit 'N', expected rad or deg or °"),
+        ("grasp force=5 mm", "force=5 mm: found the unit 'mm', expected N or mN"),
         ("grasp force=nan", "found 'force=nan', expected key=number"),
         ("grasp 5", "found '5', expected key=number"),
-        ("gasp", "found 'gasp', expected a known word; nearest: grasp"),
+        ("gasp", "unknown word 'gasp'; nearest: grasp"),
     ],
 )
 def test_invalid_numbers_are_not_sent(inline, words, said):
@@ -99,7 +99,7 @@ def test_profiles_and_keys_are_shown_from_any_folder(inline, tmp_path, monkeypat
     assert set(schema["properties"]) == set(every)
     missing = inline("config", "reference", "tactile.radius")
     assert missing.returncode == 2
-    assert "tactile.radius: found no such section or key" in missing.stderr
+    assert "tactile.radius: unknown section or key" in missing.stderr
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_one_address_suits_every_client(text, stream, commands):
             "tactile.rows = 20\nloop.rat = 3\nsafety.d_max = 0.03\n",
             1,
             [
-                "error: FILE: loop.rat: found an unknown key",
+                "error: FILE: loop.rat: unknown key",
                 "error: FILE: safety.d_max: found 0.03 m, expected at most 0.02 m",
                 "warning: FILE: tactile.rows",
                 "FILE: 2 errors, 1 warning",

@@ -73,15 +73,15 @@ def test_a_plain_req_socket_gets_its_reply(server, addresses):
         (b"", "not msgpack"),
         (b"\xc1\xff", "not msgpack: invalid format"),
         (msgpack.packb([1, 2]), "expected a map, found list"),
-        (msgpack.packb({"force": 1.0}), 'expected a text under "command"'),
-        (msgpack.packb({"command": 7}), 'expected a text under "command"'),
+        (msgpack.packb({"force": 1.0}), 'expected a string under "command"'),
+        (msgpack.packb({"command": 7}), 'expected a string under "command"'),
         (msgpack.packb({"command": "arm", 3: 4}), "not msgpack"),
-        (msgpack.packb({"command": "x" * 300}), "bytes; at most 200"),
-        (msgpack.packb({"command": "arm", "x": {b"k": 1}}), "numbers and texts as values"),
-        (msgpack.packb({"command": "arm", "client": [[[]]]}), "numbers and texts as values"),
-        (msgpack.packb({"command": "arm", "key": 7}), "key: expected a text of 1 to 64"),
-        (msgpack.packb({"command": "arm", "key": ""}), "key: expected a text of 1 to 64"),
-        (msgpack.packb({"command": "arm", "key": "k" * 65}), "key: expected a text of 1 to 64"),
+        (msgpack.packb({"command": "x" * 300}), "bytes, expected at most 200"),
+        (msgpack.packb({"command": "arm", "x": {b"k": 1}}), "numbers or strings as values"),
+        (msgpack.packb({"command": "arm", "client": [[[]]]}), "numbers or strings as values"),
+        (msgpack.packb({"command": "arm", "key": 7}), "key: expected a string of 1 to 64"),
+        (msgpack.packb({"command": "arm", "key": ""}), "key: expected a string of 1 to 64"),
+        (msgpack.packb({"command": "arm", "key": "k" * 65}), "key: expected a string of 1 to 64"),
     ],
 )
 def test_malformed_commands_are_refused_and_the_server_continues(
@@ -394,7 +394,7 @@ def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
 def test_stop_is_accepted_with_unknown_fields():
     more = {"client": "a", "how": ["now"], b"x": 4}
     assert decode(msgpack.packb({"command": "stop", **more})) == {"command": "stop", "client": "a"}
-    with pytest.raises(Refused, match="numbers and texts as values"):
+    with pytest.raises(Refused, match="numbers or strings as values"):
         decode(msgpack.packb({"command": "arm", "how": ["now"]}))
 
 
@@ -506,7 +506,7 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
         until(lambda: [served.serve(echo), flood.collect(replies) == 60][1])
         assert sum(reply["ok"] for reply in replies) == 20
         assert {reply.get("error") for reply in replies if not reply["ok"]} == {
-            "too many commands: at most 20 a second"
+            "too many commands: expected at most 20 per second"
         }
         assert all(reply["ok"] for reply in kind)
         # It may send again a second later.
@@ -586,18 +586,22 @@ def test_a_valid_request_is_parsed():
 @pytest.mark.parametrize(
     ("request_", "mode", "text"),
     [
-        ({"command": "jump"}, Mode.ARMED, "unknown command 'jump'; known: arm, disarm"),
+        ({"command": "jump"}, Mode.ARMED, "unknown command 'jump'; expected one of arm, disarm"),
         ({"command": "grasp", "froce": 1.0}, Mode.ARMED, "unknown parameter 'froce'; expected fo"),
         ({"command": "arm", "force": 1.0}, Mode.DISARMED, "expected no parameters"),
         ({"command": "grasp", "force": "much"}, Mode.ARMED, "expected a number, found str"),
         ({"command": "grasp", "force": True}, Mode.ARMED, "expected a number, found bool"),
         ({"command": "grasp", "force": float("nan")}, Mode.ARMED, "finite number, found nan"),
         ({"command": "rotate"}, Mode.HOLDING, "rotate: angle is missing"),
-        ({"command": "grasp"}, Mode.DISARMED, "grasp: not while disarmed; arm first"),
-        ({"command": "arm"}, Mode.FAULT, "arm: not while fault; clear the fault first"),
-        ({"command": "clear"}, Mode.DISARMED, "clear: not while disarmed; there is no fault"),
-        ({"command": "rotate", "angle": 0.1}, Mode.ARMED, "possible while grasping, holding, r"),
-        ({"command": "arm", "client": 7}, Mode.DISARMED, "client: expected a text"),
+        ({"command": "grasp"}, Mode.DISARMED, "grasp: not accepted in mode disarmed; arm first"),
+        ({"command": "arm"}, Mode.FAULT, "arm: not accepted in mode fault; clear the fault first"),
+        (
+            {"command": "clear"},
+            Mode.DISARMED,
+            "clear: not accepted in mode disarmed; there is no fault",
+        ),
+        ({"command": "rotate", "angle": 0.1}, Mode.ARMED, "accepted in grasping, holding, r"),
+        ({"command": "arm", "client": 7}, Mode.DISARMED, "client: expected a string"),
         ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "at most 64 characters"),
     ],
 )
@@ -638,7 +642,7 @@ def test_an_outdated_command_has_no_effect(make, name, mode, oldest):
         loop._fail("a fault")
     assert loop.state.mode == mode
     request = {"command": name, **numbers.get(name, {})}
-    with pytest.raises(Refused, match="old when its turn came") as caught:
+    with pytest.raises(Refused, match="old when it was handled") as caught:
         loop.command(request, oldest + 0.01)
     assert caught.value.reason == "late"
     loop.advance(0.05)
@@ -671,7 +675,7 @@ def test_a_refused_command_takes_no_lease():
 def test_only_one_client_commands_at_a_time():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, "a"), 0.0)
-    with pytest.raises(Refused, match=r"grasp: a commands the hand \(1\.0 s\)"):
+    with pytest.raises(Refused, match=r"grasp: a has the lease for another 1\.0 s"):
         take(lease, Command("grasp", {}, "b"), 1.0)
     take(lease, Command("disarm", {}, "b"), 1.0)
     take(lease, Command("status", {}, ""), 1.0)
@@ -685,5 +689,5 @@ def test_clients_without_a_name_share_one_lease():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, ""), 0.0)
     take(lease, Command("grasp", {}, ""), 0.1)
-    with pytest.raises(Refused, match="an unnamed client commands"):
+    with pytest.raises(Refused, match="an unnamed client has the lease"):
         take(lease, Command("grasp", {}, "a"), 0.2)

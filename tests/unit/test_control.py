@@ -117,7 +117,7 @@ def test_removing_the_object_ends_the_grip(last):
     ("angle", "then", "told", "end"),
     [
         (ANGLE, "", "", "holding"),
-        (ANGLE, "release", "rotate: dropped, since the grasp ended in releasing", "armed"),
+        (ANGLE, "release", "rotate: dropped, because the grasp ended in mode releasing", "armed"),
         (1.2, "", "rotate: angle: found 68.8° (1.2 rad), expected", "holding"),
     ],
 )
@@ -195,7 +195,7 @@ def test_a_known_load_raises_the_grip_within_its_bound():
             # 12 N on two tips at 80 % of μ = 0.6
             assert hand.mode == "holding"
             assert seen.force[-200:].mean() == pytest.approx(expected, rel=KNOWN)
-            assert any("each tip may bear 6.0 N along" in text for _, _, text in hand.events)
+            assert any("up to 6.0 N along the face" in text for _, _, text in hand.events)
 
 
 def test_each_force_increase_is_reported():
@@ -205,7 +205,9 @@ def test_each_force_increase_is_reported():
         hand.run(1.5)
         hand.command("grasp", force=8.0)
         hand.run(1.0)
-        raised = [text for _, _, text in hand.events if text.startswith("grip raised above")]
+        raised = [
+            text for _, _, text in hand.events if text.startswith("grip force increased above")
+        ]
         assert len(raised) == 2
 
 
@@ -351,7 +353,9 @@ def test_a_hand_whose_commander_is_silent_follows_its_settings(action, mode):
         assert hand.mode == mode
         told = [text for _, kind, text in hand.events if kind == "silence"]
         assert told == (
-            [] if action == "hold" else [f"the commander has been silent for 0.5 s: {action}"]
+            []
+            if action == "hold"
+            else [f"the commanding client has been silent for 0.5 s: {action}"]
         )
 
 
@@ -363,7 +367,7 @@ def test_a_stream_beyond_the_capacity_of_the_tips_is_reported_once():
             hand.command("hold", force=10.0, angle=0.002 * k)
             hand.run(0.02)
         assert hand.mode == "holding"
-        told = [text for _, _, text in hand.events if text.startswith("turning ended at")]
+        told = [text for _, _, text in hand.events if text.startswith("rotation stopped at")]
         assert len(told) == 1
 
 

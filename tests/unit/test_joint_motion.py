@@ -175,7 +175,7 @@ def test_position_mode_moves_without_current_checks(make):
     daemon = make(servos={"mode": "position", "model": "XL430-W250"})
     command(daemon, "arm")
     daemon.loop.advance(0.1)
-    assert "nothing bounds the current" in refusal(daemon, "grasp", force=8.0)
+    assert "does not limit the current" in refusal(daemon, "grasp", force=8.0)
     command(daemon, "move", left=0.05, right=-0.1)
     daemon.loop.advance(1.0)
     assert daemon.loop.state.reading.q == pytest.approx([0.05, -0.1], abs=0.01)

@@ -30,35 +30,39 @@ OLD = 5.0 - 11.0 / SETTINGS.tactile.rate  # s
 STALLED = {"goal.q": [0.0, 0.3], "goal.current": [0.4] * 2, "reading.current": [0.0, 0.39]}
 TOWARDS = {"goal.q": [0.3, 0.0], "goal.current": [0.4] * 2}
 FAULTS: dict[str, tuple[Changes, str, str]] = {
-    "stale": ({"reading.t": 4.9}, "servos.silent", "no good reading for 0.100 s"),
-    "never read": ({"reading.t": -math.inf}, "servos.silent", "no good reading yet"),
+    "stale": ({"reading.t": 4.9}, "servos.silent", "no valid reading for 0.100 s"),
+    "never read": ({"reading.t": -math.inf}, "servos.silent", "no valid reading yet"),
     "alert": ({"reading.alert": 2, "reading.hardware.1": 4}, "servos.alert", "right (overheating)"),
-    "past": ({"reading.q.0": 1.2}, "joint.angle", "left joint at 1.200 rad, outside its limits"),
-    "no angle": ({"reading.q.0": math.nan}, "joint.angle", "left joint at nan rad"),
-    "fast": ({"reading.dq.1": -7.0}, "joint.velocity", "right joint at -7.00 rad/s, too fast"),
-    "current": ({"reading.current.1": -1.9}, "joint.current", "right joint takes -1.90 A, above"),
-    "stalled": ({"mode": Mode.MOVING} | STALLED, "joint.stall", "17.2° off its goal at 0.39 A"),
-    "dead": (TOWARDS, "joint.dead", "left joint stands 17.2° off its goal and takes 0.00 A of 0"),
-    "pulled away": (TOWARDS | {"reading.current.0": -0.4}, "joint.dead", "takes -0.40 A of 0.40 A"),
-    "frozen": ({"reading.frozen": 0b01}, "servos.frozen", "servos: old readings from left"),
-    "deaf": ({"reading.lost": 0b11}, "goal.lost", "sent lately reached left and right"),
-    "hot": ({"reading.temperature.0": 71.0}, "servos.temperature", "left servo at 71 °C"),
-    "brown-out": ({"reading.voltage.1": 9.2}, "servos.voltage", "9.2 V, outside 9.5 to 16.0 V"),
+    "past": ({"reading.q.0": 1.2}, "joint.angle", "left joint is at 1.200 rad, outside"),
+    "no angle": ({"reading.q.0": math.nan}, "joint.angle", "left joint is at nan rad"),
+    "fast": ({"reading.dq.1": -7.0}, "joint.velocity", "at -7.00 rad/s, above 6 rad/s"),
+    "current": ({"reading.current.1": -1.9}, "joint.current", "right joint draws -1.90 A"),
+    "stalled": ({"mode": Mode.MOVING} | STALLED, "joint.stall", "17.2° from its goal at 0.39 A"),
+    "dead": (TOWARDS, "joint.dead", "left joint stands still 17.2° from its goal and draws"),
+    "pulled away": (TOWARDS | {"reading.current.0": -0.4}, "joint.dead", "only -0.40 A of 0.40 A"),
+    "frozen": ({"reading.frozen": 0b01}, "servos.frozen", "servos: readings from left are old"),
+    "deaf": ({"reading.lost": 0b11}, "goal.lost", "not received by left and right"),
+    "hot": ({"reading.temperature.0": 71.0}, "servos.temperature", "left servo is at 71 °C"),
+    "brown-out": ({"reading.voltage.1": 9.2}, "servos.voltage", "9.2 V, expected 9.5 to 16.0 V"),
     "no frames": (
         {"contacts.0.t_arrival": OLD, "contacts.0.t_valid": OLD},
         "tactile.silent",
-        "no frame of the left sensor for 0.1",
+        "no frame from the left sensor for 0.1",
     ),
     "no estimates": (
         {"contacts.0.t_valid": OLD},
         "tactile.silent",
-        "no sound estimate of the left",
+        "no valid estimate from the left",
     ),
-    "force": ({"contacts.1.force": 31.0}, "tip.force", "right tip at 31.0 N, above 30 N"),
-    "depth": ({"contacts.1.d": 0.013}, "tip.displacement", "right tip at 13.00 mm, above 12"),
-    "rim": ({"contacts.0.theta": -math.asin(0.8) + 0.04}, "tip.tilt", "left tip at -50.8°, past 5"),
-    "late": ({"timing.late_in_row": 100}, "loop.overruns", "loop: 100 overruns in a row"),
-    "outside": ({"contacts.0.inside": False}, "tip.tilt", "left tip at 5.7°, past"),
+    "force": ({"contacts.1.force": 31.0}, "tip.force", "right tip force is 31.0 N, above 30 N"),
+    "depth": ({"contacts.1.d": 0.013}, "tip.displacement", "displacement is 13.00 mm, above 12"),
+    "rim": (
+        {"contacts.0.theta": -math.asin(0.8) + 0.04},
+        "tip.tilt",
+        "left tip tilt is -50.8°, above 5",
+    ),
+    "late": ({"timing.late_in_row": 100}, "loop.overruns", "loop: 100 consecutive ticks were late"),
+    "outside": ({"contacts.0.inside": False}, "tip.tilt", "left tip tilt is 5.7°, above"),
 }
 THINNER: Changes = {"object.width": 0.0355}
 
@@ -160,7 +164,7 @@ def test_fingers_that_disagree_on_the_object_angle_warn_and_then_fault() -> None
     right.estimate.tilt_x += 0.1
     name, text = judged(judge, state, 0.5)
     assert name == "hand.angle"
-    assert "12.0° apart: a joint's zero is wrong" in text
+    assert "differ by 12.0°: check the joints' zeros" in text
     right.estimate.covariance[1, 1] = 0.06**2  # too uncertain for a fault
     assert judged(judge, state, 0.5) == ("", "")
 
@@ -180,11 +184,11 @@ def test_a_change_of_width_of_a_held_object_is_a_fault():
 
 STRONG = {"contacts.0.force": 27.5, "contacts.1.force": 27.5}
 WARNINGS: dict[str, tuple[Changes, str]] = {
-    "hand.force": ({"contacts.0.force": 12.0}, "left tip feels 12.0 N and the right one 5.0 N"),
-    "joint.strained": ({"reading.current": [1.19, 0.3]}, "left joint grips with all of its 1.2 A"),
-    "tactile.misfit": ({"contacts.0.misfit": True}, "left tip feels fits no contact"),
-    "servos.heat": ({"heat.1.time_to_limit": 42.0}, "right servo at 70 °C in 42 s"),
-    "tip.force": (STRONG, "left tip at 27.5 N, above 27 N"),
+    "hand.force": ({"contacts.0.force": 12.0}, "left 12.0 N, right 5.0 N"),
+    "joint.strained": ({"reading.current": [1.19, 0.3]}, "needs the highest current, 1.2 A"),
+    "tactile.misfit": ({"contacts.0.misfit": True}, "left sensor's frames do not fit"),
+    "servos.heat": ({"heat.1.time_to_limit": 42.0}, "right servo will reach 70 °C in 42 s"),
+    "tip.force": (STRONG, "left tip force is 27.5 N, above 27 N"),
 }
 
 
@@ -224,7 +228,7 @@ def test_readings_that_fail_for_a_second_are_reported_even_while_disarmed(good, 
     warnings = [each.text for each in watch.warnings if each.name == "servos.silent"]
     assert len(warnings) == told
     if told:
-        assert "of the last second's readings failed: no sound reply within" in warnings[0]
+        assert "of the readings in the last second failed: no valid reply within" in warnings[0]
         assert "servos.reply_timeout = 4 ms; `softfinger doctor`" in warnings[0]
         assert 0.9 < first < 1.5
 
@@ -255,10 +259,16 @@ def test_each_faulty_channel_is_named():
     state.reading.current[1], state.goal.current[1] = 0.1, 0.2
     judged(judge, state, 0.5)
     told = {warning.name: warning.text for warning in judge.warnings}
-    assert set(told) == {"witness.left_sensor", "witness.right_sensor", "witness.right_current"}
-    assert told["witness.left_sensor"].startswith("left sensor shows the object turned by 11° at")
-    assert told["witness.right_sensor"].startswith("right sensor reads 50% of what the joints")
-    assert "reads 0.10 A where its goal is 0.20 A" in told["witness.right_current"]
+    assert set(told) == {
+        "consistency.left_sensor",
+        "consistency.right_sensor",
+        "consistency.right_current",
+    }
+    assert told["consistency.left_sensor"].startswith(
+        "left sensor reports a jump of 11° in the object's angle"
+    )
+    assert told["consistency.right_sensor"].startswith("right sensor reads 50% of the pressure")
+    assert "current is 0.10 A, its goal 0.20 A" in told["consistency.right_current"]
 
 
 def test_a_force_that_does_not_increase_as_commanded_is_a_fault():
@@ -271,9 +281,9 @@ def test_a_force_that_does_not_increase_as_commanded_is_a_fault():
         if felt == 6.5 and not fault:
             state.contacts[0].force = state.contacts[1].force = 10.0
         found = judged(judge, state, 0.5)
-        assert (found[0] == "witness.force") is fault
+        assert (found[0] == "consistency.force") is fault
         state.contacts[0].force = state.contacts[1].force = felt
-    assert "rose to 20.0 N and the tips feel 6.5 N as before" in found[1]
+    assert "rose to 20.0 N, measured force stayed at 6.5 N" in found[1]
 
 
 def test_shear_near_friction_is_reported():
@@ -298,7 +308,7 @@ def test_a_frozen_sensor_is_a_fault_during_contact():
             later(state, 0.002)
         assert (found is not None) is fault
     assert found.name == "tactile.frozen"
-    assert "right sensor frozen" in found.text
+    assert "right sensor is frozen" in found.text
     state.contacts[1].contact = False  # without contact, repeated readings are normal
     assert judged(judge, state) == ("", "")
 
@@ -309,7 +319,7 @@ def test_saturated_cells_are_reported():
     sensor.give(5.0, np.full((4, 4), 65535))
     judged(judge, state, 0.3)
     assert [each.text for each in judge.warnings] == [
-        "tactile: 100% of the left sensor's cells are full"
+        "tactile: 100% of the cells of the left sensor are saturated"
     ]
 
 
@@ -359,8 +369,8 @@ def test_a_sensor_without_valid_estimates_is_reported_with_reason_and_noise():
     state.contacts[0].t_valid = OLD
     sensor.noise = 1.2 * SETTINGS.tactile.noise
     _, text = judged(judge, state)
-    assert text.endswith("s: not this tip")
+    assert text.endswith("s: the frame does not fit the tip's model")
     sensor.noise = 2.6 * SETTINGS.tactile.noise
     judge = safety(sensors=[sensor])
     _, text = judged(judge, state)
-    assert text.endswith("not this tip; its cells' noise is 3952 Pa, tactile.noise is 1520")
+    assert text.endswith("the noise of its cells is 3952 Pa, tactile.noise is 1520 Pa")

@@ -133,9 +133,9 @@ def test_saturated_sensors_latch_a_fault_and_cause_no_motion(make):
     before = list(daemon.loop.state.goal.current)
     blinded(daemon, 30_000)
     advance_to(daemon, "fault", 0.3)
-    assert daemon.loop.state.fault.startswith("tactile: no sound estimate of the left sensor for")
+    assert daemon.loop.state.fault.startswith("tactile: no valid estimate from the left sensor for")
     assert daemon.loop.state.goal.current == pytest.approx(before, rel=0.2)
-    with pytest.raises(Refused, match="clear: tactile: no sound estimate"):
+    with pytest.raises(Refused, match="clear: tactile: no valid estimate"):
         command(daemon, "clear")
 
 
@@ -152,14 +152,14 @@ def test_tare_is_refused_during_contact(make):
     command(daemon, "release")
     advance_to(daemon, "armed", 3.0)
     command(daemon, "tare")
-    with pytest.raises(Refused, match="grasp: tare is still at work"):
+    with pytest.raises(Refused, match="grasp: a tare is in progress"):
         command(daemon, "grasp")
     daemon.loop.advance(0.3)
     command(daemon, "grasp", force=5.0)
     advance_to(daemon, "holding", 3.0)
     command(daemon, "disarm")
     daemon.loop.advance(0.02)
-    with pytest.raises(Refused, match="tare: something touches a tip"):
+    with pytest.raises(Refused, match="tare: a tip is in contact"):
         command(daemon, "tare")
 
 
@@ -254,7 +254,7 @@ def test_a_tare_of_saturated_sensors_keeps_the_zero_offset_and_is_reported(make)
     daemon.loop.advance(0.5)
     assert not perception.is_taring
     assert perception._estimator.saturation == before
-    text = "right sensor's zero stays: most cells are full where nothing presses"
+    text = "right sensor was not tared: most cells are saturated without contact"
     assert events.count(("warning", "tare", text)) == 1
 
 
@@ -278,9 +278,9 @@ def test_a_sensor_that_shifts_during_a_grip_is_a_fault(make):
     change_frames(daemon, 1, lambda frame: replace(frame, data=np.roll(frame.data, 4, axis=1)))
     advance_to(daemon, "fault", 1.0)
     assert state.fault_name == "tactile.silent"
-    assert state.fault.startswith("right sensor shows the object turned by")
-    witness = next(event for event in events if event[1].startswith("witness"))
-    assert witness[:2] == ("warning", "witness.right_sensor")
+    assert state.fault.startswith("right sensor reports a jump of")
+    warning = next(event for event in events if event[1].startswith("consistency"))
+    assert warning[:2] == ("warning", "consistency.right_sensor")
     assert not torque_of(daemon).any()
     assert ("error", state.fault_name, state.fault) in events
 
@@ -292,8 +292,8 @@ def test_a_frozen_sensor_is_a_fault_until_it_recovers(make):
     change_frames(daemon, 0, lambda frame: replace(frame, data=frozen))
     advance_to(daemon, "fault", 1.0)
     assert daemon.loop.state.fault_name == "tactile.frozen"
-    assert "left sensor frozen" in daemon.loop.state.fault
-    assert "clear: tactile: left sensor frozen" in refusal(daemon, "clear")
+    assert "left sensor is frozen" in daemon.loop.state.fault
+    assert "clear: tactile: left sensor is frozen" in refusal(daemon, "clear")
     del left.sensor.latest  # restores the class's method
     daemon.loop.advance(0.2)
     command(daemon, "clear")
@@ -340,8 +340,8 @@ def test_a_hot_servo_is_a_fault_that_remains_until_it_has_cooled(make):
     heat = daemon.hand.servo_heat[1]
     heat.warm(70.6)
     advance_to(daemon, "fault", 1.0)
-    assert daemon.loop.state.fault == "right servo at 71 °C"
-    assert "clear: right servo at 7" in refusal(daemon, "clear")
+    assert daemon.loop.state.fault == "right servo is at 71 °C, above 70 °C"
+    assert "clear: right servo is at 7" in refusal(daemon, "clear")
     heat.warm(50.0)
     daemon.loop.advance(1.0)
     command(daemon, "clear")

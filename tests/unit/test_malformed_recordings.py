@@ -76,7 +76,7 @@ def test_a_malformed_frame_is_reported_and_omitted(tmp_path, spoil):
     found = list(Recording(path, told.append).messages([schema.TACTILE]))
     assert len(found) == 9
     assert len(told) == 1
-    assert "what is sound in it is read" in told[0]
+    assert "the intact part is read" in told[0]
     source = open_source(path, Settings(), own=True)
     contacts = analyse(source, lambda _: None)
     assert contacts[0].t.size == 9
@@ -119,5 +119,5 @@ def test_malformed_inputs_are_reported(tmp_path, spoilt):
             message.pop("ok")
         writer.add(topic, message)
     writer.close()
-    with pytest.raises(RecordingError, match="not those of a loop"):
+    with pytest.raises(RecordingError, match="do not form complete ticks"):
         recompute(Recording(tmp_path / "a.mcap"))

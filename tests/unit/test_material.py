@@ -179,7 +179,7 @@ def test_the_force_error_equals_the_effect_of_the_misfit_on_the_force():
         ([0, 0.2, math.nan, 0.6], [0, 2, 3, 4], "point 3 is not a number"),
         ([0, 0.2, 0.4, 0.6], [0, 2, math.inf, 4], "point 3 is not a number"),
         ([0, 20, 40, 100], [0, 2, 3, 4], "not per cent"),
-        ([0, 0.2, 0.4], [0, 2, 3, 4], "one length"),
+        ([0, 0.2, 0.4], [0, 2, 3, 4], "equal length"),
         ([0, 0.5, 1.2, 1.4], [0, 2, 3, 4], "too few points between"),
         ([0, 0.1, 0.2, 0.3, 0.31, 0.9], [0, 1, 2, 3, 90, 91], "no smooth monotone law"),
     ],

@@ -149,11 +149,11 @@ def test_frames_are_estimated_with_consistent_errors(law, d, degrees):
 
 
 def test_unsuitable_contacts_are_refused():
-    with pytest.raises(CurvesError, match=r"found 5 presses of 5 depths, 0 of them tilted"):
+    with pytest.raises(CurvesError, match="found 5 presses at 5 depths, 0 of them tilted"):
         fit_measured(presses(count=5), A, GRID)
     falls = presses()
     softer = [each / (1.0 + (d / 2e-3) ** 3) for each, d in zip(falls.frames, D, strict=True)]
-    with pytest.raises(CurvesError, match="every smooth curve that rises misses"):
+    with pytest.raises(CurvesError, match="the best smooth increasing curve deviates"):
         fit_measured(replace(falls, frames=softer), A, GRID)
     single = replace(falls, frames=[each[:1] for each in falls.frames])
     with pytest.raises(CurvesError, match="five frames of each press"):
@@ -183,11 +183,11 @@ def test_a_finger_uses_the_curves_of_its_file(law, tmp_path):
     with pytest.raises(SettingsError, match=r"safety.d_max: found 0.012 m, expected at most 0.006"):
         make_models(load(HIL, tmp_path, profile(file)))
     save_calibration(other, empty)
-    with pytest.raises(SettingsError, match=r"other.json has no curves of left; `softfinger cali"):
+    with pytest.raises(SettingsError, match=r"other.json has no curves for the left tip"):
         make_models(load(HIL, tmp_path, profile(other)))
     with pytest.raises(SettingsError, match=r'tactile.calibration: found "" for left'):
         load(HIL, tmp_path, ["tip.physics=measured", "safety.d_max=0.006"])
-    with pytest.raises(SettingsError, match="measured curves are of frames that a board sends"):
+    with pytest.raises(SettingsError, match="measured curves need the frames of a real board"):
         load(None, tmp_path, ["tip.physics=measured"])
     falling = asdict(law) | {"push": [[-value for value in row] for row in law.push]}
     text = json.loads(file.read_text()) | {"law": falling}

@@ -134,7 +134,7 @@ def test_a_busy_machine_is_reported_while_a_simulated_hand_waits():
     give(feed, b"hand/state", states[0] | {"behind_s": 1.55}, 10.0)
     assert "busy" not in shown(feed, 10.0)
     give(feed, b"hand/state", states[1] | {"behind_s": 1.9}, 10.01)
-    said = "this machine is busy: the simulated hand runs 0.35 s behind (1.90 s in all)"
+    said = "this machine is busy: the simulated hand runs 0.35 s behind (1.90 s in total)"
     assert said in shown(feed, 10.02)
     assert "busy" not in shown(feed, 13.1)
 

@@ -171,7 +171,7 @@ def test_a_search_recognises_servos_of_protocol_1(wired):
 
 def test_a_port_that_disappears_ends_a_search(wired, monkeypatch):
     def gone(*_: object) -> None:
-        raise PortLost("the port is gone")
+        raise PortLost("the port is lost")
 
     wired()
     monkeypatch.setattr(ServoLine, "ping_all", gone)
@@ -201,15 +201,15 @@ def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):
     assert search("line", (57600, HOME)).garbled == (Garbled(1, 57600),)
     done, problems = bus.provision()
     assert done == []
-    assert "several servos have that ID, as all have from the factory" in problems[0]
+    assert "several servos have this ID (the factory setting)" in problems[0]
     assert [bytes(each.table.memory[: reg.RAM]) for each in bus.servos] == before
 
 
 @pytest.mark.parametrize(
     ("fault", "register", "value", "done"),
     [
-        ("overload=2", None, 0, f"{RIGHT}: rebooted, since it had a hardware error: overload"),
-        ("", reg.TORQUE_ENABLE, 1, f"{LEFT}: torque off, since EEPROM is locked while it is on"),
+        ("overload=2", None, 0, f"{RIGHT}: rebooted because it had a hardware error: overload"),
+        ("", reg.TORQUE_ENABLE, 1, f"{LEFT}: torque switched off, because it locks the EEPROM"),
         ("", reg.DRIVE_MODE, 0b1100, f"{LEFT}: drive mode 12 → 4"),
         ("", reg.STATUS_RETURN_LEVEL, 0, f"{LEFT}: status return level 0 → 2"),
     ],

@@ -28,11 +28,11 @@ def test_the_demo_of_a_simulated_hand_continues_after_a_fault_and_reports_it(mak
     events = holding_demo(daemon)
     daemon.loop._fail("made up")
     daemon.loop.advance(6.0)
-    again = "the task clears it and begins again in 2 s: the hand is simulated"
+    again = "on a simulated hand the task clears the fault and restarts in 2 s"
     assert events[:6] == [
         ("info", "mode", "holding → fault"),
         ("error", "servos.bus", "made up"),
-        ("warning", "task", f"the hand is in fault; {again}"),
+        ("warning", "task", f"the mode is fault; {again}"),
         ("info", "mode", "fault → disarmed"),
         ("info", "mode", "disarmed → armed"),
         ("info", "mode", "armed → grasping"),
@@ -56,7 +56,7 @@ def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
     daemon.loop.advance(5.0)
     told = [text for _, kind, text in events if kind == "task"]
     assert len(told) == 3
-    assert told[1].startswith("clear: servos: hardware error reported by left; the task clears it")
+    assert told[1].startswith("clear: servos: hardware error reported by left; on a simulated hand")
     servos.read = really
     advance_to(daemon, "holding", 6.0)
 
@@ -66,7 +66,7 @@ def test_a_demo_with_an_endless_step_restarts(make):
     events = holding_demo(daemon)
     daemon.loop._task._end_mode = "moving"  # a mode that is never reached
     advance_to(daemon, "disarmed", 13.0)
-    assert events[0][2].startswith("still holding after 10 s; the task stops it and begins again")
+    assert events[0][2].startswith("still holding after 10 s; on a simulated hand the task stops")
     advance_to(daemon, "holding", 6.0)
 
 
@@ -79,7 +79,7 @@ def test_the_demo_of_a_real_hand_ends_with_the_first_fault(make):
     events = holding_demo(daemon)
     daemon.loop._fail("made up")
     daemon.loop.advance(6.0)
-    assert events[2:] == [("warning", "task", "task over: the hand is in fault")]
+    assert events[2:] == [("warning", "task", "task ended: the mode is fault")]
     assert daemon.loop.state.fault == "made up"
 
 
@@ -115,7 +115,7 @@ def test_one_finger_presses_on_a_fixed_object(make):
     assert daemon.loop.state.contacts[0].force == pytest.approx(6.0, rel=0.05)
     assert daemon.loop.state.contacts[1].force == 0.0
     assert not daemon.loop.state.object.valid
-    with pytest.raises(Refused, match="needs both fingers"):
+    with pytest.raises(Refused, match="needs two fingers"):
         command(daemon, "rotate", angle=0.1)
 
 
@@ -160,10 +160,10 @@ def test_the_demo_task_grasps_turns_and_releases(make):
 def test_a_demo_ended_by_a_command_restarts(make):
     daemon = make(task={"name": "demo"})
     advance_to(daemon, "holding", 6.0)
-    assert "demo: not while holding" in refusal(daemon, "demo")
+    assert "demo: not accepted in mode holding" in refusal(daemon, "demo")
     command(daemon, "stop")
     daemon.loop.advance(2.0)
     assert daemon.loop.state.mode == "disarmed"
     command(daemon, "demo")
     advance_to(daemon, "rotating", 8.0)
-    assert "names no task" in refusal(make(), "demo")
+    assert "defines no task" in refusal(make(), "demo")

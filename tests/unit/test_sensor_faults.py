@@ -13,21 +13,28 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon as Hand
 from tests.unit.test_control import grasped
 
 FORCE = 6.0
-BOTH = {"witness.left_sensor", "witness.right_sensor"}
+BOTH = {"consistency.left_sensor", "consistency.right_sensor"}
 
 # Faults: (kind, value, duration [s], fingers, expected events, expected mode afterwards). A falling
 # zero offset hides a light touch completely; the joints then hold their position, or, if only one
 # tip seems to let go, its frames are rejected. A rising zero offset is visible next to the
 # footprint.
 LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
-    "one zero sinks": ("drift", -0.1, 1.0, (0,), {"witness.left_sensor"}, "armed"),
+    "one zero sinks": ("drift", -0.1, 1.0, (0,), {"consistency.left_sensor"}, "armed"),
     "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, "armed"),
     "both zeros rise": ("drift", 0.1, 1.0, (0, 1), set(), "holding"),
-    "one image shifts": ("shift-x", 3.0, 0.0, (1,), {"witness.right_sensor"}, "fault"),
+    "one image shifts": ("shift-x", 3.0, 0.0, (1,), {"consistency.right_sensor"}, "fault"),
     "both images shift": ("shift-x", 3.0, 0.0, (0, 1), BOTH, "fault"),
-    "one image is mirrored": ("mirror", 1.0, 0.0, (0,), {"witness.left_sensor"}, "fault"),
-    "one current reads half": ("current", 0.5, 0.0, (0,), {"witness.left_current"}, "holding"),
-    "one current reads double": ("current", 2.0, 0.0, (1,), {"witness.right_current"}, "holding"),
+    "one image is mirrored": ("mirror", 1.0, 0.0, (0,), {"consistency.left_sensor"}, "fault"),
+    "one current reads half": ("current", 0.5, 0.0, (0,), {"consistency.left_current"}, "holding"),
+    "one current reads double": (
+        "current",
+        2.0,
+        0.0,
+        (1,),
+        {"consistency.right_current"},
+        "holding",
+    ),
 }
 
 
@@ -43,7 +50,7 @@ def test_a_measurement_fault_is_named_and_has_no_effect(lie: str) -> None:
             hand.plant.measurement_faults[finger].begin(kind, value, hand.plant.t, over)
         seen = hand.watch(1.5)
         assert seen.force.max() < (1.4 if len(fingers) == 2 else 1.3) * FORCE
-        found = {kind for _, kind, _ in hand.events if kind.startswith("witness")}
+        found = {kind for _, kind, _ in hand.events if kind.startswith("consistency")}
         assert found == named
         assert not [text for _, kind, text in hand.events if kind == "slip"]
         assert hand.mode == mode
@@ -130,7 +137,7 @@ def test_a_recovered_sensor_is_used_again() -> None:
         grasped(hand, FORCE)
         assert hand.mode == "holding"
         assert hand.plant.normal.mean() == pytest.approx(FORCE, rel=0.1)
-        assert not [kind for _, kind, _ in hand.events if kind.startswith("witness")]
+        assert not [kind for _, kind, _ in hand.events if kind.startswith("consistency")]
 
 
 def test_a_d_jump_without_motion_of_joints_and_the_other_tip_is_rejected() -> None:
@@ -143,8 +150,8 @@ def test_a_d_jump_without_motion_of_joints_and_the_other_tip_is_rejected() -> No
         seen = hand.watch(0.09)
         zero.clear()
         assert seen.force.max() < 1.1 * FORCE
-        (told,) = [text for _, kind, text in hand.events if kind == "witness.right_sensor"]
-        assert "mm less deep at once" in told
+        (told,) = [text for _, kind, text in hand.events if kind == "consistency.right_sensor"]
+        assert "a jump of -" in told
 
 
 def test_equal_rolling_of_both_tips_in_a_turn_is_not_a_drift() -> None:
@@ -155,7 +162,7 @@ def test_equal_rolling_of_both_tips_in_a_turn_is_not_a_drift() -> None:
         hand.command("rotate", angle=0.205)
         hand.watch(1.5)
         assert hand.mode == "holding"
-        assert not [event for event in hand.events if event[1].startswith("witness")]
+        assert not [event for event in hand.events if event[1].startswith("consistency")]
 
 
 def test_repeated_frames_are_rejected_and_the_force_is_not_changed_with_them() -> None:
@@ -167,7 +174,7 @@ def test_repeated_frames_are_rejected_and_the_force_is_not_changed_with_them() -
         seen = hand.watch(1.0)
         assert seen.force.max() < 1.3 * 20.0
         assert hand.mode == "fault"
-        found = {kind for _, kind, _ in hand.events if kind.startswith("witness")}
+        found = {kind for _, kind, _ in hand.events if kind.startswith("consistency")}
         assert found == BOTH
 
 
@@ -184,7 +191,7 @@ def test_real_loads_and_turns_are_not_measurement_faults(load: tuple[float, floa
         hand.command("rotate", angle=0.12)
         hand.watch(1.0)
         assert hand.mode == "holding"
-        assert not [event for event in hand.events if event[1].startswith("witness")]
+        assert not [event for event in hand.events if event[1].startswith("consistency")]
 
 
 def given(repeats: RepeatDetector, frames: list[float]) -> bool:

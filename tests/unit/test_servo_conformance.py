@@ -252,7 +252,7 @@ def test_position_limits_that_exclude_the_joint_range_are_reported(monkeypatch):
     table.set(reg.MAX_POSITION_LIMIT, 4095)
     rig.servos.connect()
     notices = [each.text for each in rig.servos.notices]
-    assert notices.count("in position mode nothing bounds its current") == 2
+    assert notices.count("position mode does not limit its current") == 2
     rig.close()
 
 

@@ -175,7 +175,7 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
         assert max(heat.sensed for heat in hand.plant.servo_heat) < LIMIT
         assert hand.plant.force.min() > 5.0
         told = heat_events(hand)
-        assert any("grip eased from 24.0 to" in text for _, text in told)
+        assert any("grip force reduced from 24.0 to" in text for _, text in told)
         assert {level for level, _ in told} == {"warning"}
         eased = hand.state.goal.force
         assert eased < 22.0
@@ -203,6 +203,6 @@ def test_if_the_load_needs_the_force_the_configured_action_is_reported_and_taken
         hand.run(2.0)
         assert hand.mode == mode
         (text,) = [text for level, text in heat_events(hand) if level == "error"]
-        assert text.endswith(f"and the load needs the grip: {action}")
+        assert text.endswith(f"and the load does not allow a weaker grip: {action}")
         if action == "hold":
             assert hand.state.fault_name == "servos.temperature"

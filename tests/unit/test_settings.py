@@ -94,7 +94,7 @@ def test_an_unknown_name_is_reported_with_the_known_ones():
     with pytest.raises(SettingsError) as caught:
         load(Path("hill"))
     assert str(caught.value) == (
-        f"hill: found no such profile, expected the path of a file or one of {', '.join(names())}"
+        f"hill: no such profile; expected a file or one of {', '.join(names())}"
     )
 
 
@@ -124,15 +124,14 @@ def test_all_errors_are_in_one_report_with_key_found_and_expected(tmp_path):
     *most, last = map(repr, known("servos"))
     assert sorted(lines) == sorted(
         [
-            "hand.pivot_seperation: found an unknown key, expected a known one; "
-            "nearest: pivot_separation",
+            "hand.pivot_seperation: unknown key; nearest: pivot_separation",
             'hand.finger_length: found "long", expected a valid number',
             "hand.q_min: found [1, 2, 3], expected at most 2 items after validation, not 3",
             "servos.baud: found 1.5, expected a valid integer",
             "servos.ids.1: found 300, expected less than or equal to 252",
             f'servos.backend: found "dynamxl", expected {", ".join(most)} or {last}',
             "tip.radius: found -1, expected greater than or equal to 0.0001",
-            "lop: found an unknown key, expected a known one; nearest: loop",
+            "lop: unknown key; nearest: loop",
             "tactile.noise: found nan, expected a finite number",
             'scene.fingers: found "left", expected a valid tuple',
             "scene.object_model: found 1, expected a valid boolean",
@@ -167,13 +166,13 @@ def test_wrong_values_do_not_hide_contradictions_between_other_keys(tmp_path):
 def test_only_a_similar_key_is_suggested(tmp_path):
     for key, hint in (("nosie", "; nearest: noise"), ("resolution", ""), ("x", "")):
         (line,) = report(tmp_path, f"[tactile]\n{key} = 1")
-        assert line == f"tactile.{key}: found an unknown key, expected a known one{hint}"
+        assert line == f"tactile.{key}: unknown key{hint}"
 
 
 def test_at_most_20_errors_are_told_and_the_others_counted(tmp_path):
     lines = report(tmp_path, "".join(f"x{k} = 1\n" for k in range(30)))
     assert len(lines) == 21
-    assert lines[-1] == "and 10 more errors"
+    assert lines[-1] == "10 more errors"
 
 
 def test_all_contradictions_between_keys_are_reported(tmp_path):
@@ -218,7 +217,7 @@ def test_a_missing_or_binary_file_is_reported(tmp_path):
         load(path)
     with pytest.raises(SettingsError, match=r"absent\.toml: can't be read"):
         load(tmp_path / "absent.toml")
-    with pytest.raises(SettingsError, match=r"No such file .*; hil alone names the packaged one"):
+    with pytest.raises(SettingsError, match=r"No such file .*; `hil` alone selects"):
         load(tmp_path / "config" / "hil.toml")
 
 
@@ -248,7 +247,10 @@ def test_an_unknown_model_is_reported_with_all_other_errors(tmp_path):
             "servos.backend, tactile.backend: found none and none, expected at least one",
         ),
         ("[loop]\nrate = = 3\n", "not TOML: Invalid value (at line 2"),
-        ("[servos]\nwatchdog = 0.003", "servos.watchdog: found 0.003 s, expected above two ticks"),
+        (
+            "[servos]\nwatchdog = 0.003",
+            "servos.watchdog: found 0.003 s, expected more than two ticks",
+        ),
         ('[stream]\naddress = "tcp://127.0.0.1:99999"', "stream.address: found"),
         ('[stream]\naddress = "tcp://*:9872"', "stream.address: found"),
         ('[stream]\naddress = "inproc://x"', "stream.address: found"),
@@ -271,7 +273,7 @@ def test_an_unknown_model_is_reported_with_all_other_errors(tmp_path):
         ),
         ("[tactile]\nrate = 1e300", "tactile.rate: found 1e+300, expected less than or equal to"),
         ("[loop]\nrate = 1979-05-27", "loop.rate: found 1979-05-27, expected a valid number"),
-        ('"\\u001b[31m" = 1', "?[31m: found an unknown key"),
+        ('"\\u001b[31m" = 1', "?[31m: unknown key"),
         ("[safety]\nframe_age_hold = 20.0", "safety.frame_age_hold: found 20, expected below"),
         (
             '[control]\nlaw = "upright"\ndither_torque = 3.0',
@@ -299,7 +301,7 @@ def test_an_unknown_model_is_reported_with_all_other_errors(tmp_path):
         (
             '[material]\nlaw = "points"\nstrain = [0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0]\n'
             "stress = [1e4, 2e4, 3e4, 6e4, 12e4, 18e4, 24e4]\nforce_error_max = 0.01",
-            "material.strain, material.stress: the smooth law misses its points by up to",
+            "material.strain, material.stress: the smooth law deviates from its points by up to",
         ),
     ],
 )
@@ -320,7 +322,7 @@ def test_command_line_changes_override_the_file_and_are_checked_with_it(tmp_path
     with pytest.raises(SettingsError) as report:
         load(file, changes=["loop.rate=fast", "tip.radios=0.02"])
     assert str(report.value).splitlines() == [
-        "--set: tip.radios: found an unknown key, expected a known one; nearest: radius",
+        "--set: tip.radios: unknown key; nearest: radius",
         '--set: loop.rate: found "fast", expected a valid number',
     ]
 

@@ -101,10 +101,10 @@ def test_reported_channels_are_compared_with_the_actual_faults(soak):
     holding(soak)
     soak.run(600)
     soak._false.add("left_sensor")
-    soak._hear("warning", "witness.left_sensor", "")
+    soak._hear("warning", "consistency.left_sensor", "")
     with pytest.raises(AssertionError, match="right_sensor named"):
-        soak._hear("warning", "witness.right_sensor", "")
+        soak._hear("warning", "consistency.right_sensor", "")
     soak.hand.object_pose[1] += 0.02  # the object's edge is at the tips
     soak.hand.refresh()
     soak._judge_sensor_faults("holding")
-    soak._hear("warning", "witness.right_sensor", "")
+    soak._hear("warning", "consistency.right_sensor", "")

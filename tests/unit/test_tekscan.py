@@ -101,7 +101,7 @@ def test_a_single_frame_needs_no_frame_line():
         ("Frame 6 0.08 s", "Frame six", "line 19"),
         ("7,255,1", "7,255", "line 17: 2 cells, expected 3"),
         ("7,255,1", "7,,1", "line 17"),
-        ("7,255,1", "7,nan,1", "line 17: a cell that is no number"),
+        ("7,255,1", "7,nan,1", "line 17: a cell is not a number"),
         ("7,255,1", "7,-255,1", "row 2, cell 2 is -255"),
         ("7,255,1", "7,inf,1", "row 2, cell 2 is inf"),
         ("7,255,1\n", "", "frame 4 has 1 rows of 2"),
@@ -124,5 +124,5 @@ def test_an_export_is_read_as_a_recording(tmp_path):
     path.write_text(EXPORT.replace("RAW", "kPa"))
     assert load_recording(path, 50.0, 100.0).counts[0, 1].tolist() == [140, 5100, 20]
     path.write_text("nothing")
-    with pytest.raises(RecordingError, match=r"run\.asf: no line ASCII_DATA"):
+    with pytest.raises(RecordingError, match=r"run\.asf: found no line ASCII_DATA"):
         load_recording(path, 4.0, 100.0)

@@ -21,7 +21,7 @@ def test_a_non_finite_goal_is_a_fault_even_after_a_refused_command(make):
     daemon.loop.advance(0.1)
     daemon.loop.state.goal.q[0] = math.nan
     bounded(daemon.loop._safety, daemon.loop.state)
-    assert "a non-finite goal" in refusal(daemon, "grasp")
+    assert "a goal that is not a finite number" in refusal(daemon, "grasp")
     daemon.loop.advance(daemon.loop.period)
     assert daemon.loop.state.fault_name == "goal.number"
     command(daemon, "clear")
@@ -62,7 +62,7 @@ def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
     told = [text for _, kind, text in events if kind == "torque.off"]
     assert len(told) == 2, "must be reported once at the beginning and once at the end"
     assert "the bus is kept silent" in told[0]
-    assert "torque off confirmed" in told[1]
+    assert "confirmed torque off" in told[1]
     command(daemon, "clear")
     assert command(daemon, "stop")["torque_off"] == "confirmed"
 
@@ -178,7 +178,7 @@ def test_a_stop_by_signal_precedes_waiting_commands_and_prevents_them_from_armin
             return len(told)
 
         until(lambda: tick() == 20)
-        assert all("before a stop" in reply["error"] for reply in told)
+        assert all("before the last stop" in reply["error"] for reply in told)
         client.send(msgpack.packb({"command": "arm"}))
         until(lambda: [served.settle(1), served.link.asked][1])
         daemon.loop.advance(daemon.loop.period)

@@ -99,7 +99,7 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
     command(daemon, "grasp", force=6.0)
     assert greatest_force(daemon, 3.0) < 4.0
     assert daemon.loop.state.fault_name == "joint.swapped"
-    assert "closes: are servos.ids swapped?" in daemon.loop.state.fault
+    assert "stands still: are servos.ids swapped?" in daemon.loop.state.fault
     assert not daemon.hand.torque_on.any()
 
 
@@ -111,7 +111,7 @@ def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
     command(daemon, "rotate", angle=0.2)
     assert greatest_force(daemon, 1.0) < 10.0
     assert daemon.loop.state.fault_name == "joint.swapped"
-    assert "against its commanded turn: are servos.ids swapped?" in daemon.loop.state.fault
+    assert "against the commanded direction: are servos.ids swapped?" in daemon.loop.state.fault
 
 
 @pytest.mark.parametrize("off", [0.0, *OFF])
@@ -175,6 +175,6 @@ def test_fingers_that_stand_in_the_approach_are_reported(make):
     while daemon.hand.q[0] > -0.54:  # until it reaches its stop
         daemon.loop.advance(0.02)
     daemon.loop.advance(1.0)
-    (text,) = texts(events, "joint.blocked")
-    assert text.startswith("left joint stands at 3")
-    assert text.endswith("is servos.direction right?")
+    (told,) = [text for level, kind, text in events if kind == "joint.blocked"]
+    assert told.startswith("left joint has stopped at 3")
+    assert told.endswith("correct servos.direction")

@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(_analysed(arguments, settings, files[0]), end="")
         return 0
     if arguments.csv:
-        print("analyse: --csv goes with one FILE", file=sys.stderr)
+        print("analyse: --csv needs exactly one FILE", file=sys.stderr)
         return 2
     status = 0
     _compile(settings)
@@ -100,12 +100,12 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
     touching = sum(int((each.contact & each.valid).sum()) for each in contacts)
     reasons = sum((each.reasons() for each in contacts), Counter[str]())
     told = (
-        f"{frames} frames in {elapsed:.2f} s ({frames / max(elapsed, 1e-9):.0f} a second): "
-        f"{touching} with contact, {reasons.total()} not usable; {table}\n"
+        f"{frames} frames in {elapsed:.2f} s ({frames / max(elapsed, 1e-9):.0f} per second): "
+        f"{touching} with contact, {reasons.total()} invalid; {table}\n"
     )
     if source.recording is not None and not touching and not reasons:
         told += _silence(source.recording, source.settings.tactile)
-    told += "".join(f"  {n} not usable: {reason}\n" for reason, n in reasons.most_common())
+    told += "".join(f"  {n} invalid: {reason}\n" for reason, n in reasons.most_common())
     return told
 
 
@@ -121,7 +121,7 @@ def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
     pressure, level = recording.largest * scale, PEAK_LEVEL * tactile.noise
     found = f"{recording.largest:.4g} counts, " if recording.whole else ""
     if pressure == 0.0:
-        cause = "no cell ever read more than 0: look at the sensor's cable"
+        cause = "no cell read more than 0: check the sensor's cable"
     elif not recording.whole and recording.largest <= 1.0:
         cause = (
             "floats of 0 to 1 are shares of the sensor's range, not Pa: multiply them by its "
@@ -130,13 +130,13 @@ def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
     elif pressure < level and not recording.whole:
         cause = "floats are read as Pa: convert kPa, and save counts as integers"
     elif pressure < level:
-        cause = "nothing pressed, or tactile.pascal_per_count is not this sensor's"
+        cause = "nothing pressed, or tactile.pascal_per_count belongs to another sensor"
         if recording.largest <= _EIGHT_BITS < tactile.full_count:
             cause = "counts of 8 bits need a larger tactile.pascal_per_count"
     else:
         counts = recording.counts[:, recording.live].astype(np.float64)
         noise = tactile.pascal_per_count * math.sqrt(np.mean(counts[counts > 0.0] ** 2))
-        cause = "no such cells beside each other: single cells are outliers"
+        cause = "no adjacent cells above the threshold: single cells count as outliers"
         if noise > _NOISE_RATIO * tactile.noise:
             cause = f"the noise of the cells is {noise:.0f} Pa: set tactile.noise"
     return (
@@ -203,7 +203,7 @@ def open_source(path: Path, settings: Settings, own: bool) -> Source:
 def _stream(path: Path, settings: Settings, own: bool) -> Source:
     recording = Recording(path, to_stderr("analyse"))
     if not recording.count(schema.TACTILE):
-        raise RecordingError(f"{path}: no tactile frames in it")
+        raise RecordingError(f"{path}: contains no tactile frames")
     models = partial(recorded_models, recording) if own else partial(_models_of, settings)
     if own:
         settings, _ = recorded_settings(recording)
@@ -228,8 +228,8 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
     )
     if own:
         raise SettingsError(
-            f"{path}: no settings in it: name the tip and the sensor by --config PROFILE, as "
-            "--config paper, or by --set"
+            f"{path}: contains no settings: describe the tip and the sensor with --config "
+            "PROFILE, such as --config paper, or with --set"
         )
     count, rows, cols = recording.counts.shape
     for note in (*recording.notes, pitch_difference(recording, (tactile.pitch, tactile.pitch_y))):

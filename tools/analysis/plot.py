@@ -132,10 +132,10 @@ class RecordedRun:
     def contacts(self) -> dict[str, ContactTable]:
         """Return the contact table of each finger that touched; raise Missing if none did."""
         if not self.t.size:
-            raise Missing("no hand/state in it")
+            raise Missing("contains no hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
         if not touched:
-            raise Missing("no contact in it")
+            raise Missing("contains no contact")
         if self.models is None:
             raise Missing(self.why_no_model)
         return {name: self.models[FINGERS.index(name)].table for name in touched}
@@ -160,7 +160,7 @@ def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None
     except RecordingError as error:
         return None, str(error).removeprefix(f"{recording.path}: ")
     except (SettingsError, TactileError, ValueError) as error:
-        return None, f"its model can't be made: {error}"
+        return None, f"can't build its model: {error}"
 
 
 def _titled(figure: Figure, run: RecordedRun, text: str) -> None:

@@ -26,7 +26,7 @@ MEASUREMENTS = {
     "tick": "the tick back to back, in place and over ptys",
     "control": "error of an object's angle that remains with each grip law",
     "reflex": "sudden larger loads on a grip: held or lost, slide, reaction time",
-    "faults": "true force of grips with faulty measurements, a quarter of an hour",
+    "faults": "true force of grips with faulty measurements (15 minutes)",
     "robustness": "true force of grips by hands that differ from their settings",
 }
 # These benchmarks run on virtual time, so other load on the machine does not affect them.
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     tables: list[Report] = []
     status = 0
     for name in names:
-        print(f"measuring {MEASUREMENTS[name]} …", file=sys.stderr, flush=True)
+        print(f"measuring {MEASUREMENTS[name]}", file=sys.stderr, flush=True)
         found = _measured(name, arguments)
         rows += _kept(name, found)
         if any(table.failed for table in found) or not found:
@@ -167,9 +167,9 @@ def _check(names: list[str], arguments: argparse.Namespace) -> None:
     """Raise ValueError if the arguments are invalid."""
     for key, of in _OWN.items():
         if getattr(arguments, key) and (len(names) != 1 or names[0] not in of):
-            raise ValueError(f"--{key}: for {' or '.join(of)} alone")
+            raise ValueError(f"--{key}: only for {' or '.join(of)}")
     for name in names:
         if name not in MEASUREMENTS:
             raise ValueError(f"found {name!r}, expected one of {', '.join(MEASUREMENTS)}")
     if arguments.only and not any(arguments.only in case for case in _module(names[0]).NAMES):
-        raise ValueError(f"--only {arguments.only}: no case of {names[0]} has this in its name")
+        raise ValueError(f"--only {arguments.only}: no case of {names[0]} contains this text")

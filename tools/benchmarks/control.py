@@ -181,14 +181,16 @@ LATE_TIPS = {
 def measure(brief: bool = False) -> list[Report]:
     """Return tables of residual angles [°]; with few draws, p99 is close to the maximum."""
     plants = drawn(2 if brief else _DRAW_COUNT)
-    title = f"left of {math.degrees(_ANGLE_STD):g}° after {_READ_TIME:g} s at {_FORCE:g} N"
+    title = (
+        f"remaining angle of {math.degrees(_ANGLE_STD):g}° after {_READ_TIME:g} s at {_FORCE:g} N"
+    )
     return [
         Report(f"{title}{of}", [row(name, way, plants) for name, way in ways.items()])
         for of, ways in (
             ("", WAYS),
             (", upright, limits", LIMITS),
-            (", its angle late", LATE_LIMITS),
-            (", its angle late, other tips, two-phased", LATE_TIPS),
+            (", delayed angle", LATE_LIMITS),
+            (", delayed angle, other tips, two-phased", LATE_TIPS),
         )
     ]
 

@@ -26,12 +26,12 @@ from softfinger.tools.benchmarks.rigs import SOLID, Sections
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIAL_COUNT = 20
-_FORCES = (6.0, 12.0)  # N, requested force
-_EVENT_PREFIX = "witness."  # prefix of event kinds that report a faulty channel
+_FORCES = (6.0, 12.0)  # N, requested forces
+_EVENT_PREFIX = "consistency."  # prefix of the kinds of events that name a faulty measurement
 
-# Aims. Forces are relative to the requested force.
-SETTLES = "settled at 0.8 … 1.2, not raised"
-BOUNDED = "≤ 50 ms above 1.3, named ≤ 0.3 s"
+# Aims: forces relative to the requested force; times in s.
+SETTLES = "settles at 0.8 to 1.2 without a force increase"
+BOUNDED = "≤ 50 ms above 1.3, reported within 0.3 s"
 _SETTLED_RANGE = (0.8, 1.2)
 _EXCESS_TIME_MAX = 0.05  # s above 1.3
 _REPORT_TIME_MAX = 0.3  # s after the error reached half of its final value
@@ -70,7 +70,7 @@ class FaultCase:
 def _cases(force: float) -> Iterator[FaultCase]:
     settles = partial(FaultCase, aim=SETTLES, force=force)
     bounded = partial(FaultCase, aim=BOUNDED, force=force)
-    yield settles("honest")
+    yield settles("no fault")
     for who, side, false in (
         ("one sensor", "{side}:", ("{side}_sensor",)),
         ("both sensors", "", _SENSORS),
@@ -99,7 +99,7 @@ def _cases(force: float) -> Iterator[FaultCase]:
     for scale in (0.6, 0.8, 1.25, 1.6):
         odd = {"simulation": {"modulus_scale": scale}}
         yield settles(f"E of the tips x {scale:g}", settings=odd)
-    yield settles("solid tips, honest", settings=SOLID)
+    yield settles("solid tips, no fault", settings=SOLID)
     for gain in (0.7, 1.3):
         lies = partial(settles, words=f"gain={gain}", false=_SENSORS, settings=SOLID)
         yield lies(f"solid tips, both sensors, gain {gain:g} from the start", before=True)
@@ -146,11 +146,11 @@ class GripTrial:
         named = min((t for t, _ in self.named(True)), default=math.inf) - 0.5 * case.comes
         wrong = {
             "not held": not self.held and not case.before,
-            "named wrongly": bool(self.named(False)),
+            "wrong report": bool(self.named(False)),
             "force": case.aim == SETTLES and not low <= self.settled <= high,
-            "raised": case.aim == SETTLES and any(kind == "slip" for _, kind in self.events),
-            "too strong": case.aim == BOUNDED and self.above > _EXCESS_TIME_MAX,
-            "not named": case.aim == BOUNDED and named > _REPORT_TIME_MAX,
+            "increased": case.aim == SETTLES and any(kind == "slip" for _, kind in self.events),
+            "too much force": case.aim == BOUNDED and self.above > _EXCESS_TIME_MAX,
+            "not reported": case.aim == BOUNDED and named > _REPORT_TIME_MAX,
         }
         return [why for why, true in wrong.items() if true]
 
@@ -180,7 +180,7 @@ def measure(
         if rows:
             note = f"  not met: {missed} of {len(rows)}"
             reports.append(
-                Report(f"force over asked: {aim}", rows, notes=(note,), failed=missed > 0)
+                Report(f"force over commanded force: {aim}", rows, notes=(note,), failed=missed > 0)
             )
     return reports
 
@@ -227,16 +227,16 @@ def summary(case: FaultCase, found: Sequence[GripTrial]) -> Row:
         "met": sum(not each for each in missed),
         "trials": len(found),
         "settled": median(settled) if settled else None,
-        "least": min(settled, default=None),
-        "most": max(settled, default=None),
+        "lowest": min(settled, default=None),
+        "highest": max(settled, default=None),
         "peak": max(each.peak for each in found),
         "above ms": 1e3 * max(each.above for each in found),
         "slid mm": 1e3 * median(each.slid for each in found),
         "lost": sum(each.slid > _SLIDE_MAX for each in found),
-        "named": _firsts([each.named(True) for each in found]),
-        "named wrongly": _firsts([each.named(False) for each in found]),
+        "reported": _firsts([each.named(True) for each in found]),
+        "wrong reports": _firsts([each.named(False) for each in found]),
         "missed": _counts(why for each in missed for why in each),
-        "in the end": _counts(each.end for each in found),
+        "final state": _counts(each.end for each in found),
         "events": _firsts([each.events for each in found]),
     }
 

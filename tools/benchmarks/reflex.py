@@ -96,9 +96,9 @@ def _table(
         found = [Overload(*each) for each in tried if each is not None]
         told = row(f"{standing:g} N, then a {kind} of {overload:g} N", found)
         rows.append(told | {"trials": trials, "no grip": trials - len(found)})
-    said = [each["said ms"] for each in rows if each["held %"] < 100.0]
+    said = [each["reported ms"] for each in rows if each["held %"] < 100.0]
     slowest = max(said, default=0.0)
-    note = f"  said that the object has gone: in {slowest:.0f} ms, aim ≤ {_REPORT_AIM:g}"
+    note = f"  loss reported within {slowest:.0f} ms, aim ≤ {_REPORT_AIM:g}"
     return Report(f"{name}, answer", rows, notes=(note,) if said else ())
 
 
@@ -112,7 +112,7 @@ def row(name: str, found: Sequence[Overload]) -> Row:
         "unanswered": sum(each.answer == math.inf for each in found),
         "held %": 100.0 * len(held) / len(found) if found else math.nan,
         "slid mm": 1e3 * max((each.slid for each in held), default=math.nan),
-        "said ms": 1e3 * max((each.said for each in found if each.lost), default=math.nan),
+        "reported ms": 1e3 * max((each.said for each in found if each.lost), default=math.nan),
     }
 
 
@@ -130,7 +130,7 @@ def overloaded(
         loop.advance(0.1)
         grip.command("grasp", force=_FORCE)
         if not grip.until("holding", _GRIP_TIMEOUT):
-            raise RigError(f"the hand does not hold: {state.mode} {state.fault}")
+            raise RigError(f"the hand did not grip the object: {state.mode} {state.fault}")
         loop.advance(1.0 + chance.uniform(0.0, 0.02))
         for k in range(_LOAD_STEP_COUNT):
             grip.plant.load(push=standing * (k + 1) / _LOAD_STEP_COUNT)

@@ -30,9 +30,9 @@ _ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01  # 1, 1, m
 _REPORT_TIME_MAX = 2.0  # s, time limit for reporting a force error above `_ERROR_MAX`
 # Without a load: ratio to the requested force, and maximum time above it [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
-_EVENT_PREFIX = "witness."
-_GAIN_ERROR_MIN = math.log(1.3)  # log of the gain error above which a sensor is faulty
-_LOAD_FRACTION = 0.8  # fraction of the friction limit, maximum load of the ensemble
+_EVENT_PREFIX = "consistency."
+_GAIN_ERROR_MIN = math.log(1.3)  # log of the gain error above which naming a sensor is correct
+_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which no load should be lost
 
 # Full scale of 127.5 kPa, as on real tactile boards. The simulated sensor's default is 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
@@ -263,8 +263,10 @@ def measure(
     reports = []
     if rows:
         table = [_row(case, [next(outcomes) for _ in seeds]) for case in rows]
-        failed = any(row["well"] < trials for row in table)
-        reports.append(Report("true force over asked, one thing other", table, failed=failed))
+        failed = any(row["passed"] < trials for row in table)
+        reports.append(
+            Report("true force over commanded force, one difference", table, failed=failed)
+        )
     if hands:
         reports.append(_ensemble(hands, [next(outcomes) for _ in hands]))
     return reports
@@ -276,16 +278,16 @@ def _row(case: HandCase, found: list[Outcome]) -> dict[str, Any]:
     print(f"{case.name}: {well} of {len(found)}", file=sys.stderr, flush=True)
     return {
         "name": f"{case.force:g} N: {case.name}",
-        "well": well,
+        "passed": well,
         "trials": len(found),
-        "least": settled[0] if settled else None,
-        "most": settled[-1] if settled else None,
+        "lowest": settled[0] if settled else None,
+        "highest": settled[-1] if settled else None,
         "peak": max(each.peak for each in found),
         "above s": max(each.above for each in found),
-        "raised": sum(each.raised for each in found),
-        "named": sum(each.named < math.inf for each in found),
-        "accused": sum(bool(each.accused) for each in found),
-        "let go": sum(math.isnan(each.settled) for each in found),
+        "increased": sum(each.raised for each in found),
+        "reported": sum(each.named < math.inf for each in found),
+        "wrong reports": sum(bool(each.accused) for each in found),
+        "released": sum(math.isnan(each.settled) for each in found),
     }
 
 
@@ -300,11 +302,13 @@ def _ensemble(hands: list[HandCase], found: list[Outcome]) -> Report:
     rows = [
         share("true force within 20 %", "≥ 90 %", sum(each <= _ERROR_MAX for each in off)),
         share("within 30 %", "≥ 98 %", sum(each <= _ERROR_FAR for each in off)),
-        share("above 1.4 for 0.1 s, unloaded", "0", sum(e.above > _EXCESS_TIME_MAX for e in found)),
+        share(
+            "above 1.4 for 0.1 s without load", "0", sum(e.above > _EXCESS_TIME_MAX for e in found)
+        ),
         share("objects lost", "≤ 1 %", sum(e.lost for e in loaded), max(len(loaded), 1)),
-        share("healthy channel accused", "≤ 2 %", sum(bool(e.accused) for e in found)),
-        share("did not come to hold", "", sum(not each.held for each in found)),
-        share("let go", "", sum(math.isnan(each.settled) for each in found)),
-        share("raised, unloaded", "", sum(each.raised for each in found)),
+        share("healthy channel reported", "≤ 2 %", sum(bool(e.accused) for e in found)),
+        share("never held", "", sum(not each.held for each in found)),
+        share("released", "", sum(math.isnan(each.settled) for each in found)),
+        share("force increased without load", "", sum(each.raised for each in found)),
     ]
-    return Report(f"{count} hands drawn at random", rows)
+    return Report(f"{count} random hands", rows)

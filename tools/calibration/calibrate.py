@@ -191,7 +191,7 @@ def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
         try:
             draw(arguments.step, panels, file.with_name(f"{file.stem}.{arguments.step}.png"))
         except MissingExtra as error:
-            print(f"calibrate: no picture is drawn: {error}", file=sys.stderr)
+            print(f"calibrate: no picture was drawn: {error}", file=sys.stderr)
     return line
 
 
@@ -223,8 +223,8 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     contact = getattr(state, arguments.finger)
     if not contact.sensor_gain_std < _LEARNT * settings.tactile.gain_error * contact.sensor_gain:
         raise CalibrationError(
-            f"scales: found a gain known to {contact.sensor_gain_std:.2f}, expected better than "
-            f"{_LEARNT * settings.tactile.gain_error:.2f}: grasp something firmly first"
+            f"scales: found a gain uncertainty of {contact.sensor_gain_std:.2f}, expected less "
+            f"than {_LEARNT * settings.tactile.gain_error:.2f}: grasp an object firmly first"
         )
     step = ScalesStep(
         date=now(),
@@ -237,7 +237,7 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
         f"{name} {mean:.3f} ± {mean * error:.3f}"
         for name, (mean, error) in step.model_dump(exclude={"date"}).items()
     ]
-    return f"{', '.join(told)} of what is set"
+    return f"{', '.join(told)}, relative to the settings"
 
 
 def _last_state(arguments: argparse.Namespace) -> HandState:
@@ -249,7 +249,7 @@ def _last_state(arguments: argparse.Namespace) -> HandState:
     path = arguments.recording[-1]
     last = deque(Recording(path).messages({STATE}), maxlen=1)
     if not last:
-        raise CalibrationError(f"{path}: no {STATE.decode()} in it")
+        raise CalibrationError(f"{path}: contains no {STATE.decode()}")
     return read(HandState, last[0][1])
 
 

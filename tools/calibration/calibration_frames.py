@@ -71,7 +71,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
             if recording.counts.shape[1:] != (sensor.rows, sensor.cols):
                 found = " × ".join(map(str, recording.counts.shape[1:]))
                 raise RecordingError(
-                    f"{path}: frames of {found} cells, {sensor.rows} × {sensor.cols} expected"
+                    f"{path}: frames of {found} cells, expected {sensor.rows} × {sensor.cols}"
                 )
             if wrong := pitch_difference(recording, sensor.pitch):
                 raise RecordingError(f"{path}: {wrong}")
@@ -157,7 +157,7 @@ def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | s
     if arguments.move:
         _move(arguments.move, load)
     elif not sys.stdin.readline():
-        raise CalibrationError("ended before all loads were on")
+        raise CalibrationError("ended before all loads were applied")
 
 
 def _move(command: str, load: Mapping[str, float | str]) -> None:
@@ -171,7 +171,7 @@ def _move(command: str, load: Mapping[str, float | str]) -> None:
     except (LookupError, ValueError, OSError, subprocess.TimeoutExpired) as error:
         raise CalibrationError(f"--move: {command}: {error}") from None
     if done != 0:
-        raise CalibrationError(f"--move: {command}: it ended with {done}")
+        raise CalibrationError(f"--move: {command}: ended with status {done}")
 
 
 @contextlib.contextmanager

@@ -107,7 +107,7 @@ def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArr
         f"{name} {math.degrees(start):.0f}° to {math.degrees(start + way):.0f}°"
         for name, (start, way) in ways.items()
     )
-    bring(arguments, f"friction: nothing may be between or beside the fingers; sweeps {told}", {})
+    bring(arguments, f"friction: keep the space around the fingers free; sweeps {told}", {})
     with LiveHand(arguments) as hand:
         hand.command("move", **{name: start for name, (start, _) in ways.items()})
         hand.until(
@@ -141,7 +141,7 @@ def _way(settings: Settings, name: str) -> tuple[float, float]:
     if abs(way) < 0.5 * _WIDEST:
         raise CalibrationError(
             f"friction: {name}: found {math.degrees(abs(way)):.0f}° from hand.open_angle to the "
-            f"ends of its range, expected {math.degrees(0.5 * _WIDEST):.0f}° at least"
+            f"ends of its range, expected at least {math.degrees(0.5 * _WIDEST):.0f}°"
         )
     return start, way
 
@@ -157,7 +157,7 @@ def _stroke(
     for state in hand.states():
         if max(state.left.force, state.right.force) > touch:
             raise CalibrationError(
-                f"friction: {name}: a tip touches something: clear the space round the fingers"
+                f"friction: {name}: a tip is in contact: clear the space around the fingers"
             )
         begin = begin or state.mono_ns
         passed = (state.mono_ns - begin) * 1e-9

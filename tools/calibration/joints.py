@@ -53,7 +53,8 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
     servos = settings.servos
     if servos.backend != "dynamixel":
         raise CalibrationError(
-            f"servos.backend: found {servos.backend!r}, expected 'dynamixel': joints are real ones"
+            f"servos.backend: found {servos.backend!r}, expected 'dynamixel': this step needs "
+            "real servos"
         )
     new: dict[str, dict[str, list[Any]]] = {
         "servos": {name: list(getattr(servos, name)) for name in ("ids", "direction", "zero")},
@@ -106,9 +107,9 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
             encoder = -encoder
         if not 0 <= encoder < reg.COUNTS_PER_TURN:
             raise ServoError(
-                f"servo {servo}: at {encoder} counts it is past the encoder's wrap, 0 to "
-                f"{reg.COUNTS_PER_TURN - 1}, and would be a turn off after a power-up: switch its "
-                "power off and on; if that doesn't help, mount its horn half a turn round"
+                f"servo {servo}: its position of {encoder} counts is outside one turn, 0 to "
+                f"{reg.COUNTS_PER_TURN - 1}, and would be off by a turn after a power-up: switch "
+                "its power off and on; if that does not help, mount its horn half a turn further"
             )
     return counts
 
@@ -120,7 +121,7 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
     if moved[servo] < _LEAST:
         raise CalibrationError(
             f"{name} finger: found {math.degrees(moved[servo]):.1f}° between closed and open, "
-            f"expected {math.degrees(_LEAST):.0f}° at least"
+            f"expected at least {math.degrees(_LEAST):.0f}°"
         )
     for other in others:
         if moved[other] > _ALONE * moved[servo]:
@@ -141,7 +142,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
     """
     if len(arguments.recording) != 1:
         raise CalibrationError(
-            "heat: expected --recording with one hold, made by softfinger record"
+            "heat: expected --recording with one grip, made by softfinger record"
         )
     found = read_recording(arguments.recording[0])
     law, finger = HeatLaw(), arguments.finger
@@ -157,7 +158,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
     write_keys(arguments, {"servos": new})
     return (
         f"{new['heat_rise']:.1f} ± {rise * fit.rise_std:.1f} K/A² in {new['heat_time']:.0f} ± "
-        f"{time * fit.time_std:.0f} s, {fit.residual:.1f} °C left"
+        f"{time * fit.time_std:.0f} s, residual {fit.residual:.1f} °C"
     )
 
 
@@ -176,7 +177,7 @@ def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any
     with contextlib.suppress(tomllib.TOMLDecodeError):
         found = tomllib.loads(text)
     if found != wanted:
-        raise SettingsError(f"{source}: put this in yourself: {', '.join(changes)}")
+        raise SettingsError(f"{source}: add these settings yourself: {', '.join(changes)}")
     write_whole(arguments.file, text.encode())
     return changes
 

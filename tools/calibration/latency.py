@@ -71,19 +71,20 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
         raise CalibrationError(f"latency: {error}") from None
     if fit.std > _STD_MAX:
         raise CalibrationError(
-            f"latency: found a standard deviation of {fit.std * 1e3:.1f} ms, expected "
-            f"{_STD_MAX * 1e3:g} ms at most: grasp with more force, and change it several times"
+            f"latency: found a standard deviation of {fit.std * 1e3:.1f} ms, expected at most "
+            f"{_STD_MAX * 1e3:g} ms: grasp with more force, and change it several times"
         )
     if not _SCALE[0] < fit.scale < _SCALE[1] or fit.residual > _MISFIT_MAX:
         raise CalibrationError(
-            f"latency: found d by the frames at {fit.scale:.2f} of the joints' closing, "
-            f"{fit.residual * 1e3:.2f} mm off, expected {_SCALE[0]:g} to {_SCALE[1]:g} and "
-            f"{_MISFIT_MAX * 1e3:g} mm: grasp a flat object that neither slides nor tilts"
+            f"latency: found d by the frames at {fit.scale:.2f} of d by the joints, with "
+            f"{fit.residual * 1e3:.2f} mm rms between them, expected {_SCALE[0]:g} to "
+            f"{_SCALE[1]:g} and at most {_MISFIT_MAX * 1e3:g} mm: grasp a flat object that "
+            "neither slides nor tilts"
         )
     latency = round(max(set_latency + fit.delay, 0.0), 4)
     told = (
-        f"{latency * 1e3:.1f} ± {fit.std * 1e3:.1f} ms (the daemon had {set_latency * 1e3:g} ms), "
-        f"by {fit.ramps} ramps; d by the frames {fit.scale:.2f} of the joints' closing, "
+        f"{latency * 1e3:.1f} ± {fit.std * 1e3:.1f} ms (the daemon used {set_latency * 1e3:g} "
+        f"ms) from {fit.ramps} ramps; d by the frames is {fit.scale:.2f} of d by the joints, "
         f"{fit.residual * 1e3:.2f} mm rms"
     )
     return "\n  ".join([told, *write_keys(arguments, {"tactile": {"latency": latency}})])
@@ -93,7 +94,9 @@ def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
     """Grasp with several forces and open again; return the hand with its stored stream."""
     first = arguments.force[0] if arguments.force else settings.control.force_default
     forces = [min(step * first, settings.safety.force_max) for step in _STEPS]
-    bring(arguments, f"latency: put an object between the fingers, for {first:g} N", {})
+    bring(
+        arguments, f"latency: put an object between the fingers; it is grasped with {first:g} N", {}
+    )
     with LiveHand(arguments) as hand:
         for force in forces:
             hand.command("grasp", force=force)

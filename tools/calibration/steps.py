@@ -78,9 +78,7 @@ def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
     calibration = load_calibration(arguments.file)
     wrong = difference(calibration.sensor, sensor)
     if wrong:
-        raise CalibrationFileError(
-            f"{arguments.file}: this is the calibration of another sensor: {wrong}"
-        )
+        raise CalibrationFileError(f"{arguments.file}: calibration of another sensor: {wrong}")
     return calibration
 
 
@@ -156,14 +154,14 @@ def done(step: Step) -> Done:
         raise CalibrationError("no frame with d above 0 in this run")
     for name, values in truths.items():
         if not np.isfinite(values).all():
-            raise CalibrationError(f"{name}: a value that is not finite")
+            raise CalibrationError(f"{name}: found a value that is not finite")
     radius = step.settings.tip.radius
     if "d" in truths and (deepest := float(truths["d"].max())) > radius:
         raise CalibrationError(
-            f"d: {deepest * 1e3:g} mm is more than the tip's radius, {radius * 1e3:g} mm"
+            f"d: found {deepest * 1e3:g} mm, expected at most the tip's radius, {radius * 1e3:g} mm"
         )
     if "theta" in truths and (most := float(np.abs(truths["theta"]).max())) >= 0.5 * math.pi:
-        raise CalibrationError(f"theta: {math.degrees(most):g}° is no tilt of a press")
+        raise CalibrationError(f"theta: found {math.degrees(most):g}°, expected less than 90°")
     return _STEPS[step.arguments.step](step)
 
 
@@ -208,8 +206,8 @@ def _curve(step: Step) -> Done:
     if force is None:
         d = truths.get("d")
         if d is None:
-            raise CalibrationError("curve: expected --force or --d, or a run that has them")
-        # Integrate the force over the whole footprint with the profile's material.
+            raise CalibrationError("curve: expected --force or --d, or a run that contains them")
+        # Compute the force from the profile's material over the whole footprint.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
         pressures = [
             step.plain_grid.pressure(tip, material, float(x), float(theta))
@@ -218,7 +216,9 @@ def _curve(step: Step) -> Done:
         force = np.array([each.sum() * step.cell_area for each in pressures])
     for k, frames in enumerate(step.loads.frames):
         if (frames >= sensor.full_count).any():
-            raise CalibrationError(f"curve: load {k + 1} saturates a cell, which hides its force")
+            raise CalibrationError(
+                f"curve: load {k + 1} saturates a cell, so its force can't be used"
+            )
     gains = step.calibration.equilibrate
     full = float(sensor.full_count) * max(map(max, gains.gain) if gains else [1.0])
     found = fit_curve(step.arguments.kind, step.readings, force, step.cell_area, full)
@@ -255,7 +255,7 @@ def _centre(step: Step) -> Done:
 def _modulus(step: Step) -> Done:
     d, theta, sensor = step.loads.truths.get("d"), step.theta, step.calibration.sensor
     if d is None:
-        raise CalibrationError("modulus: expected --d, or a run that has d")
+        raise CalibrationError("modulus: expected --d, or a run that contains d")
     pressed = zip(step.pressures, step.readings, strict=True)
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
@@ -282,7 +282,7 @@ def _modulus(step: Step) -> Done:
 def _law(step: Step) -> Done:
     d, theta, settings = step.loads.truths.get("d"), step.theta, step.settings
     if d is None:
-        raise CalibrationError("law: expected --d, or a run that has d")
+        raise CalibrationError("law: expected --d, or a run that contains d")
     if len(d) < 3 or np.ptp(d) <= 0.0:
         raise CalibrationError("law: expected at least three presses of different d")
     sensor = step.calibration.sensor
@@ -315,16 +315,19 @@ def _law(step: Step) -> Done:
     except CurvesError as error:
         if best.valid == 0.0:
             raise CalibrationError(
-                f"law: none explains these presses; the best: {lines[0]}; measured: {error}"
+                f"law: no model fits these presses; the best: {lines[0]}; measured: {error}"
             ) from None
         lines.append(f"measured: no curves: {error}")
     if best.trend is not None:
         lines.insert(1, _over_d(best.trend))
     softer = first_cycle(d, theta, signed.sum(axis=(1, 2)))
     if softer is not None:
-        lines.insert(1, f"first presses read {softer:+.1%} against the same ones again")
+        lines.insert(1, f"first presses read {softer:+.1%} compared with later equal presses")
         if softer > _SOFTENS:
-            lines[1] += ": the rubber SOFTENS; press it some times to the full depth, then again"
+            lines[1] += (
+                ": the rubber softens; press it several times to the full depth, then "
+                "calibrate again"
+            )
     told = (f"tip.{name} = {json.dumps(value)}" for name, value in wants.items())
     lines.append(f"for the profile: {', '.join(told)}")
     return step.result(**steps, wants=wants), "\n  ".join(lines), ()
@@ -345,7 +348,7 @@ def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArra
     d, theta, frames = step.loads.truths["d"], step.theta, step.loads.frames
     sensor, converter, tare = step.calibration.sensor, step.converter, step.calibration.tare
     if any((each >= sensor.full_count).any() for each in frames):
-        raise CurvesError("a press saturates a cell, which hides its force")
+        raise CurvesError("a press saturates a cell, so its force can't be used")
     seen = [np.stack([converter(frame).copy() for frame in each]) for each in frames]
     pressures = np.stack([converter.pressure(each) for each in step.over])
     rest = converter.pressure((tare.excess if tare else 0.0) * converter.gain)
@@ -371,8 +374,8 @@ def _measured_told(law: TipCurves, left: FloatArray) -> str:
     d, theta, force = left.tolist()
     return (
         f"measured: curves of {law.presses} presses to {law.deepest * 1e3:g} mm and "
-        f"{math.degrees(law.tilt):g}°; errors left: d {d * 1e3:.3f} mm, "
-        f"θ {math.degrees(theta):.2f}°, F {force:.1%}"
+        f"{math.degrees(law.tilt):g}°; remaining errors: d {d * 1e3:.3f} mm, θ "
+        f"{math.degrees(theta):.2f}°, F {force:.1%}"
     )
 
 
@@ -384,7 +387,7 @@ def _over_d(trend: Trend) -> str:
     told = f"E alone at {depths} mm: {values} MPa"
     if not trend.drifts:
         return told
-    return f"{told}: DRIFTS by {trend.drift:+.0%} ± {trend.std:.1%}, so {trend.cause}"
+    return f"{told}: drifts by {trend.drift:+.0%} ± {trend.std:.1%}, so {trend.cause}"
 
 
 def _name(fit: TipFit) -> str:
@@ -396,13 +399,14 @@ def _name(fit: TipFit) -> str:
 def _told(fit: TipFit) -> str:
     words = (
         f"{_name(fit)}: E = {fit.modulus / 1e6:.4f} MPa, zero of d at {fit.offset * 1e3:.3f} mm, "
-        f"χ² {fit.chi2:.2f} a cell; "
+        f"χ² {fit.chi2:.2f} per cell; "
     )
     if fit.valid == 0.0:
         return words + "no frame is a valid contact"
     return words + (
-        f"errors left: d {fit.d_error * 1e3:.3f} mm, θ {math.degrees(fit.theta_error):.2f}°, "
-        f"F {fit.force_error:.1%}, {fit.valid:.0%} of the frames valid"
+        f"remaining errors: d {fit.d_error * 1e3:.3f} mm, θ "
+        f"{math.degrees(fit.theta_error):.2f}°, F {fit.force_error:.1%}, {fit.valid:.0%} of the "
+        "frames valid"
     )
 
 
@@ -413,8 +417,8 @@ def _relaxation(step: Step) -> Done:
     found = fit_relaxation(t, force, step.settings.tip.relaxation_times)
     strengths = ", ".join(f"{each:.3f}" for each in found.strengths)
     line = (
-        f"force within {found.residual:.2%} rms, {found.elastic:.2%} if the tip were elastic; for "
-        f"the profile: tip.relaxation = [{strengths}]"
+        f"force within {found.residual:.2%} rms, {found.elastic:.2%} for an elastic tip; for the "
+        f"profile: tip.relaxation = [{strengths}]"
     )
     shown = Points("hold", "t [s]", "F [N]", t, force, found.model)
     left = Points("residuals", "t [s]", "measured − fit [N]", t, force - found.model)

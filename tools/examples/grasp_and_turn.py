@@ -65,7 +65,7 @@ columns = to_columns(recorded)
 t = (columns["mono_ns"] - columns["mono_ns"][0]) * 1e-9
 touching = {name: columns[f"{name}.contact"] for name in ("left", "right")}
 held = columns["mode"] == "holding"
-print(f"force while holding: {columns['left.force'][held].mean():.2f} N, asked for {FORCE:g} N")
+print(f"force while holding: {columns['left.force'][held].mean():.2f} N, commanded {FORCE:g} N")
 
 # %% Compute the energy landscape of the built-in hand's fingertip, and its minimum over θ
 tip, material = Fingertip(radius=0.020), Material.table_i()
@@ -93,7 +93,7 @@ for name, (colour, line) in LOOKS.items():
     panels["force"].plot(t, force, line, color=colour, label=name)
     path = columns[f"{name}.theta"][touched], columns[f"{name}.d"][touched]
     panels["map"].plot(path[0] * DEGREES, path[1] * 1e3, line, color=colour, label=name)
-panels["force"].axhline(FORCE, color="k", linestyle=":", linewidth=1.0, label="asked for")
+panels["force"].axhline(FORCE, color="k", linestyle=":", linewidth=1.0, label="commanded")
 known = np.where(columns["object.valid"], columns["object.angle"], np.nan)
 panels["angle"].plot(t, known * DEGREES, color="#009E73")
 for angle in ANGLES:

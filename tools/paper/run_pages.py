@@ -320,7 +320,7 @@ def _over_upright(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
         theta, model = rolling[f"theta at {depth} mm"], rolling[f"U at {depth} mm"]
         level = float(np.interp(0.0, theta, model))
         found = rolling[f"U estimated at {depth} mm"]
-        label = f"{depth} mm: least at {angle:.2f}° ± {error:.2f}°".replace("-", "−")
+        label = f"{depth} mm: minimum at {angle:.2f}° ± {error:.2f}°".replace("-", "−")
         axes.plot(theta, found / level, **style | {"linewidth": 0.9}, label=label)
         axes.plot(theta, model / level, color=GREY, linewidth=0.7)
 
@@ -346,10 +346,10 @@ PAGES = {
         ),
         rows=2,
         notes=(
-            "The plant presses the object on the tip at 2 mm/s; 44 × 44 cells on 58 mm, 25 frames "
-            "a second, noise of 0.5 % of E in each cell. Errors are shown from 1 mm on, each point "
-            "from one frame alone. Model and sensor are of one kind here: the paper's constant "
-            "offset, which comes from the material, does not appear.",
+            "The plant presses the object on the tip at 2 mm/s; 44 × 44 cells on 58 mm, 25 "
+            "frames per second, noise of 0.5 % of E in each cell. Errors are shown from 1 mm on, "
+            "each point from one frame. Plant and estimator use the same model, so the paper's "
+            "constant offset, which comes from the material, does not appear.",
         ),
     ),
     "fig10_run": FigurePage(
@@ -368,10 +368,11 @@ PAGES = {
         ),
         rows=2,
         notes=(
-            "Angles with the paper's sign. Rotation: the servo turns the finger about a root 20.1 "
-            "mm from the tip's centre, so that d goes from 0 to 4 mm; estimates are the daemon's, "
-            "carried on by the joint between frames. Rolling: d is held, estimates are of one "
-            "frame. Grey: model. Least: of a parabola through the estimates, ± standard error.",
+            "Angles have the paper's sign. Rotation: the servo turns the finger about a root "
+            "20.1 mm from the tip's centre, so d goes from 0 to 4 mm; between frames the joint "
+            "carries the daemon's estimates on. Rolling: d is constant, and each estimate uses "
+            "one frame. Grey: model. Minimum: of a parabola through the estimates, ± standard "
+            "error.",
         ),
     ),
 }  # fmt: skip

@@ -144,7 +144,7 @@ def _curves(name: str, axes: Axes, model: Sheet, run: Sheet, *_: Sheet) -> None:
     upright = float(np.interp(0.0, theta, model[f"{name}, 0%"]))
     for share, style in zip(SHARES, ordered(len(SHARES)), strict=True):
         ratio = model[f"{name}, {share:.0%}"] / upright
-        axes.plot(theta, ratio, **style, label=f"{share:.0%} not rolled off")
+        axes.plot(theta, ratio, **style, label=f"{share:.0%} shear")
         where = angle_of_minimum(np.radians(theta), ratio)
         axes.plot(where, np.interp(where, theta, ratio), "v", ms=6, color=style["color"])
     axes.plot(run["theta"][::13], run[name][::13] / upright, **DOT, label=f"plant, {SHARE:.0%}")
@@ -162,7 +162,7 @@ def _minima(axes: Axes, _model: Sheet, _run: Sheet, minima: Sheet, felt: Sheet) 
 
 PAGES = {
     "fig10_shear": FigurePage(
-        "Sec. IV-B: the minimum slightly before 0°, by the tip's own tangential term",
+        "Sec. IV-B: the minimum slightly before 0°, from the tip's tangential force",
         (9.6, 4.0),
         sheared_rolling,
         (
@@ -170,13 +170,14 @@ PAGES = {
                   f"(a) force on the base, d = {DEPTH} mm", None, (0.99, 1.07), "upper center"),
             Panel(partial(_curves, _ENERGY), RELATIVE, "U(θ)/U(0) without shear",
                   f"(b) energy, d = {DEPTH} mm", None, (0.98, 1.14), "upper center"),
-            Panel(_minima, "share that is not rolled off [%]", "angle of the least U [deg]",
-                  "(c) where U is least", None, None, "lower left"),
+            Panel(_minima, "share of shear in the motion [%]", "angle of the minimum of U [deg]",
+                  "(c) angle of the minimum of U", None, None, "lower left"),
         ),
         notes=(
-            "The object rolls from −11.5° to 9.2° at a fixed d. What it does not roll off shears "
-            "the tip, by s (a − d)(θ + 11.5°). The paper puts the shift down to lateral springs; "
-            "these springs, each as stiff sideways as along its axis, have it.",
+            "The object rolls from −11.5° to 9.2° at a fixed d. The share s of the motion that "
+            "is not rolling shears the tip by s (a − d)(θ + 11.5°). The paper attributes the "
+            "shift to lateral springs; these springs, as stiff across their axes as along them, "
+            "reproduce it.",
         ),
     ),
 }  # fmt: skip

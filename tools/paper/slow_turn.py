@@ -126,7 +126,7 @@ def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
         steps = 1e-7 * np.eye(x.size)
         slopes = [(residual(x + h) - residual(x - h)) / 2e-7 for h in steps]
         x = x - np.linalg.solve(np.array(slopes).T, value)
-    raise RuntimeError(f"no balance near {start}: {residual(x)} left")
+    raise RuntimeError(f"found no equilibrium near {start}: residual {residual(x)}")
 
 
 @cache
@@ -299,8 +299,9 @@ PAGES = {
         ),
         rows=2,
         notes=(
-            "The paper's springs, stuck to an object of 40 mm, 10 N; no other friction. V: energy "
-            "of both tips less the work of equal joint torques; lines end where a tip would slip.",
+            "The paper's springs, stuck to an object of 40 mm, 10 N; no other friction. V: "
+            "energy of both tips minus the work of equal joint torques; lines end where a tip "
+            "would slip.",
         ),
     )
 }  # fmt: skip

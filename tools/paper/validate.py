@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print all comparisons as a table."""
     table = plain_table()
-    for head in ("", "quantity", "published", "here", "source, and what stands between"):
+    for head in ("", "quantity", "published", "here", "source and remarks"):
         table.add_column(head, overflow="fold")
     found = list(comparisons())
     for each in found:

@@ -160,8 +160,8 @@ class RecorderProcess:
         why = self._said.splitlines()[-1:] or ["it ended"]
         if self._process.returncode < 0:
             name = signal.Signals(-self._process.returncode).name
-            why = [f"ended by {name}; `softfinger record --recover {self._path}` closes its file"]
-        self._on_end(f"the recorder has ended, nothing is recorded any more: {why[0]}")
+            why = [f"ended by {name}; `softfinger record --recover {self._path}` repairs its file"]
+        self._on_end(f"the recorder has ended, and nothing more is recorded: {why[0]}")
 
     def close(self) -> str:
         """End the recording and return the recorder's summary."""

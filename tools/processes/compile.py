@@ -87,16 +87,20 @@ def build_kernels(
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
-        text = f"{folder.path}: {count} damaged files are compiled anew"
+        text = f"{folder.path}: compiling {count} damaged files again"
         tell("warning", "compile", text)
     missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
     if not missing:
         return Built(0, False)
     if folder is None:
-        tell("warning", "compile", "kernels are compiled in this process, for half a minute")
+        tell(
+            "warning", "compile", "kernels are compiled in this process, which takes half a minute"
+        )
         return Built(0, False)
     if why_plain:
-        tell("info", "compile", f"compiled by Numba alone, in twice the time: {why_plain}")
+        tell(
+            "info", "compile", f"compiling with Numba alone, which takes twice as long: {why_plain}"
+        )
     names = ", ".join(part.name for part in missing)
     tell("info", "compile", f"compiling kernels, on the first start only: {names}")
     started = time.monotonic()

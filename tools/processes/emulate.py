@@ -133,7 +133,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Emulate until SIGINT, SIGTERM or SIGHUP. Return 1, with a message, if the set-up fails."""
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
-        raise SettingsError(f"{runtime_fault()}; or name another folder by --dir")
+        raise SettingsError(f"{runtime_fault()}; or name another folder with --dir")
     if arguments.send is not None:
         return _send(arguments.dir, arguments.send)
     if arguments.model is not None:

@@ -143,7 +143,7 @@ def _serve(
         for line in recording.close().splitlines():
             log.plain(line)
         if recording.failed:
-            log.plain(f"softfinger: {arguments.record} does not hold all of this run", "error")
+            log.plain(f"softfinger: {arguments.record} is incomplete", "error")
     state, statistics = daemon.loop.state, daemon.loop.statistics
     if statistics.ticks:
         counts = {"ticks": statistics.ticks, "overruns": state.timing.overruns}

@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     for each in files:
         print(each)
     if not files:
-        print(f"export: {path}: no messages in it", file=sys.stderr)
+        print(f"export: {path}: contains no messages", file=sys.stderr)
     return 0 if files else 1
 
 
@@ -175,7 +175,7 @@ def export(
             if topic not in tables:
                 name = _file_name(topic)
                 if any(each.stem == name for each in files):
-                    raise RecordingError(f"{recording.path}: two topics would be {name}")
+                    raise RecordingError(f"{recording.path}: two topics would be written to {name}")
                 files.append(folder / f"{name}{kind.suffix}")
                 tables[topic] = kind(files[-1], _columns(topic, row))
                 opened.callback(tables[topic].close)

@@ -65,7 +65,7 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     recording = Recording(Path(path))
     states = [read(HandState, message) for _, message in recording.messages({STATE})]
     if not states:
-        raise RecordingError(f"{path}: no {STATE.decode()} in it")
+        raise RecordingError(f"{path}: contains no {STATE.decode()}")
     columns = to_columns(states)
     return {"t": (columns["mono_ns"] - recording.zero) * 1e-9, **columns}
 
@@ -213,7 +213,7 @@ class Recording:
                 self._damaged(error)
                 continue
             except (TypeError, AttributeError):
-                self._damaged(ValueError(f"a message that is none of {topic.decode()}"))
+                self._damaged(ValueError(f"an invalid message of {topic.decode()}"))
                 continue
             yield topic, message
 
@@ -278,7 +278,7 @@ class Recording:
     def _count(self, unpacked: int) -> None:
         self._left -= unpacked
         if self._left < 0:
-            raise ValueError("it unpacks to more than recordings of its size do")
+            raise ValueError("it unpacks to more data than its size allows")
 
     def _learn(self, content: bytes) -> None:
         from mcap.data_stream import ReadDataStream
@@ -308,7 +308,7 @@ class Recording:
         self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
         if first and self._say is not None:
             what = "cut short" if self.truncated else "damaged"
-            self._say(f"{self.path}: {what} ({self.damage}); what is sound in it is read")
+            self._say(f"{self.path}: {what} ({self.damage}); the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
         """Check the file's end; return the header's profile, or PROFILE if it is unreadable."""
@@ -393,7 +393,7 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
             raise EOFError
         kind, length = _RECORD.unpack(head)
         if kind == 0:
-            raise ValueError("a record of no kind")
+            raise ValueError("a record of unknown type")
         if kind not in wanted:
             file.seek(length, os.SEEK_CUR)
             continue
@@ -424,7 +424,7 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
     else:
         if not maps:
             return message
-    raise ValueError("a message with more fields than any topic's")
+    raise ValueError("a message with more fields than any topic has")
 
 
 def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
@@ -435,7 +435,7 @@ def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
         import zstandard
 
         if zstandard.frame_content_size(data) not in (-1, size):
-            raise ValueError("a chunk that is larger than it claims")
+            raise ValueError("a chunk that is larger than its header states")
         unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
     elif method == "lz4":
         import lz4.frame
@@ -446,5 +446,5 @@ def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
     else:
         raise ValueError(f"a chunk compressed by {method[:20]!r}, expected zstd, lz4 or none")
     if len(unpacked) != size or crc not in (0, zlib.crc32(unpacked)):
-        raise ValueError("a chunk that is not what it claims")
+        raise ValueError("a chunk that does not match its header")
     return unpacked

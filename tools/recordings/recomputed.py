@@ -70,7 +70,7 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
     """
     message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
-        raise RecordingError(f"{recording.path}: no hand/settings in it")
+        raise RecordingError(f"{recording.path}: contains no hand/settings")
     text, *calibrations = (message.get(name) for name in _SETTINGS)
     if not (isinstance(text, str) and all(isinstance(each, str) for each in calibrations)):
         raise RecordingError(f"{recording.path}: its hand/settings lacks {' or '.join(_SETTINGS)}")
@@ -80,7 +80,7 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
         first = error.errors(include_url=False, include_input=False)[0]
         where = "".join(f"{part}: " for part in first["loc"])
         raise RecordingError(
-            f"{recording.path}: its settings are not of this version: {where}{first['msg']}"
+            f"{recording.path}: its settings belong to another version: {where}{first['msg']}"
         ) from None
     return without_files(settings), [str(each) for each in calibrations]
 
@@ -119,8 +119,8 @@ def counts_of(
     if shape != (expected.rows, expected.cols):
         raise RecordingError(
             f"{recording.path}: its frames have {shape[0]} × {shape[1]} cells, the settings' "
-            f"sensors {expected.rows} × {expected.cols}: another hand's recording, or another "
-            "hand's settings"
+            f"sensors {expected.rows} × {expected.cols}: the recording or the settings belong to "
+            "another hand"
         )
     return np.frombuffer(message["data"], "<u2").reshape(shape)
 
@@ -138,15 +138,15 @@ def recompute(
     own, calibrations = recorded_settings(recording)
     if not recording.count(schema.INPUT):
         raise RecordingError(
-            f"{recording.path}: no hand/input in it, each tick's inputs: record with --topics all, "
-            "or by `softfinger run --record FILE`"
+            f"{recording.path}: contains no hand/input, the inputs of each tick: record with "
+            "--topics all, or with `softfinger run --record FILE`"
         )
     result = Comparison()
     try:
         _run(result, recording, settings or own, calibrations, progress)
     except (LookupError, TypeError, ValueError, ArithmeticError, struct.error) as error:
         raise RecordingError(
-            f"{recording.path}: its messages are not those of a loop: {error!r}"
+            f"{recording.path}: its messages do not form complete ticks: {error!r}"
         ) from error
     return result
 
@@ -217,8 +217,8 @@ def _ticks(
         if topic == schema.TACTILE:
             if message.get("seq_step") != 1:
                 raise RecordingError(
-                    f"{recording.path}: one of {message.get('seq_step')} frames was published, "
-                    "all are needed: record with stream.tactile_rate at the sensors' own"
+                    f"{recording.path}: contains one of {message.get('seq_step')} frames, "
+                    "expected all: record with stream.tactile_rate equal to the sensors' rate"
                 )
             finger = FINGERS.index(message["finger"])
             frames[finger, message["seq"]] = counts_of(recording, message, used)

@@ -90,9 +90,9 @@ class RecordingWriter:
         try:
             self._file = path.open("xb", buffering=4 * CHUNK_SIZE)  # one write per chunk
         except FileExistsError:
-            raise RecordingError(f"{path}: exists already; nothing is written over it") from None
+            raise RecordingError(f"{path}: already exists; choose another file") from None
         except FileNotFoundError:
-            raise RecordingError(f"{path}: its folder does not exist; make it first") from None
+            raise RecordingError(f"{path}: its folder does not exist; create it first") from None
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
@@ -193,8 +193,8 @@ class RecordingWriter:
         with contextlib.suppress(OSError):
             os.truncate(self.path, self.size)  # Only complete records remain.
         return RecordingError(
-            f"{self.path}: {error.strerror}; what was written until then can be read, "
-            f"`softfinger record --recover {self.path}` closes it"
+            f"{self.path}: {error.strerror}; earlier messages can be read, `softfinger record "
+            f"--recover {self.path}` repairs the file"
         )
 
 
@@ -222,7 +222,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Record until the end. Return 1 if the recording is incomplete. Raises SoftfingerError."""
     if arguments.recover:
         messages, damage = recover(arguments.file)
-        state = f"was damaged ({damage}), its sound part is kept" if damage else "sound"
+        state = f"was damaged ({damage}), its intact part is kept" if damage else "sound"
         print(f"{arguments.file}: {messages} messages; {state}")
         return 0
     with StopCondition(arguments.duration, arguments.lifeline) as ending:
@@ -347,7 +347,7 @@ class _Recorder:
             f"{size / max(elapsed, 1e-3):.2f} MB/s  {lost} lost"
         )
         if silent > _SILENCE_TIME:
-            line += f"  silent for {silent:.0f} s"
+            line += f"  no message for {silent:.0f} s"
         print(f"\r{line:<79.79}", end="", file=sys.stderr, flush=True)
 
     def _summary(self, failure: str) -> int:
@@ -362,7 +362,7 @@ class _Recorder:
             f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost
         )
         received = f" of {self._messages} received" if self._messages > written else ""
-        print(f"{written} messages written{received}; lost on the way: {lost or 'none'}")
+        print(f"{written} messages written{received}; lost: {lost or 'none'}")
         if self._unreadable:
             print(f"{self._unreadable} messages could not be read and were left out")
         if failure:

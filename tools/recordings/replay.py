@@ -27,7 +27,7 @@ pace or --speed times as fast. To subscribers this looks like a daemon.
 With --recompute, the recorded readings, frames and commands are processed by this version's
 estimator, tables, control and limits, and every state is compared with the recorded one. This needs
 a recording of all topics: `record --topics all`, or `run --record`, which starts at the first tick.
-From the first tick on, the same code and settings give identical bits.
+From the first tick on, the same code and settings give bit-identical results.
 Exit status: 0 identical or published, 1 the file can't be read, 3 states differ."""
 
 _SUBSCRIBER_WAIT = 10.0  # s, timeout for the first subscriber
@@ -132,8 +132,8 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     )
     if not result.from_start:
         print(
-            "the recording begins after the first tick, and what the loop remembered is not in it: "
-            "states may differ, all of them if the hand was armed; `run --record` misses nothing"
+            "the recording begins after the first tick, without the loop's earlier state: states "
+            "may differ, all of them if the hand was armed; `run --record` records every tick"
         )
     for count, what in ((result.missing_ticks, "ticks"), (result.missing_frames, "frames")):
         if count:

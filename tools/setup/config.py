@@ -114,7 +114,5 @@ def _explained(what: str) -> str:
         for line in key.lines(f"{key.section}.")
     ]
     if not lines:
-        raise SettingsError(
-            f"{what}: found no such section or key; see `softfinger config reference`"
-        )
+        raise SettingsError(f"{what}: unknown section or key; see `softfinger config reference`")
     return "".join(f"{line}\n" for line in lines)

@@ -52,15 +52,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add_profile(parser)
     change = parser.add_mutually_exclusive_group()
-    change.add_argument("--fix", action="store_true", help="repair what softfinger can repair")
+    change.add_argument(
+        "--fix", action="store_true", help="fix the findings that softfinger can fix"
+    )
     change.add_argument(
         "--restore",
         type=Path,
         metavar="FILE",
-        help="write the servo registers back that --save stored in FILE",
+        help="restore the servo registers that --save stored in FILE",
     )
     parser.add_argument(
-        "--save", type=Path, metavar="FILE", help="first store the servo registers in FILE"
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help="store the servo registers in FILE before any other action",
     )
 
 
@@ -102,7 +107,7 @@ def results(
         yield Finding("warn", "settings", warning)
     tactile = settings.tactile
     if not backend("tactile", tactile.backend).metal:
-        yield Finding("note", "tactile", f"{tactile.backend}: no board to ask")
+        yield Finding("note", "tactile", f"{tactile.backend}: no board to check")
     else:
         for name in settings.scene.fingers:
             finger = FINGERS.index(name)
@@ -157,10 +162,10 @@ def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Fi
     servos = settings.servos
     found = backend("servos", servos.backend)
     if not found.metal:
-        yield Finding("note", "servos", f"{servos.backend}: no servo to ask")
+        yield Finding("note", "servos", f"{servos.backend}: no servo to check")
         return
     if found.source:
-        text = f"{servos.backend}: a plugin's, which softfinger.testing.check_servos tries"
+        text = f"{servos.backend}: a plugin; test it with softfinger.testing.check_servos"
         yield Finding("note", "servos", text)
         return
     if not free[servos.port]:

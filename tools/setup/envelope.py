@@ -197,7 +197,8 @@ def _keep(
 ) -> None:
     frictions, masses, sizes = axes
     lines = [
-        "# What the hand holds, by `softfinger envelope --keep`; a row for each friction and mass,",
+        "# Objects that the hand holds, by `softfinger envelope --keep`; a row for each friction "
+        "and mass,",
         "# a letter for each size: "
         + ", ".join(f"{k} {text}" for k, text in OUTCOME_TEXTS.items()),
         f"force = {force!r}",
@@ -230,7 +231,7 @@ def _draw(
     frictions, masses, sizes = axes
     with style.settings():
         figure = style.new_figure(1.0 + 0.28 * len(sizes) * len(found), 1.2 + 1.2 * len(frictions))
-        figure.suptitle(f"What the hand holds with {force:g} N", fontsize=10)
+        figure.suptitle(f"Objects held with {force:g} N", fontsize=10)
         grid = figure.subplots(len(frictions), len(found), squeeze=False, sharex=True, sharey=True)
         for (k, i), axes_ in np.ndenumerate(grid):
             shape = list(found)[i]

@@ -60,6 +60,6 @@ def _file(name: str) -> str:
 def _quoted(word: str) -> str:
     """Quote one word in ExecStart: escape specifiers, variables and separators."""
     if any(ord(character) < 32 for character in word):
-        raise SettingsError(f"{word!r}: control characters can't stand in a unit")
+        raise SettingsError(f"{word!r}: a systemd unit can't contain control characters")
     word = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
     return f'"{word}"' if re.search(r"[\s\"';\\]", word) else word

@@ -8,12 +8,12 @@ from pathlib import Path
 from softfinger.daemon.wire.keys import make_keys
 
 _EPILOG = """\
-The first call makes the daemon's keys and those of the client `local`, for tools on the daemon's
-machine; each CLIENT adds the keys of one client. Set access.keys in the profile to FOLDER, copy
+The first call creates the daemon's keys and those of the client `local`, for tools on the daemon's
+machine. Each CLIENT adds the keys of one client. Set access.keys in the profile to FOLDER, copy
 FOLDER/CLIENT to the client's machine, and pass it to the tools with --keys. Files are never
 overwritten. Removing FOLDER/server/clients/CLIENT.key disconnects a client within a second. With
-keys, the commander's lease belongs to the name of the key.
-Exit status: 0 made, 1 refused."""
+keys, the lease is bound to the name of the key.
+Exit status: 0 keys created, 1 an error occurred."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -37,7 +37,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Scan the ports and print a line for each servo. Return 0 if a servo was found."""
     paths = arguments.ports or [path for path, _ in serial_ports()]
     if not paths:
-        print("scan: this machine has no serial port; name one", file=sys.stderr)
+        print(
+            "scan: found no serial port on this machine; give one as an argument", file=sys.stderr
+        )
         return 1
     count = 0
     for path in paths:

@@ -62,7 +62,7 @@ class HandKeys:
             self._grasp(now)
         elif key == "d" and self._gripping and now - self._asked > _CONFIRMATION_TIME:
             self._asked = now
-            self._commander.refuse(now, "disarm: it lets the object fall; d again to do it")
+            self._commander.refuse(now, "disarm: the object would fall; press d again to disarm")
         elif key in _COMMAND_KEYS:
             self._target = None
             self._commander.send(now, _COMMAND_KEYS[key], _COMMAND_KEYS[key])
@@ -117,7 +117,7 @@ class HandKeys:
         if self._target is None or refused or self._feed.mode not in ("rotating", "holding"):
             self._target = pose.angle if pose.valid and math.isfinite(pose.angle) else None
             if self._target is None:
-                self._commander.refuse(now, "rotate: the object's angle is not known")
+                self._commander.refuse(now, "rotate: the object's angle is unknown")
                 return
         self._target += step
         label = f"rotate to {math.degrees(self._target):.1f}°"
@@ -211,7 +211,7 @@ class _MonitorStop(StopCondition):
     def end(self, *_: object) -> None:
         super().end()
         if self.terminal is not None and self.terminal.writing:
-            raise TerminalGone("a signal came while the terminal took no output")
+            raise TerminalGone("a signal arrived while the terminal was blocked")
 
     def _pause(self, *_: object) -> None:
         self.suspend = True

@@ -158,12 +158,12 @@ class MonitorPage:
             )
         if feed.state.schema != SCHEMA:
             what = f" the stream has schema {feed.state.schema}, this page knows {SCHEMA}"
-            return Text(what + " and shows the fields it knows", WARN)
+            return Text(what + "and shows the fields that it knows", WARN)
         lately = feed.waited(now)
         if lately > DELAY_MIN:
             what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"
             return truncated(
-                Text(f"{what} ({format_value(feed.state.behind_s, 2)} s in all)", WARN), width
+                Text(f"{what} ({format_value(feed.state.behind_s, 2)} s in total)", WARN), width
             )
         return truncated(Text(f" {why_invalid(feed.state)}", WARN), width)
 
@@ -302,7 +302,7 @@ class MonitorPage:
     def _footer(self, width: int) -> Text:
         """List the keys. On a narrow terminal, list only those useful in the current mode."""
         if not self.keys:
-            return Text(" no keyboard here: commands go through softfinger send", DIM)
+            return Text(" no keyboard input: send commands with softfinger send", DIM)
         force = f"{self.force:.3g} N" if math.isfinite(self.force) else "N"
         keys = _KEYS | {"+-": force}
         line = _named(keys)

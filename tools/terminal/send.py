@@ -75,8 +75,8 @@ def si_numbers(words: list[str]) -> dict[str, float]:
             raise ValueError(f"found {key + text!r}, expected key=number")
         unit, known = found[2], _UNITS.get(key.removesuffix("="), {})
         if unit and unit not in known:
-            expected = f"expected {' or '.join(known)}" if known else "expected a number alone"
-            raise ValueError(f"found {key + text!r} in {unit!r}, {expected}")
+            expected = " or ".join(known) or "a number without unit"
+            raise ValueError(f"{key + text}: found the unit {unit!r}, expected {expected}")
         numbers[key.removesuffix("=")] = float(found[1]) * known.get(unit, 1.0)
     return numbers
 

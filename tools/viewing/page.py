@@ -190,7 +190,7 @@ class Site:
         if upgrade and path in self._routes:
             return None
         if upgrade or path != "/":
-            return connection.respond(404, "nothing here")
+            return connection.respond(404, "not found")
         watched = "command" if self._allows(request) else "watch"
         shown = "play" if self._send is None else watched
         others = rf'<section class="(?!{shown}).*?</section>'
@@ -277,7 +277,7 @@ class Site:
             # This call fails for values that msgpack can't represent: deep nesting, long integers.
             msgpack.packb(asked)
         except _NO_COMMAND:
-            return '✗ no command: expected a JSON object with "command", not nested deeply'
+            return '✗ invalid command: expected a JSON object with "command", not nested deeply'
         if name == "record":
             return self.record()
         if name != "stop" and math.isnan(age):
@@ -387,7 +387,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
             serving.join()
     _say(f"{pictures.seen} states seen, {pictures.unreadable} messages could not be read")
     if pictures.seen == 0:
-        raise ViewError(f"{arguments.file or arguments.address}: nothing came that can be shown")
+        raise ViewError(f"{arguments.file or arguments.address}: received nothing to show")
 
 
 def _address(listener: socket.socket) -> str:

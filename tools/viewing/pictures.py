@@ -200,7 +200,7 @@ class Pictures:
             self._settings_text = text(message, "settings")
             settings, unknown = read_settings(message)
             if unknown:
-                self._say(f"settings not known here: {printable(', '.join(unknown))}")
+                self._say(f"unknown settings: {printable(', '.join(unknown))}")
             self._read_settings(settings)
         self.feed.process(topic, message, self._moment())
         if self._foxglove is not None:

@@ -74,7 +74,7 @@ def _rate(text: str) -> float:
 def run(arguments: argparse.Namespace) -> int:
     """Show the page until the end. Raises SoftfingerError if nothing can be shown."""
     if arguments.foxglove is not None and arguments.file is not None:
-        print("view: --foxglove serves the stream alone, found FILE.mcap, too", file=sys.stderr)
+        print("view: --foxglove serves only the stream, found FILE.mcap", file=sys.stderr)
         return 2
     arguments.address, arguments.commands = arguments.address
     require("view")

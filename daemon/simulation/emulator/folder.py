@@ -58,7 +58,7 @@ class LinkFolder:
             link = path / name
             if link.exists() and not link.is_symlink():
                 self.close()
-                raise FolderError(f"{link}: is in the way and is no link; move it elsewhere")
+                raise FolderError(f"{link}: exists and is not a link; move it elsewhere")
 
     def _take(self, path: Path) -> int:
         while True:
@@ -70,7 +70,7 @@ class LinkFolder:
                 os.close(lock)
                 raise FolderError(
                     f"{self.path}: in use by another emulator (process {holder or 'unknown'}); "
-                    "end that one or choose another --dir"
+                    "end it or choose another --dir"
                 ) from None
             # The previous holder may have removed the file between the open and the lock.
             with contextlib.suppress(FileNotFoundError):
@@ -134,7 +134,7 @@ class ControlPort:
             with contextlib.suppress(FileNotFoundError):
                 # This process holds the folder lock, so the socket was left by a killed emulator.
                 if not stat.S_ISSOCK(os.stat(_CONTROL, dir_fd=self._folder).st_mode):
-                    raise FolderError(f"{folder / _CONTROL}: is in the way; move it elsewhere")
+                    raise FolderError(f"{folder / _CONTROL}: already exists; move it elsewhere")
                 os.unlink(_CONTROL, dir_fd=self._folder)
             self._listener.bind(_address(self._folder))
             self._listener.listen(_CLIENT_COUNT_MAX)
@@ -224,9 +224,9 @@ def send_words(folder: Path, text: str) -> str:
                 client.send(text.encode())
                 reply = client.recv(_REPLY_SIZE_MAX)
     except OSError:
-        raise NoEmulator(f"{folder}: no emulator answers here") from None
+        raise NoEmulator(f"{folder}: no emulator is running here") from None
     if not reply:
-        raise NoEmulator(f"{folder}: the emulator ended")
+        raise NoEmulator(f"{folder}: the emulator has ended")
     return reply.decode()
 
 

@@ -126,8 +126,8 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
     force, *_, inside = lookup(table.data, d, theta)
     if d > d_max or not inside:
         raise PlateError(
-            f"press: at {math.degrees(theta):g}° this tip takes {depths[-1] * 1e3:.2f} mm or "
-            f"{forces[-1]:.1f} N at most"
+            f"press: expected at most {depths[-1] * 1e3:.2f} mm or {forces[-1]:.1f} N at "
+            f"{math.degrees(theta):g}° on this tip"
         )
     return PlatePress(d, theta, pressure, scale * float(force), values["speed"], values["hold"])
 

@@ -76,7 +76,7 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
     if points.ndim != 2 or points.shape[1] != 2 or not 3 <= len(points) <= CORNERS:
         raise ValueError(f"found corners {points.shape}, expected 3 to {CORNERS} pairs")
     if not np.isfinite(points).all():
-        raise ValueError("found a corner that is no number")
+        raise ValueError("found a corner that is not a number")
     along = np.roll(points, -1, axis=0) - points
     turns = _cross(along, np.roll(along, -1, axis=0))
     whole = np.arctan2(turns, (along * np.roll(along, -1, axis=0)).sum(axis=1)).sum()
@@ -110,8 +110,8 @@ def wedge(simulation: SimulationSettings) -> Shape:
     width = simulation.object_width
     if 2.0 * abs(leaning) >= width:
         raise ValueError(
-            f"a wedge's faces meet: found simulation.object_width {width:g} m, expected above "
-            f"{2.0 * abs(leaning):.3g} m at its object_taper and object_height"
+            f"the faces of the wedge meet: found simulation.object_width {width:g} m, expected "
+            f"above {2.0 * abs(leaning):.3g} m for its object_taper and object_height"
         )
     return polygon(_trapezoid(simulation, leaning))
 

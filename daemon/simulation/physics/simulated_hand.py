@@ -323,7 +323,7 @@ class SimulatedHand:
         ValueError for another mode or a non-finite goal.
         """
         if mode not in _MODES:
-            raise ValueError(f"operating mode {mode} is not simulated; {_MODES} are")
+            raise ValueError(f"operating mode {mode} is not simulated; expected one of {_MODES}")
         if not (math.isfinite(goal_q) and math.isfinite(goal_current)):
             raise ValueError(f"goals must be finite, not {goal_q!r} rad, {goal_current!r} A")
         self._mode[joint] = mode
@@ -387,7 +387,9 @@ class SimulatedHand:
         """
         row = self._rows[number % len(self._rows)]
         if row.number != number:
-            raise LookupError(f"sample {number} is not kept; {self.sample_count} were taken")
+            raise LookupError(
+                f"sample {number} is no longer stored; {self.sample_count} were taken"
+            )
         return row
 
     def energy(self) -> float:

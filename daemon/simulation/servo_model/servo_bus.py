@@ -91,7 +91,8 @@ class ServoBus:
         rate = baud or servos.baud
         if rate not in model.baud_rates:
             raise ValueError(
-                f"{model.name} has no {rate} baud; it has {', '.join(map(str, model.baud_rates))}"
+                f"{model.name} does not support {rate} baud, only "
+                f"{', '.join(map(str, model.baud_rates))}"
             )
         eeprom = {reg.BAUD_RATE: model.baud_rates.index(rate)}
         if not factory:

@@ -16,7 +16,7 @@ function say(text, bad = false) {
 function send(command, numbers = {}, answered = () => {}) {
   const lane = lanes[command] ??= { busy: 0, next: null };
   const asked = { message: { command, client, seen: picture?.now, ...numbers }, answered };
-  if (command === "stop") drop("a stop came first");
+  if (command === "stop") drop("stop was sent first");
   else if (lane.busy) return void (lane.next = asked);
   transmit(lane, asked);
 }
@@ -140,7 +140,7 @@ const pressed = {
 
 function press(command, value) {
   if (command !== "stop" && command !== "record" && !allowed(command))
-    return say(`✗ ${command}: not ${isOld() ? "without a stream" : `while ${picture.mode}`}`, true);
+    return say(`✗ ${command}: not accepted ${isOld() ? "without a stream" : `in mode ${picture.mode}`}`, true);
   (pressed[command] ?? (() => send(command)))(value);
 }
 

@@ -153,7 +153,7 @@ function redraw() {
     item.dataset.mode = item.textContent = mode;
     item.prepend(document.createElement("i"));
   });
-  put(one(".window"), `${seconds(view.span)} s${view.end === null ? "" : ", standing still"}`);
+  put(one(".window"), `${seconds(view.span)} s${view.end === null ? "" : ", paused"}`);
   one("#follow").hidden = view.end === null && view.span === 20;
   give(one("#hold"), "aria-pressed", view.end !== null);
   put(one("#hold"), view.end === null ? "Pause" : "Resume");
@@ -166,7 +166,7 @@ function showAges() {
   const age = aged(picture.age), old = isOld(), { patience } = picture;
   const mark = (element, label, since) => {
     element.classList.toggle("old", since !== null);
-    put(label, since === null ? "" : since < Infinity ? `${seconds(since)} s old` : "nothing came");
+    put(label, since === null ? "" : since < Infinity ? `${seconds(since)} s old` : "nothing received");
   };
   for (const panel of panels) {
     const frame = aged(picture.panels[panel.name]?.age ?? (panel.low ? null : picture.age));
@@ -182,7 +182,7 @@ function showAges() {
   }
   put(one(".mode"), old ? "No stream" : picture.mode || "—");
   give(one(".mode"), "data-mode", picture.mode);
-  const past = age === Infinity ? "no state came yet" : `last state ${seconds(age)} s ago, then ${picture.mode}`;
+  const past = age === Infinity ? "no state yet" : `last state ${seconds(age)} s ago, then ${picture.mode}`;
   const why = connected ? "" : "; the page's server doesn't answer";
   put(one(".stream"), old ? past + why : scene.live ? "live" : "recording");
   if (old && settings.force) showControls();
@@ -239,7 +239,7 @@ function begin() {
   one("#hold").hidden = !!player;  // The player has its own button.
   if (one("#force")) beginControls();
   const keys = { ...(settings.force ? { Space: ["", "Stop"], ...KEYS } : {}), p: ["", "Pause or resume the plots"], "?": ["", "This help"],
-    ...(player ? { Space: ["", "Play or pause"], "← →": ["", "1 s back or on; with Shift 5 s"], ", .": ["", "Previous or next mark"] } : {}) };
+    ...(player ? { Space: ["", "Play or pause"], "← →": ["", "1 s back or forward; with Shift 5 s"], ", .": ["", "Previous or next mark"] } : {}) };
   for (const [key, [, meaning]] of Object.entries(keys)) {
     make(make(one(".keys"), "dt"), "kbd", "", key.replace("Arrow", ""));
     make(one(".keys"), "dd", "", meaning);
