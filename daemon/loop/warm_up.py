@@ -23,6 +23,7 @@ from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
 from softfinger.kinematics.compiled.kernel_folder import is_marked, kernel_folder, mark
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.invalid import Invalid
+from softfinger.kinematics.hand.geometry import tip_position
 from softfinger.kinematics.hand.grasp_state import total_tilt
 from softfinger.kinematics.hand.servo_heat import (
     HeatState,
@@ -197,6 +198,7 @@ def _joints(scene: WantedScene) -> None:
     winding_std(heat.array)
     time_to_limit(heat.array, 1.0, 70.0)
     sustained_square(heat.array, 70.0)
+    tip_position(0.0, 1.0, 0.0, 1.0, 0.0)  # used by the limit joint.opens
     Setpoint(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time, SetpointState())
     Statistics()
 

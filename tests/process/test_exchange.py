@@ -183,9 +183,9 @@ def test_a_servo_that_answers_after_the_wait_is_told_from_a_broken_cable(running
         return found
 
     monkeypatch.setattr(devices, "examine", examine_then_boot)
-    settings = backend_settings(bus.path, open_timeout=0.01)
+    settings = backend_settings(bus.port, open_timeout=0.01)
     failed = [each for each in devices.check_servos(settings) if each.status != "pass"]
-    assert [each.fix for each in failed] == ["it answers now: set a longer servos.open_timeout"]
+    assert [each.fix for each in failed] == ["it replies now: set a longer servos.open_timeout"]
     assert failed[0].text.endswith("within servos.open_timeout = 0.01 s")
 
 

@@ -209,7 +209,7 @@ def test_an_error_that_a_wrong_limit_causes_is_corrected_with_the_limit(bus):
     until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
     supply = [each for each in told(bus) if each.text.startswith("supply is ")]
     assert [each.fix for each in supply] == [FIX]
-    fixed = [each.text for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    fixed = [each.text for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert fixed == [
         "min voltage limit 140 → 95",
         "rebooted because it had a hardware error: input voltage out of limits",
@@ -220,7 +220,7 @@ def test_an_error_that_a_wrong_limit_causes_is_corrected_with_the_limit(bus):
 def test_an_error_that_a_reboot_does_not_clear_is_reported(bus):
     bus.fault("undervoltage=1")
     until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
-    (left,) = [each for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    (left,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert left.text == "hardware error after a reboot: input voltage out of limits"
     assert left.fix == "remove the cause"
 
@@ -229,7 +229,7 @@ def test_no_reboot_is_advised_for_a_reversed_drive_mode(bus):
     put(bus, reg.DRIVE_MODE, 1)
     fixes = [each.fix for each in told(bus) if each.status == "FAIL"]
     assert fixes == ["`softfinger calibrate joints`, since its drive mode is reversed"]
-    assert provision(backend_settings(bus.path)) == []
+    assert provision(backend_settings(bus.port)) == []
 
 
 def test_a_servo_with_protocol_1_is_recognised(bus):

@@ -149,7 +149,7 @@ def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
     profile = tmp_path / "my.toml"
     profile.write_text("")
     assert main(["calibrate", "heat", str(profile), "--recording", str(RECORDING)]) == 1
-    assert "found 0 °C of warming, expected 8 at least" in capsys.readouterr().err
+    assert "found 0 °C of warming, expected at least 8 °C" in capsys.readouterr().err
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:

@@ -142,7 +142,9 @@ FRAMES: dict[str, tuple[str, Callable[[Path], object]]] = {
 @pytest.mark.parametrize(("name", "make"), FRAMES.values(), ids=FRAMES)
 def test_frames_beyond_the_end_of_the_file_are_reported(tmp_path, name, make):
     make(tmp_path / name)
-    with pytest.raises(RecordingError, match=r"more than|another compression|no line|expected 4"):
+    with pytest.raises(
+        RecordingError, match=r"more (data )?than|unsupported compression|no line|expected 4"
+    ):
         load_recording(tmp_path / name, 1.0, 100.0)
 
 
