@@ -82,7 +82,7 @@ class Fingertip:
             raise ValueError(f"poisson must be {low} to {high}, not {self.poisson!r}")
         if (self.physics == "measured") != (self.law is not None):
             raise ValueError(
-                "a law is required for a measured tip, and allowed for no other; "
+                "a measured tip requires a law, and other tips must not have one; "
                 f"physics: {self.physics!r}"
             )
         radius = float(self.radius)

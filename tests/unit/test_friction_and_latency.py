@@ -122,7 +122,7 @@ def test_impossible_times_are_refused():
     ("words", "why"),
     [
         (["--set", "servos.model=XL430-W250"], "one that measures its current"),
-        (["--recording", "a.mcap", "b.mcap"], "expected one --recording"),
+        (["--recording", "a.mcap", "b.mcap"], "expected at most one --recording"),
     ],
 )
 def test_data_without_friction_are_refused(tmp_path, capsys, words, why):

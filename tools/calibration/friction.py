@@ -51,7 +51,7 @@ def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str
             "its current"
         )
     if len(arguments.recording) > 1:
-        raise CalibrationError("friction: expected one --recording, or none")
+        raise CalibrationError("friction: expected at most one --recording")
     if arguments.recording:
         columns = read_recording(arguments.recording[0])
     else:

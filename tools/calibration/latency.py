@@ -48,7 +48,7 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
     RecordingError, SettingsError
     """
     if len(arguments.recording) > 1:
-        raise CalibrationError("latency: expected one --recording, or none")
+        raise CalibrationError("latency: expected at most one --recording")
     source: MessageSource
     source = (
         Recording(arguments.recording[0]) if arguments.recording else _gripped(arguments, settings)
