@@ -416,7 +416,7 @@ class ControlSettings(Section):
         0.05, "N·m", "Coulomb friction that is compensated while the joint is commanded to move."
     )
     joint_load_friction: GearLoss = setting(
-        0.0, "", "Gear friction as a fraction of the transmitted torque (MX-64 0.23, XL330 0.3)."
+        0.0, "", "Gear friction as a fraction of the transmitted torque (MX-64 0.23, XL330 0.25)."
     )
     friction_speed: Positive = setting(
         0.02, "rad/s", "Commanded speed above which friction is fully compensated."
