@@ -70,8 +70,8 @@ _KEYS = """\
 Send commands from a REQ socket, with or without `REQ_CORRELATE`, or from a DEALER socket. As with a
 REP socket, the reply begins with all frames of the request up to and including the first empty
 frame. A DEALER socket may omit the empty frame; the reply then omits the empty frame as well. The
-daemon rejects a command that spans several frames with the reason `request`. It also rejects
-envelopes of more than 14 frames or 1,024 bytes with this reason.
+daemon rejects commands that span several frames, and envelopes of more than 14 frames or 1,024
+bytes. The reason in the reply is then `request`.
 
 **Late commands.** If the daemon stalls, commands wait longer than their clients expect. The daemon
 therefore rejects outdated commands as `late`. `arm` and all commands that move the hand or change
