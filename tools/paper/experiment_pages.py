@@ -257,13 +257,13 @@ PAGES = {
                 "the elastic force is proportional to the over-square of the displacement, also in "
                 "experiments",
                 "The model's exponent is exactly 2 at every angle, with the prefactor 1/cos θ. "
-                "The exponent is larger only if the modulus increases with strain.",
+                "The exponent is larger only if the modulus increases with the strain.",
             ),
             Erratum(
                 "IV-A",
                 "an approximately constant error over d, which a higher modulus brings close",
-                "The force of springs is πE d²/cos θ. Another E multiplies F by a factor; it "
-                "does not add a constant that is independent of d.",
+                "The force of springs is πE d²/cos θ. A different E multiplies F by a constant "
+                "factor. It does not add a constant that is independent of d.",
             ),
         ),
         notes=(
@@ -303,15 +303,15 @@ PAGES = {
         errata=(
             Erratum(
                 "eq. 18",
-                "the last integral, of t⁻³ from cos θ_max to 1, has no dt",
+                "the last integral, of t⁻³ from cos θ_max to 1, lacks dt",
                 "The integral is 2π ∫ t⁻³ dt. Its value is correct.",
             ),
             Erratum(
                 "Appendix I",
                 "eq. 10 is converted to spherical coordinates",
                 "x² + y² = (a − d)² tan² θ and eq. 14 are polar coordinates in the contact plane, "
-                "r = (a − d) tan θ. The angle θ at the tip's centre points to a point of that "
-                "plane, not to a point of the sphere.",
+                "r = (a − d) tan θ. The angle θ at the tip's centre specifies a point in this "
+                "plane, not a point on the sphere.",
             ),
         ),
         notes=("Tip of radius 20 mm, E = 0.304 MPa, as in the paper.",),
