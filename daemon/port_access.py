@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join merely to open a port
+_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join just to open a port
 
 
 def port_group_remedy(path: str) -> str:

@@ -96,8 +96,8 @@ def _try_exchange(
 ) -> list[Finding]:
     """Measure the duration of a tick's reads and writes if all servos are usable.
 
-    The writes have the same length and address as those of a tick, but write the present values, so
-    the registers do not change. If a servo has torque on, or might switch it on when a goal is
+    The writes have the same length and address as those of a tick, but contain the current register
+    values, so nothing changes. If a servo has torque on, or might switch it on when a goal is
     written, only the reads are measured.
     """
     if not all(each.table and not each.errors for each in found):
@@ -124,7 +124,7 @@ def _try_exchange(
 
 
 def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -> list[Finding]:
-    """Return the findings of one servo; ``late`` if it answered only after the others' checks."""
+    """Return the findings of one servo; ``late`` if it replied only after some waiting."""
     name = servo.name
     if not servo.replies:
         if servo.errors:
@@ -215,7 +215,7 @@ def check_law(settings: Settings, finger: int) -> Finding:
 
 
 def check_board(settings: Settings, finger: int) -> Finding:
-    """Check that a board sends frames with the grid size and rate given in the settings."""
+    """Check that a board sends frames with the configured grid size and rate."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
     sensor = make_sensor(settings, RealClock(), None, finger)

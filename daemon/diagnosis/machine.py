@@ -1,4 +1,4 @@
-"""Check that this machine can run regular ticks: scheduling, memory, idle states, clock.
+"""Check that this machine can run ticks on time: scheduling, memory, idle states and clock.
 
 Problems of this kind only degrade the timing, so they are reported as warnings. The checks read the
 limits of this process. A daemon that is started from the same shell has the same limits.
@@ -17,7 +17,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_folder
 
-_MEMORY = 1 << 30  # bytes, upper bound of the daemon's mapped memory
+_MEMORY = 1 << 30  # bytes, upper bound on the daemon's mapped memory
 _WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
 _CLOCK_MIN = 1_700_000_000.0  # Unix time [s]; an earlier time means that the clock was never set
@@ -83,7 +83,7 @@ def check_wall_clock(now: float) -> Finding:
 
 
 def wake_ups() -> list[float]:
-    """Measure wake-up delays [s] of sleeps until a deadline, like those between ticks."""
+    """Measure wake-up delays [s], using the same kind of sleep as between ticks."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UP_COUNT):
@@ -105,7 +105,7 @@ def check_wake_ups(late: list[float]) -> Finding:
 
 
 def check_kernels(settings: Settings) -> list[Finding]:
-    """Check that compiled kernels can be stored and that this scene's kernels are compiled."""
+    """Check that the kernel cache is writable and contains this scene's compiled kernels."""
     try:
         with find_kernel_folder() as folder:
             place, spoilt = folder.path, len(damaged(folder))

@@ -111,7 +111,7 @@ def _is_daemon(process: int) -> bool:
 def users(path: str) -> list[tuple[int, str]]:
     """Return (process, name) for each visible process that has the port open.
 
-    The process that owns the other end of a pseudo-terminal is not included.
+    The list excludes the process that owns the other end of a pseudo-terminal.
     """
     try:
         device = Path(path).stat().st_rdev
@@ -149,7 +149,7 @@ def _uses(folder: Path, device: int) -> bool:
 
 
 def _pseudo_terminal(folder: Path, link: Path) -> int:
-    """Return the terminal number of a pseudo-terminal master, or -1 for another descriptor."""
+    """Return the terminal number of a pseudo-terminal master, or -1 for any other descriptor."""
     if not str(link.readlink()).endswith("ptmx"):
         return -1
     match = re.search(r"^tty-index:\s*(\d+)", (folder / "fdinfo" / link.name).read_text(), re.M)

@@ -22,7 +22,7 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
 from softfinger.daemon.types import FINGERS
 
-_FILE_SIZE_MAX = 1 << 20  # bytes, limit for reading a file
+_FILE_SIZE_MAX = 1 << 20  # bytes, maximum file size
 _PASS_COUNT = 2  # A lower limit may be rejected until the upper limit has been written.
 
 
@@ -82,7 +82,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
 def restore_registers(settings: Settings, path: Path) -> list[Finding]:
     """Write the registers saved by :func:`save_registers` to servos with the same ID and model.
 
-    Raises ServoError if the file has other content.
+    Raises ServoError if the file does not have this format.
     """
     stored = _stored(path)
     result: list[Finding] = []
@@ -137,7 +137,7 @@ def _restore(
 
 
 def _stored(path: Path) -> dict[int, StoredServo]:
-    """Return a file's servos by ID. Raises ServoError if the file has other content."""
+    """Return a file's servos by ID. Raises ServoError if the file does not have this format."""
     try:
         stored = StoredServos.model_validate_json(read_file(path, _FILE_SIZE_MAX))
     except OSError as error:

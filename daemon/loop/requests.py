@@ -28,7 +28,7 @@ from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, State
 
-AGE_MAX = 1.0  # s, age limit for all commands except status and stop
+AGE_MAX = 1.0  # s, maximum age of all commands except status and stop
 _COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE_KEYS = frozenset({"command", "client"})
 _MODE_REMEDIES = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
@@ -43,7 +43,7 @@ class Command(NamedTuple):
 
 
 def parse(request: dict[str, Any], mode: Mode) -> Command:
-    """Validate a request against the command table. Raises Refused if it is invalid."""
+    """Validate a request against the command table. Raises Refused if the request is invalid."""
     name = request["command"]
     if name not in COMMANDS:
         raise _malformed(f"unknown command {name[:40]!r}; expected one of {', '.join(COMMANDS)}")
@@ -80,7 +80,7 @@ def _malformed(text: str) -> Refused:
 
 
 def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
-    """Return the range of a command's parameter; infinite if it depends on the grip.
+    """Return the range of a command's parameter, which is infinite if it depends on the grip.
 
     A force must be above the lower bound.
     """
@@ -114,7 +114,7 @@ class Lease:
             raise Refused(text, Reason.LEASE)
 
     def lapses(self, now: float) -> str:
-        """Return the name of the client whose lease has just expired, otherwise "".
+        """Return the name of the client whose lease has just expired, or an empty string.
 
         Each expiry is reported once.
         """
@@ -149,7 +149,7 @@ class Requests:
         Parameters
         ----------
         emit : sends an event
-        command_age_max : maximum age [s] of a command that can stiffen or move the hand
+        command_age_max : maximum age [s] of a command that may stiffen or move the hand
         """
         self._command_age_max = command_age_max
         self._settings = settings
@@ -337,7 +337,7 @@ class Requests:
         if self._torque.servos is None or not silent:
             return
         if self._torque.pending and not state.read_error:
-            return  # The port works. Connecting would end the bus silence that stops the servos.
+            return  # The port works, and connecting would end the silence that stops the servos.
         try:
             self._torque.reconnect()
         except ServoError as error:
@@ -345,7 +345,9 @@ class Requests:
         self._emit("info", "servos", "reconnected")
 
     def _reopen(self, name: str) -> None:
-        """Reopen sensors with a lost port. Only ``clear`` and ``arm`` do this, with torque off.
+        """Reopen the sensors whose port was lost.
+
+        Only ``clear`` and ``arm`` reopen sensors, while torque is off.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Create the objects that the settings describe: tip, material, contact table, sensor grid."""
+"""Create the objects that the settings describe: tip, material, contact table and sensor grid."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def make_tip(settings: Settings) -> Fingertip:
 
 
 def law_problem(material: Material, limit: float) -> str:
-    """Describe a material law fit error above ``limit`` (relative to F); empty if it is smaller."""
+    """Describe a fit error of the material law above ``limit`` (relative to F), else return ""."""
     found = material.worst_force_error
     if found <= limit:
         return ""
@@ -57,7 +57,7 @@ def make_table(
     """
     tip = tip or make_tip(settings)
     try:
-        if tip.physics != "springs":  # These tables are built fast, so they are not cached.
+        if tip.physics != "springs":  # Building such a table is fast, so it is not cached.
             return ContactTable.build(tip, material)
         return _built(tip, material, settings.table.tolerance)
     except TableError as error:
@@ -66,7 +66,7 @@ def make_table(
 
 @lru_cache(maxsize=8)
 def _built(tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
-    """Build a table in 0.16 s. All hands in a process share it."""
+    """Build a contact table in 0.16 s. All hands in one process share the table."""
     return ContactTable.build(tip, material, tolerance)
 
 

@@ -25,9 +25,9 @@ from softfinger.daemon.profile.validation import plausibility_warnings, problems
 __all__ = ["load"]
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-_FILE_SIZE_MAX = 256 << 10  # bytes; the reference with every key has 21 kB
+_FILE_SIZE_MAX = 256 << 10  # bytes; the reference profile, which has every key, takes 21 kB
 _DEPTH_MAX = 8  # nesting depth of tables and arrays
-_ERROR_COUNT_MAX = 20  # reported errors per load
+_ERROR_COUNT_MAX = 20  # maximum number of errors reported per load
 # Matches dotted keys with 16 or more parts, because tomllib needs minutes for thousands of parts.
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
 _WORD = re.compile(r"\w+")
@@ -56,7 +56,7 @@ class ExaminedProfile(NamedTuple):
     unused: set[str]
 
     def warnings(self) -> list[str]:
-        """Return a line for every setting that is allowed but probably wrong."""
+        """Return one line for each setting that is allowed but probably wrong."""
         found = _without_words(plausibility_warnings(self.settings), self.unused)
         return [f"{self.name}: {line}" for line in found]
 
@@ -83,7 +83,7 @@ def load(
 def examine(
     path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
 ) -> ExaminedProfile:
-    """Read a profile and find all of its errors. Raises SettingsError if it cannot be read.
+    """Read a profile and find all of its errors. Raises SettingsError if the profile can't be read.
 
     The arguments are those of `load`.
     """
@@ -136,7 +136,7 @@ def _without_words(lines: Iterable[str], words: set[str]) -> list[str]:
 
 
 def _without(data: dict[str, Any], wrong: Sequence[ErrorDetails]) -> dict[str, Any]:
-    """Return the sections without the keys, or the whole sections, that have errors."""
+    """Return the sections without the invalid keys and without entirely invalid sections."""
     kept: dict[Any, Any] = {
         name: dict(keys) if isinstance(keys, dict) else keys for name, keys in data.items()
     }
@@ -154,7 +154,7 @@ def names() -> list[str]:
 
 
 def find(path: Path) -> Path:
-    """Return a profile's file; a bare name may refer to a packaged profile.
+    """Return the path of a profile's file; a bare name may refer to a packaged profile.
 
     Raises SettingsError for a bare name that is neither in `names` nor an existing file.
     """
@@ -205,7 +205,7 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
     except RecursionError:
         raise SettingsError(f"{name}: nested too deeply") from None
-    except ValueError as error:  # TOMLDecodeError, or a number with 5000 digits
+    except ValueError as error:  # TOMLDecodeError, or ValueError for a number with 5000 digits
         raise SettingsError(f"{name}: not TOML: {error}") from None
 
 
@@ -218,7 +218,7 @@ def _change(data: dict[str, Any], change: str) -> str:
     try:
         value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
-        value = text.strip()  # a string whose quotes the shell has removed
+        value = text.strip()  # a string whose quotes were removed by the shell
     held = data
     for section in sections:
         held = held.setdefault(section, {})
@@ -241,7 +241,8 @@ def _tuples(value: Any, depth: int = 0) -> Any:
         return {key: _tuples(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list):
         return tuple(_tuples(item, depth + 1) for item in value)
-    # Large integers are rejected here, because one with 5000 digits could not be printed later.
+    # Large integers are rejected here, because an integer with 5000 digits could not be printed
+    # later.
     if isinstance(value, int) and value.bit_length() > 63:
         raise ValueError("an integer beyond 64 bits")
     return value

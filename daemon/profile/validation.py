@@ -1,4 +1,4 @@
-"""Check a profile for keys that contradict each other.
+"""Check a profile for settings that contradict each other.
 
 Each check is a function that yields one line per problem, with the key, the value found and the
 value expected.
@@ -16,8 +16,8 @@ from softfinger.daemon.backends import backend, servo_model
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
-_VALUE_LENGTH_MAX = 60  # longest value in a message, in characters
-_DITHER_TICKS_MIN = 8  # ticks per period of the dither; fewer give no separate oscillation
+_VALUE_LENGTH_MAX = 60  # characters, maximum length of a value in a message
+_DITHER_TICKS_MIN = 8  # minimum number of ticks per dither period
 _SENSOR_WIDTH_MAX = 2.0  # tip diameters; a larger sensor probably belongs to another tip
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
@@ -55,9 +55,9 @@ def _wide_sensor(settings: Settings) -> Iterator[str]:
 
 
 def _small_sensor(settings: Settings) -> Iterator[str]:
-    """Compare the sensor with what a tip presses on it.
+    """Compare the sensor size with the contact area of a tip.
 
-    A solid tip presses with its whole base, springs only with the footprint.
+    A solid tip loads the sensor with its whole base, a spring tip only with the footprint.
     """
     tip, tactile = settings.tip, settings.tactile
     if tactile.backend == "none":
@@ -95,7 +95,7 @@ def _deep_grip(settings: Settings) -> Iterator[str]:
 
 
 def _strong_grip(settings: Settings) -> Iterator[str]:
-    """Compare forces with the torque of the servos over the length of a finger."""
+    """Compare forces with the servo torque divided by the finger length."""
     servos, lever = settings.servos, settings.hand.finger_length
     if servos.backend == "none" or backend("servos", servos.backend).source:
         return
@@ -117,7 +117,7 @@ def _strong_grip(settings: Settings) -> Iterator[str]:
 
 
 def _set_forces(settings: Settings) -> list[tuple[str, float]]:
-    """Return key and value [N] of the forces that are gripped with unless a command names one."""
+    """Return key and value [N] of the grip forces used by commands that do not specify a force."""
     forces = [("control.force_default", settings.control.force_default)]
     if settings.task.name != "none":
         forces.append(("task.force", settings.task.force))
@@ -127,7 +127,7 @@ def _set_forces(settings: Settings) -> list[tuple[str, float]]:
 def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
     """Yield key, force [N] and displacement [m] of an upright spring tip at the set forces.
 
-    The force is that of `Material.force_error`, by sums over steps of the strain.
+    The force is computed as in `Material.force_error`, by summing over strain steps.
     """
     if settings.tip.physics != "springs":
         return
@@ -250,7 +250,7 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
 
 
 def _missing(settings: Settings, key: str, expected: str) -> Iterator[str]:
-    """Check a string in the tactile settings that must be set for each finger in the scene."""
+    """Check a tactile setting, a string that must be given for each finger in the scene."""
     for name in settings.scene.fingers:
         if not getattr(settings.tactile, key)[FINGERS.index(name)]:
             yield f'tactile.{key}: found "" for {name}, expected {expected}'
@@ -262,7 +262,7 @@ def _too_large(key: str, found: float, unit: str, limit: float, why: str) -> Ite
 
 
 def _depth(settings: Settings) -> Iterator[str]:
-    """Check that the limit of the displacement can act."""
+    """Check that the displacement limit does not exceed the tip radius."""
     why = "the tip's radius"
     yield from _too_large("safety.d_max", settings.safety.d_max, "m", settings.tip.radius, why)
 

@@ -33,7 +33,7 @@ from softfinger.kinematics.hand.geometry import tip_position
 
 _NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention noise
 _WARNING_FRACTION = 0.9  # fraction of a fault limit at which a warning starts
-# A/rad, expected current per position error. The control loop of every servo model is stiffer.
+# A/rad, expected current per position error. The position loop of every servo model is stiffer.
 _CURRENT_PER_ERROR = 2.0
 _STANDSTILL_SPEED = 0.05  # rad/s, maximum speed of a joint at standstill
 # Minimum relative increase in commanded force, and fraction of it that must be measured.
@@ -41,8 +41,8 @@ _FORCE_RISE_MIN = 0.2
 _RESPONSE_TIME = 0.3  # s, time allowed for the measured force to follow
 _STEP_TOLERANCE = 0.02  # rad, step tolerance beyond the distance at maximum velocity
 _DRIFT_MAX = 0.1  # rad, allowed difference between angle and integrated velocity
-_DRIFT_TIME = 0.1  # s, window for this difference, to allow for velocity lag
-_LATE_TIME = 0.02  # s or 3 ticks, interval between readings that restarts the window
+_DRIFT_TIME = 0.1  # s, time window for this difference, which allows for velocity lag
+_LATE_TIME = 0.02  # s; if readings are farther apart than this and 3 ticks, the window restarts
 _FAILURE_TIME = 0.72  # s, time constant for the fraction of failed readings
 _FAILED_FRACTION_MAX = 0.75  # warning threshold, reached after 1 s without a valid reading
 _GAP_TIME = 0.1  # s, interval between readings above which steps are not checked
@@ -51,7 +51,7 @@ _GAP_TIME = 0.1  # s, interval between readings above which steps are not checke
 class JointMotion:
     """Consistency check of joint angles with measured velocities and the maximum velocity.
 
-    An encoder may jump, stop while the joint rotates, or drift while the joint is at standstill.
+    An encoder may jump, freeze while the joint rotates, or drift while the joint is at standstill.
     Its angles are then inconsistent with its velocity, and the finger's bit is set in ``jumped``.
     """
 
@@ -93,7 +93,7 @@ class JointMotion:
 
 
 class View:
-    """Scene in which limits are checked, and history required by some checks."""
+    """Scene whose limits are checked, with the history that some checks require."""
 
     def __init__(
         self,
@@ -110,11 +110,11 @@ class View:
         self.failed = 0.0  # fraction of failed readings during about the last second
         self._t = math.nan  # time of the previous state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
-        servos = settings.servos  # limited by the stiffness in current mode
+        servos = settings.servos  # in current mode, the stiffness limits `pull`
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
             self.pull = min(self.pull, 0.5 * servos.stiffness)
-        self.bad_goal = False  # a goal since the previous check was not finite
+        self.bad_goal = False  # True if a goal since the previous check was not finite
         self.grip_width = math.nan  # object width at the start of the grip [m]
         self._target = math.nan  # commanded grip force on the previous tick [N]
         self.rise_t = math.inf  # time of a commanded increase without a measured response [s]
@@ -127,7 +127,7 @@ class View:
         self.voltage = (low, high)
 
     def update(self, state: State) -> None:
-        """Record parts of this tick's state for comparison in later checks."""
+        """Store the parts of this tick's state that later checks compare."""
         self.motion.update(state.t, state.reading)
         self.wiring.update(state)
         passed, self._t = state.t - self._t, state.t
@@ -175,8 +175,8 @@ FingerCheck = Callable[[View, State, float, int], str]
 class Limit:
     """One row of the table. As a decorator, it adds the row with the decorated check.
 
-    A row without a check is added directly; its limit is applied in `Safety.write`, on the bus or
-    in the gateway.
+    A row without a check is added directly, because its limit is applied elsewhere: in
+    `Safety.write`, on the bus or in the gateway.
     """
 
     name: str
@@ -193,7 +193,7 @@ class Limit:
     def __call__(self, check: Check) -> Check:
         """Add the row with its check.
 
-        If several rows decorate the same check, the lowest row is added first.
+        If several rows decorate the same check, the one closest to the function is added first.
         """
         LIMITS.append(replace(self, check=check))
         return check
@@ -418,7 +418,7 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     )
 
 
-_OVERLAP_RATIO = 0.5  # of the tip radius; more than zero errors and frame latency cause
+_OVERLAP_RATIO = 0.5  # fraction of the tip radius; offset errors and frame latency cause less
 
 
 @Limit("joint.opens", "tips that overlap by their joint angles in an approach, and one of them has "
@@ -426,9 +426,9 @@ _OVERLAP_RATIO = 0.5  # of the tip radius; more than zero errors and frame laten
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 
-    With the wrong direction, goal, angle and current change their signs together, so the servos'
-    readings are those of a finger that closes. The first difference is the contact that is missing
-    when the tips should meet.
+    If the configured direction is wrong, goal, angle and current all change sign, so the servos'
+    readings look like those of a closing finger. The first visible difference is that contact is
+    missing when the tips should meet.
     """
     felt = [contact.contact for contact in state.contacts]
     if state.mode != Mode.GRASPING or len(view.sensors) < len(FINGERS) or all(felt):
@@ -604,7 +604,7 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
     return ""
 
 
-_GAIN_SIGMA = 1.5  # prior standard deviations of gain error that trigger a report
+_GAIN_SIGMA = 1.5  # prior standard deviations; a larger gain error is reported
 
 
 def _gain_fault(view: View, finger: int) -> str:
@@ -625,8 +625,8 @@ def _add_consistency_checks(finger: int, side: str) -> None:
     def _sensor(view: View, state: State, _: float) -> str:
         if finger not in view.fingers:
             return ""
-        # Check the gain only during a grip: after release, the cells may relax more slowly than the
-        # shape.
+        # Check the gain only during a grip. After release, the sensor cells may relax more slowly
+        # than the shape of the tip.
         return _sensor_fault(view, state, finger) or (
             _gain_fault(view, finger) if view.holds(state) else ""
         )
@@ -698,7 +698,7 @@ def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
 
 # --- the hand and its grip ------------------------------------------------------------------------
 
-_ANGLE_SIGMA = 4.0  # minimum significant difference, in summed tilt standard deviations
+_ANGLE_SIGMA = 4.0  # summed tilt standard deviations, minimum significant difference
 _ANGLE_TEXT = "difference between the two fingers' estimates of the object's angle"
 _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
@@ -710,7 +710,7 @@ _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
-    left, right = (sensor.estimate for sensor in view.sensors)  # from the newest frames alone
+    left, right = (sensor.estimate for sensor in view.sensors)  # newest frames only
     if not (left.contact and right.contact):
         return ""
     unsure = _ANGLE_SIGMA * (left.tilt_x_std + right.tilt_x_std)

@@ -20,7 +20,7 @@ from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-CHECKED = reg.BACKUP_READY  # number of registers to read, 0 … 146
+CHECKED = reg.BACKUP_READY  # number of registers to read: addresses 0 to 146
 DRIVE_REVERSE = 0b0001
 FIX = "`softfinger doctor --fix`"
 REBOOT_FIX = "remove the cause, then reboot it with `softfinger doctor --fix`"
@@ -31,11 +31,11 @@ OLD_PROTOCOL = (
     "firmware for 2.0), or use another servo",
 )
 _WATCHDOG_FIRMWARE = 38
-_FAULT_AFTER_LONG = 0.5  # s, value of servos.fault_after above which a notice is given
-_CONSTANT_RATIO_MAX = 1.3  # allowed ratio of a torque constant to the data sheet value
+_FAULT_AFTER_LONG = 0.5  # s, values of servos.fault_after above this limit cause a notice
+_CONSTANT_RATIO_MAX = 1.3  # maximum ratio of a torque constant to the data sheet value
 _TEMPERATURE_MARGIN = 10  # °C below the temperature limit
-# rad beyond the hand's limits at which an angle is implausible. Causes are a wrong zero offset, or
-# a servo that lost its turn count when it was switched off.
+# rad beyond the hand's limits. A larger angle is implausible. Possible causes are a wrong zero
+# offset, or a servo that lost its turn count when it was switched off.
 ANGLE_MARGIN = 0.25
 
 
@@ -61,7 +61,7 @@ class Examined:
     table: Registers = field(default_factory=Registers)
     errors: tuple[Finding, ...] = ()
     notices: tuple[Finding, ...] = ()
-    misplaced: Finding | None = None  # set if the joint angle is implausible
+    misplaced: Finding | None = None  # None, or the finding that the joint angle is implausible
 
     @property
     def name(self) -> str:
@@ -142,7 +142,7 @@ def check_servo(
     )
     if not low <= volts <= high:
         fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
-        fix = FIX if fits else "check the supply"  # its own limits are too narrow
+        fix = FIX if fits else "check the supply"  # the servo's own limits are too narrow
         wrong(f"supply is {volts:.1f} V, expected {low:.1f} to {high:.1f} V", fix)
     firmware = table[reg.FIRMWARE_VERSION]
     if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:
@@ -254,8 +254,8 @@ def check_angle(
 ) -> Finding | None:
     """Return a finding if a joint is far outside the hand's limits, otherwise None.
 
-    Switching torque on would immediately move such a joint back. After a reboot, the servo counts
-    from its first turn again, which corrects a lost turn.
+    Switching torque on would immediately move such a joint back. A reboot resets the servo's turn
+    count, which corrects a lost turn.
     """
     low, high = hand.q_min[finger], hand.q_max[finger]
 
@@ -281,7 +281,7 @@ def check_position(
 ) -> Finding | None:
     """Check the angle of a servo from its registers.
 
-    A servo with reversed drive mode counts from 0 down, which no reboot changes.
+    A servo in reverse drive mode counts down from 0, also after a reboot.
     """
     counts = table.long(reg.PRESENT_POSITION)
     found = check_angle(name, scale, counts, hand, finger)
@@ -293,7 +293,7 @@ def check_position(
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
-    """Check a USB adapter's latency timer against the reply time [s]; None if it has no timer.
+    """Compare a USB adapter's latency timer with the reply time [s]; None if it has no timer.
 
     The adapter holds a reply until the timer expires, so a value of 16 ms limits reads to 60 Hz.
     """

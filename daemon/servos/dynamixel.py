@@ -7,8 +7,8 @@ exchange. Every 10 ms, a read includes the goals stored in the servo, its bus wa
 more bytes).
 
 One sync write sends goal current and goal position as adjacent registers (:mod:`servos.torque`).
-Current mode and position mode have a single goal and need no indirect addresses. Required EEPROM
-values are checked but never changed.
+Current mode and position mode have a single goal, so they do not need indirect addresses. Required
+EEPROM values are checked but never changed.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _CHECK_INTERVAL = 0.01  # s
 _CHECK_FRACTION = 0.05  # maximum fraction of the line capacity used for checks
 _RECENT_TIME = 0.035  # s, maximum age of a recent goal
 _FROZEN_TIME = 0.1  # s, maximum time for which a servo's 1 ms clock may stand still
-_VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a missing reply
+_VARIED_READ_COUNT = 32  # requests with varying span lengths after a missing reply
 _CHECK_TIMEOUT = 0.2  # s, reply timeout during the checks; `clear` blocks the loop for this time
 # s, reply timeout for an emulated hand, whose clock pauses while the machine is late.
 _BUSY_TIME = 0.04
@@ -82,9 +82,9 @@ class DynamixelServos:
         self._line: ServoLine | None = None
         self._torque: Torque | None = None
         self._reads: TickReads | None = None
-        self._waiting: SerialPort | None = None  # open port, waiting for the servos to respond
-        self._turn = 0  # index of the last span length
-        self._varied_reads = 0  # remaining requests whose replies could be confused
+        self._waiting: SerialPort | None = None  # open port whose servos have not responded yet
+        self._turn = 0  # index of the most recent span length
+        self._varied_reads = 0  # number of remaining requests whose replies could be confused
         self._next_health = self._next_check = -math.inf  # clock times of the next reads
         self._check_interval = _CHECK_INTERVAL
         self._retries = 0
@@ -135,7 +135,7 @@ class DynamixelServos:
         self._line, self._torque = line, torque
 
     def _check(self, line: ServoLine, model: ServoModel) -> TickReads:
-        """Check servos, adapter and group reads; set the joint limits and the notices."""
+        """Check servos, adapter and group reads; store the joint limits and the notices."""
         port = line.port
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _CHECK_TIMEOUT)
         try:
@@ -259,7 +259,7 @@ class DynamixelServos:
             reading.temperature[joint.finger] = float(temperature)
 
     def _check_torque(self, group: GroupRead, reading: Reading, now: float) -> None:
-        """Check that each servo's clock advances and that its goal is a recent one."""
+        """Check that each servo's clock advances and that its goal is recent."""
         start, torque = group.start, self._torque
         assert torque is not None
         reading.lost = reading.frozen = 0
@@ -282,12 +282,12 @@ class DynamixelServos:
                 reading.hardware[joint.finger] = errors.data[joint.id][0]
 
     def write(self, goal: Goal) -> None:
-        """Send goal angles and current limits, but only if torque was switched on here.
+        """Send goal angles and current limits, but only if this object switched torque on.
 
         Raises
         ------
         ServoError
-            The port is gone.
+            If the port has been lost.
         """
         torque = self._torque
         if torque is None or torque.goals is None:
@@ -318,7 +318,7 @@ class DynamixelServos:
         Raises
         ------
         ServoError
-            The port is gone.
+            If the port has been lost.
         """
         torque = self._torque
         if torque is None:
@@ -337,7 +337,7 @@ class DynamixelServos:
     # --- closing ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """Return the numbers of failed exchanges since connect by type."""
+        """Return the number of failed exchanges since `connect`, by type."""
         handler = self._handler
         return {
             "timeouts": handler.timeouts,
@@ -353,7 +353,7 @@ class DynamixelServos:
     def close(self) -> None:
         """Switch torque off, verify it if possible, and close. Never raises.
 
-        Torque that another program switched on is left unchanged.
+        If another program switched torque on, it stays on.
         """
         if self._waiting is not None:
             with contextlib.suppress(Exception):

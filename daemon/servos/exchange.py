@@ -1,4 +1,4 @@
-"""Perform a tick's group reads, choose their type, and measure their duration.
+"""Perform the group reads of a tick, choose their type, and measure their duration.
 
 The daemon and `doctor` share this code, so `doctor` tests the exchanges that the daemon uses.
 """
@@ -20,25 +20,25 @@ from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.servos.protocol import TRY_COUNT, FastGroupRead, GroupRead, PacketHandler
 
 Span = tuple[int, int]  # first and last address
-# Spans of one exchange: on most ticks; including goals and bus watchdog; including supply and
-# temperature; starting at torque enable.
+# Register spans read in one exchange: the one for most ticks; with goals and bus watchdog; with
+# supply voltage and temperature; from torque enable on.
 PRESENT: Span = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
 CHECK: Span = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
 HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 # A late reply could be mistaken for the reply to the next request. After a missing reply, the next
-# requests therefore use spans of different lengths, which distinguish the replies.
-LENGTH_COUNT = 11  # per span: the shortest version, and up to ten preceding registers
+# requests therefore use spans of different lengths, so that the replies can be distinguished.
+LENGTH_COUNT = 11  # versions of each span: without and with up to ten preceding registers
 
 EXCHANGE_COUNT = 50  # number of exchanges timed by `doctor`
 _TIMED_REPLY_TIMEOUT = 0.1  # s, minimum reply timeout for timed exchanges
-_CONNECT_READ_COUNT = 9  # reads at connect; the fastest one gives the minimum reply time
-_REPLY_FRACTION_MAX = 0.8  # maximum fraction of a tick for a reply
+_CONNECT_READ_COUNT = 9  # reads in `connect`; the fastest one gives the minimum reply time
+_REPLY_FRACTION_MAX = 0.8  # maximum duration of a reply as a fraction of a tick
 _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2  # fraction of failed exchanges
 
 
 class TickReads:
-    """The group reads of a tick, all of one type, in all span lengths."""
+    """A tick's group reads, all of the same type, in all span lengths."""
 
     def __init__(
         self,
@@ -106,10 +106,10 @@ def time_exchanges(
     write: Callable[[], None] | None = None,
     count: int = EXCHANGE_COUNT,
 ) -> ExchangeTimes:
-    """Time ``count`` exchanges without pauses, reading and writing as in a tick.
+    """Time ``count`` exchanges without pauses, with the same reads and writes as in a tick.
 
-    A read waits on the wire for the preceding write, so its duration includes both. If ``write`` is
-    None, only reads are timed. Each reply may take up to 0.1 s.
+    A read has to wait until the preceding write has been transmitted, so its duration includes
+    both. If ``write`` is None, only reads are timed. Each reply may take up to 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0
@@ -166,7 +166,7 @@ def judge_exchanges(
 
 
 def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) -> list[Finding]:
-    """Return a notice if even the fastest of a few reads takes most of a tick."""
+    """Return a notice if even the fastest of a few test reads takes most of a tick."""
     least = time_exchanges(port, reads, count=_CONNECT_READ_COUNT).least
     rate = settings.loop.rate
     if least * rate <= _REPLY_FRACTION_MAX:

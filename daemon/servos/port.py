@@ -1,4 +1,4 @@
-"""Provide the SDK with an exclusive serial port and a monotonic deadline per exchange.
+"""Provide an exclusive serial port for the SDK, with a monotonic deadline for each exchange.
 
 :mod:`servos.protocol` lists the reasons why the SDK's own port is not used.
 """
@@ -19,7 +19,7 @@ from dynamixel_sdk.port_handler import PortHandler
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.port_access import grant, port_group_remedy
 
-with contextlib.suppress(ModuleNotFoundError):  # Windows supports only simulated servos
+with contextlib.suppress(ModuleNotFoundError):  # on Windows, only simulated servos are supported
     import termios
 
 BITS_PER_BYTE = 10
@@ -31,13 +31,13 @@ _SYSFS = Path("/sys/class/tty")
 
 
 def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
-    """Return the kernel file for a USB adapter's latency timer [ms], or None if there is none."""
+    """Return the kernel file for a USB adapter's latency timer [ms]; None if it does not exist."""
     place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     return place if place.exists() else None
 
 
 class PortLost(ServoError):
-    """Raised if the open port disappears: adapter unplugged or without power."""
+    """Raised if the open port disappears because the adapter was unplugged or lost power."""
 
 
 class SerialPort(PortHandler):  # type: ignore[misc]
@@ -114,7 +114,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
     def setPacketTimeout(self, packet_length: int) -> None:
         """Start the deadline for a reply of ``packet_length`` bytes."""
         wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
-        # At slow baud rates, allow twice the transmission time and the return delays.
+        # At low baud rates, allow twice the transmission time plus the return delays.
         self.deadline = time.monotonic() + max(self.reply_timeout, 2.0 * wire + 0.001)
 
     def fill(self) -> bool:

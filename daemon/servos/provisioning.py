@@ -1,8 +1,8 @@
 """Find servos on a port and configure the hand's servos: ID, baud rate and registers.
 
-Only :func:`provision` writes a servo's EEPROM. It runs only on request (`softfinger doctor --fix`)
-and with torque off. IDs and baud rates are written only to servos that are identified unambiguously
-(:func:`plan`).
+Only :func:`provision` writes a servo's EEPROM. This function runs only on request (`softfinger
+doctor --fix`) and with torque off. IDs and baud rates are written only to servos that are
+identified unambiguously (:func:`plan`).
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-SEARCH_TIME = 0.8  # s of listening per rate, enough for 253 servos at 1 Mbaud
+SEARCH_TIME = 0.8  # s, listening time per baud rate, enough for 253 servos at 1 Mbaud
 FACTORY_ID = 1
 ONE_SERVO_ONLY = (
     "connect one servo alone and run `softfinger doctor --fix`; then add the next one and run it "
     "again"
 )
 _READ_COUNT = 8  # number of full-table reads
-_REBOOT_TIMEOUT = 2.0  # s, maximum time until a servo responds after a reboot
-_WRITE_TIME = 0.05  # s for sending a packet and storing it in EEPROM
+_REBOOT_TIMEOUT = 2.0  # s, maximum time from a reboot until the servo responds
+_WRITE_TIME = 0.05  # s, time for sending a packet and storing its data in the EEPROM
 
 
 # --- finding servos ------------------------------------------------------------------------------
@@ -60,14 +60,14 @@ class FoundServo:
         return self.describe(str(self.baud))
 
     def describe(self, rates: str) -> str:
-        """Return the report line for a servo that replies at these rates [baud]."""
+        """Return the report line for a servo that replies at these baud rates."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
 
 @dataclass(frozen=True, slots=True)
 class Garbled:
-    """ID with corrupted replies: several servos share it, or the line is faulty."""
+    """ID with corrupted replies: several servos share the ID, or the line is faulty."""
 
     id: int
     baud: int
@@ -86,10 +86,10 @@ class Found:
 
     servos: tuple[FoundServo, ...]
     garbled: tuple[Garbled, ...]
-    old: tuple[int, ...] = ()  # rates at which a servo replies in Protocol 1.0
+    old: tuple[int, ...] = ()  # baud rates at which a servo replies in Protocol 1.0
 
     def old_protocol(self) -> list[Finding]:
-        """Return a finding for each rate at which a servo uses Protocol 1.0."""
+        """Return a finding for each baud rate at which a servo uses Protocol 1.0."""
         problem, fix = OLD_PROTOCOL
         return [Finding("FAIL", f"a servo at {baud} baud", problem, fix) for baud in self.old]
 
@@ -100,9 +100,9 @@ def search(
     wait: float = SEARCH_TIME,
     ids: Iterable[int] = (FACTORY_ID,),
 ) -> Found:
-    """Search the port for servos for ``wait`` [s] at each rate, without changing registers.
+    """Search the port for servos for ``wait`` [s] at each baud rate, without changing registers.
 
-    Rates that the adapter does not support are skipped. If corrupted bytes arrive, ``ids`` are
+    Baud rates that the adapter does not support are skipped. If corrupted bytes arrive, ``ids`` are
     probed individually.
 
     Raises
@@ -178,24 +178,24 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Unambiguous ``changes`` and remaining differences from the settings."""
+    """Unambiguous ``changes``, and the remaining differences from the settings."""
 
     changes: tuple[Change, ...]
-    missing: tuple[int, ...]  # fingers with an unidentified servo
-    strangers: tuple[FoundServo, ...]  # replying servos not assigned to a finger
+    missing: tuple[int, ...]  # fingers whose servo could not be identified
+    strangers: tuple[FoundServo, ...]  # servos that reply but are not assigned to a finger
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
-    """Assign the servos found at ``rates`` to the joints.
+    """Assign the servos found at the baud ``rates`` to the joints.
 
-    If a servo of the right model replies at another rate with the ID of a missing servo, it is
-    taken to be that servo. Otherwise, a single unassigned servo is assigned to a single missing
-    one. Servos with corrupted replies are not changed.
+    If a servo of the configured model replies at another baud rate with the ID of a missing servo,
+    it is assumed to be the missing servo. Otherwise, if exactly one servo is unassigned and exactly
+    one is missing, they are matched. Servos with corrupted replies are not changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
-    # An emulator without line timing replies at every rate.
+    # An emulator without line timing replies at every baud rate.
     anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
@@ -206,8 +206,8 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
         and not (each.id in anywhere and each.baud != servos.baud)
         and (each.id, each.baud) not in bad
     ]
-    # A servo with a configured ID and rate belongs to that finger even if the finger is not in the
-    # scene.
+    # A servo with a finger's configured ID and baud rate belongs to that finger, even if the finger
+    # is not in the scene.
     others = {each for each in strangers if each.baud == servos.baud and each.id in servos.ids}
     fit = [each for each in strangers if each.number == model.number and each not in others]
     missing = [servo_id for servo_id in ids if servo_id not in home]
@@ -327,14 +327,15 @@ def _set_up(
     model: ServoModel,
     result: list[Finding],
 ) -> None:
-    """Write all registers required by `register_table` and reboot the servo if needed."""
+    """Write all registers required by `register_table`, and reboot the servo if needed."""
     servo_id = settings.servos.ids[finger]
     name = servo_name(servo_id, finger)
 
     def failed(problem: str) -> None:
         result.append(Finding("warn", name, problem))
 
-    # At level 0, servos do not reply to reads, so set the level before the first read.
+    # At status return level 0, servos do not reply to reads, so set the level before the first
+    # read.
     if line.read(servo_id, reg.STATUS_RETURN_LEVEL, 1) is None:
         if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
             return failed("answers a ping but no read")
@@ -366,7 +367,7 @@ def _reboot_if_needed(
     model: ServoModel,
     result: list[Finding],
 ) -> None:
-    """Reboot a servo with a hardware error or a lost turn; its limits are already corrected."""
+    """Reboot a servo with a hardware error or a lost turn, after its limits have been corrected."""
     servo_id = settings.servos.ids[finger]
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
     table = Registers(line.read(servo_id, 0, CHECKED) or b"")
@@ -398,7 +399,7 @@ def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]
 
 
 def _reboot(line: ServoLine, servo_id: int) -> int | None:
-    """Reboot a servo and return its hardware errors, or None if it does not answer in time."""
+    """Reboot a servo and return its hardware errors, or None if it does not reply in time."""
     line.handler.reboot(line.port, servo_id)
     end = time.monotonic() + _REBOOT_TIMEOUT
     while time.monotonic() < end:

@@ -2,8 +2,8 @@
 
 :func:`required_registers` returns the table in the order of the e-Manual's control table. A servo
 retains its EEPROM permanently and its RAM until power is cut, so both may contain values from
-another program. EEPROM is checked at connect and written only by `softfinger doctor --fix`. RAM
-registers marked ``armed`` are written by `arm`, so they are correct even after a reboot.
+another program. The EEPROM is checked in `connect` and written only by `softfinger doctor --fix`.
+RAM registers marked ``armed`` are written by `arm`, so they are correct even after a reboot.
 
 The omitted registers do not affect goal tracking, limits or bus replies in the modes used by the
 hand. ID and baud rate are found by a search. Moving threshold, LED and external ports are only
@@ -23,8 +23,8 @@ from softfinger.daemon.servos.base import Status
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 
-# The return delays of both servos add up in one read. With more than 50 µs each, a read would
-# exceed a 500 Hz tick.
+# In one read, the return delays of both servos add up. If each delay were longer than 50 µs, a read
+# would exceed a tick at 500 Hz.
 RETURN_DELAY_MAX: Final = 25
 # Drive mode bits: follow another servo, and switch torque on when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
@@ -88,7 +88,10 @@ _AT: Final = {register.address: register for register in REGISTERS}
 
 
 class Requirement(NamedTuple):
-    """Required value of a register. A wrong value causes a finding with this ``status``."""
+    """Required value of a register.
+
+    If the value is wrong, a finding with this ``status`` is reported.
+    """
 
     register: Register
     holds: Callable[[int], bool]
@@ -119,7 +122,7 @@ def _exactly(
 
 
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
-    """Return the row for a limit at which the servo stops itself; ``high`` is the factory value."""
+    """Return the row for a limit at which the servo shuts down; ``high`` is the factory value."""
     register = _AT[address]
     expected = f"{low}" if low == high else f"{low} to {high}"
     return Requirement(

@@ -5,10 +5,11 @@ consists of a line ``Frame n``, which may contain more text, and the rows, with 
 sensor has no cell. A line ``@@`` may end the file. An export with a single frame has no ``Frame``
 line.
 
-Encoding, decimal sign and separator depend on the locale of the exporting machine and are detected
-from the file. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings are raw,
-pressures, or forces per cell. Free text follows ``COMMENTS:``; within it, only words in capitals
-are keys. Spreadsheets may add quotation marks, and separators at line ends.
+Encoding, decimal sign and separator depend on the locale of the exporting machine. The parser
+detects them from the file. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings
+are raw counts, pressures, or forces per cell. Free text follows ``COMMENTS:``; within this text,
+only words in capitals are keys. Spreadsheets may add quotation marks and may append separators to
+lines.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from softfinger.daemon.errors import SoftfingerError
 
 _SIZE_MAX = 1024  # maximum number of rows or cols
 _HEADER_LINES_MAX = 1000
-_READING_MAX = 1e12  # maximum reading in its unit
+_READING_MAX = 1e12  # maximum reading in the unit of the readings
 _RAW_SATURATION = 255  # the manufacturer's electronics have 8 bits
 _SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, to allow for rounding
 _EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
@@ -80,7 +81,7 @@ class Export:
 
 
 def decode(data: bytes) -> str:
-    """Decode UTF-8, UTF-16 or a single-byte encoding, with or without a byte order mark."""
+    """Decode text in UTF-8, UTF-16 or a single-byte encoding, with or without byte order mark."""
     for mark, code in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
         if data.startswith(mark):
             return data.decode(code, "replace")
@@ -129,9 +130,9 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
 def _live_cells(
     values: NDArray[np.float64], places: list[list[int]]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Set missing and never-numeric cells to 0; return the values and a mask of the other cells.
+    """Set cells without numbers to 0; return the values and a mask of the cells with numbers.
 
-    Raises TekscanError if a cell is a number only in some frames.
+    Raises TekscanError if a cell contains a number only in some frames.
     """
     unknown = np.isnan(values)
     live: NDArray[np.bool_] = ~np.any([np.isneginf(values).any(0), unknown.all(0)], axis=0)
@@ -186,7 +187,7 @@ def _frames(
             continue
         if line.lstrip(_EDGE_CHARACTERS).startswith("@@"):
             break
-        if re.match(r'"?[^\W\d]{2}', line):  # A row starts with a number or a single B.
+        if re.match(r'"?[^\W\d]{2}', line):  # A row starts with a number or a single letter B.
             match = re.match(r'"?[^\W\d]+[\s:#,;]*(\d{1,9})\b', line)
             if match is None:
                 if re.match(r'"?(nan|inf)', line, re.IGNORECASE) is None:
@@ -244,7 +245,7 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
     cells = [cell.strip(' "').upper() for cell in _cells(line, separator, cols)]
     missing = cells.count("B")
     if separator == "," and len(cells) != cols:
-        # Commas are decimal signs only if every number has one.
+        # Commas are decimal signs only if every number contains one.
         if len(cells) == 2 * cols - missing:
             parts = iter(cells)
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
@@ -270,8 +271,8 @@ _GROUPS = str.maketrans("", "", "'\N{RIGHT SINGLE QUOTATION MARK}\N{NO-BREAK SPA
 def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
-    If both occur, the last one is the decimal sign, and the other one groups digits. Apostrophes
-    and narrow spaces only group digits.
+    If both characters occur, the last one is the decimal sign, and the other groups digits.
+    Apostrophes and narrow spaces only group digits.
     """
     text = text.translate(_GROUPS)
     if "," in text:

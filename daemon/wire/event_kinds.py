@@ -265,7 +265,7 @@ KINDS: dict[str, EventKind] = {
         "After the warning, check the board's gain and `tactile.full_count`. If the change is "
         "large at every start, repeat `softfinger calibrate tare`.",
     ),
-    # Consistency checks between the hand's parts
+    # consistency checks between components of the hand
     "hand.angle": EventKind(
         "warning, error",
         "The two fingers measure different angles of the object.",

@@ -1,8 +1,8 @@
 """Manage CurveZMQ keys for the daemon and its clients: key files and socket options.
 
 The server and every client have their own key pairs. A client needs the server's public key. The
-server needs the public keys of its clients and rejects all others. `make_keys` creates a folder
-with these files:
+server needs the public keys of its clients and rejects all other clients. `make_keys` creates a
+folder with these files:
 
 ``server/server.key_secret``, ``server/server.key``
     the daemon's key pair, and its public key alone
@@ -50,9 +50,9 @@ class ServerKeys:
     clients: dict[bytes, str]  # public key → name
 
     def left(self, folder: Path) -> ServerKeys:
-        """Return the keys without clients whose files were removed. Raises KeyFileError.
+        """Return the keys without those of clients whose files were removed. Raises KeyFileError.
 
-        This method does not open files, so it works even without a free file descriptor.
+        This method does not open files, so it works even if no file descriptor is free.
         """
         clients = _place(folder) / "clients"
         _check_above(clients / "any")
@@ -93,7 +93,7 @@ def check_curve() -> None:
 
 
 def make_keys(folder: Path, names: list[str]) -> list[Path]:
-    """Create a key pair for each client, and one for the server if it has none.
+    """Create a key pair for each client, and for the server if it does not have one yet.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     Raises
     ------
     KeyFileError
-        If a file can't be written, or if a client already exists. In the latter case nothing is
+        If a file can't be written, or if a client already exists. In the latter case, no files are
         written.
     """
     check_curve()
@@ -141,7 +141,7 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
             client.mkdir()
             zmq.auth.create_certificates(client, "client")
             shutil.copyfile(server / "server.key", client / "server.key")
-            # This step is last, so that the server accepts only clients with complete keys.
+            # This step comes last, so that the server accepts only clients with complete keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     finally:
         os.umask(before)
@@ -207,7 +207,7 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
                 raise ValueError("a key has the wrong length")
     except OSError as error:
         raise _unreadable(path, error) from None
-    except (ValueError, LookupError, struct.error):  # struct.error: value exceeds the Z85 range
+    except (ValueError, LookupError, struct.error):  # struct.error: a value exceeds the Z85 range
         raise KeyFileError(f"{path}: not a key file") from None
     return keys
 

@@ -1,11 +1,11 @@
-"""Define the stream schema: the single declaration of all topics and fields.
+"""Define the stream schema, the only declaration of all topics and fields.
 
-Each topic is a record. Each field has a unit, a meaning and a source. Its value is a function of
-the source or the source's attribute of the same name. The packers (`wire.publisher`), the records
-that clients read (`client.stream`), the ``STREAM.md`` page and the JSON Schemas of recordings
-(`wire.schema_docs`) are derived from these declarations.
+Each topic is a record. Each field has a unit, a meaning and a source. The value of a field is
+either a function of the source or the source's attribute of the same name. The packers
+(`wire.publisher`), the records that clients read (`client.stream`), the ``STREAM.md`` page and the
+JSON Schemas of recordings (`wire.schema_docs`) are derived from these declarations.
 
-New versions may add fields but never remove any. A float is always sent as a float. Values are in
+New versions may add fields but never remove them. A float is always sent as a float. Values are in
 SI units.
 """
 
@@ -89,7 +89,7 @@ def _ns(t: float) -> int:
     return int(t * 1e9)
 
 
-# Fields shared by several sources are declared for only one of them.
+# Fields that several sources share are declared for only one of them.
 _tick = FieldSource["StateSource"]()
 _state = _tick.of(lambda m: m.state)
 _timing = _state.of(lambda s: s.timing)
@@ -326,7 +326,7 @@ _info = _tactile.of(lambda m: m.info)
 )
 @record
 class TactileFrame:
-    """One ``hand/tactile`` message. Raises ValueError if its data is not a rows × cols grid."""
+    """One ``hand/tactile`` message. Raises ValueError if the data is not a rows × cols grid."""
 
     schema: int = _tactile(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _frame(*_SEQ)
@@ -373,7 +373,7 @@ class TactileFrame:
 
     @property
     def counts(self) -> NDArray[np.uint16]:
-        """The data, uint16 [rows, cols], read-only."""
+        """The frame's data, uint16 [rows, cols], read-only."""
         return np.frombuffer(self.data, dtype="<u2").reshape(self.rows, self.cols)
 
     @property

@@ -1,4 +1,4 @@
-"""Define shapes of the simulated object: outline, inertia and table friction radius."""
+"""Define the shapes of the simulated object: outline, inertia and radius for table friction."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Shape:
 
     @property
     def extent(self) -> float:
-        """Maximum distance of a point from the centre."""
+        """Maximum distance of an outline point from the centre."""
         return self.roundness or float(np.hypot(*self.corners.T).max())
 
     @property
     def half_width(self) -> float:
-        """Half the width at the centre height."""
+        """Half of the width at the height of the centre."""
         x, y = np.vstack((self.corners, self.corners[:1])).T
         across = [
             x[k] - y[k] * (x[k + 1] - x[k]) / (y[k + 1] - y[k])
@@ -58,7 +58,7 @@ class Shape:
 
 
 def shape_of(settings: Settings) -> Shape:
-    """Create the object in the settings with the function registered in `daemon.backends`."""
+    """Create the configured object with the function registered in `daemon.backends`."""
     simulation = settings.simulation
     found = backend("shapes", simulation.object_shape)
     shape: Shape = found.load()(simulation, *found.options(settings.plugins.tables))
@@ -68,9 +68,9 @@ def shape_of(settings: Settings) -> Shape:
 def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
     """Create a convex polygon with 3 to 8 ``corners`` [n, 2] in m, counter-clockwise.
 
-    The corners may have any origin; the shape is then centred on its centre of mass. The area
-    integrals are closed-form sums over the triangles between the centre and each edge. Raises
-    ValueError for other outlines.
+    The corners may refer to any origin; they are shifted so that the centre of mass is at 0. The
+    area integrals are closed-form sums over the triangles between the centre and each edge. Raises
+    ValueError if the outline is not such a polygon.
     """
     points = np.array(corners, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or not 3 <= len(points) <= CORNERS:
@@ -97,7 +97,7 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
 
 
 def rectangle(simulation: SimulationSettings) -> Shape:
-    """Create a box with the width and height in the settings."""
+    """Create a box with the configured width and height."""
     return polygon(_trapezoid(simulation, 0.0))
 
 
@@ -117,7 +117,7 @@ def wedge(simulation: SimulationSettings) -> Shape:
 
 
 def disc(simulation: SimulationSettings) -> Shape:
-    """Create a disc with the radius in the settings."""
+    """Create a disc with the configured radius."""
     radius = simulation.object_radius
     square = radius * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
