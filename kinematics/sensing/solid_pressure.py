@@ -1,6 +1,6 @@
 """Forward model of a solid tip: a frame is a weighted sum of fixed images.
 
-Each image shows a mode from `solid_data`. A mode gives one image of the grid, or two if it is
+Each image shows a mode from `solid_data`. A mode has one image on the grid, or two images if it is
 directional: B(r) cos mφ and B(r) sin mφ, averaged over each cell. The image weights are smooth
 functions of (d, n_x, n_y). Because the sensor cannot measure tension, a cell reads 0 where the sum
 is negative.
@@ -26,10 +26,10 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
 IMAGES = 2 * MODES
-_IMAGES_PER_PASS = 4  # images added per pass; must divide IMAGES
+_IMAGES_PER_PASS = 4  # number of images added per pass; must divide IMAGES
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
-# Sample points along each side of a cell: inside the rim, cut by the rim, and with blur.
+# Sample points per cell side: for cells inside the rim, cells cut by the rim, and with blur.
 _INSIDE, _CUT, _BLURRED = 6, 24, 12
 
 
@@ -196,7 +196,7 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
 def own_shear(weights: Weights, d: float, square: float) -> float:
     """Return the shear force of straight indentation on a sticking face, divided by a² sin θ [Pa].
 
-    The shear acts at height a and is already included in the modes. ``weights`` must be set for
+    This shear acts at height a and is already included in the modes. ``weights`` must be set for
     this contact.
     """
     q = weights.q[0]
@@ -257,7 +257,7 @@ def _add_images(
 def add_images(weights: Weights, of: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
     """Add all images, stored consecutively in ``pixels``, multiplied by the weights ``of``.
 
-    The last group may include the shear images, whose weights are 0 here.
+    The last group of images may include the shear images, whose weights are 0 here.
     """
     count = out.shape[0]
     for j in range(0, weights.images, _IMAGES_PER_PASS):
@@ -295,9 +295,9 @@ def render_solid(
     """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), multiplied by ``gain``, into ``out``.
 
     ``shear`` [N] is the force on the face along x and y, acting at height a. If ``whole`` is True,
-    it is the total shear; otherwise it is added to the shear of straight indentation. ``basis``
-    holds the grid's images. The result is zero for d ≤ 0. Contacts outside the range of the data
-    are clamped to the maximum depth and tilt at the same azimuth.
+    ``shear`` is the total shear; otherwise ``shear`` is added to the shear of straight indentation.
+    ``basis`` holds the grid's images. The result is zero for d ≤ 0. Contacts outside the range of
+    the data are clamped to the maximum depth and tilt at the same azimuth.
     """
     each = weights[0]
     table = each.table
