@@ -1,4 +1,4 @@
-"""Test rigs for several benchmarks: holding daemons, canned backends and an emulated hand."""
+"""Test rigs for several benchmarks: daemons with a held object, canned backends, emulated hands."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _FRAME_COUNT = 16  # frames used in turn
 
 
 class RigError(SoftfingerError):
-    """The test rig does not work, so the measurement is not possible."""
+    """The measurement is not possible, because the test rig does not work."""
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:

@@ -37,7 +37,7 @@ _POSES = {
     "zero": "put it upright, straight away from the palm",
 }
 _LEAST = 0.2  # rad, minimum rotation between closed and open
-_ALONE = 0.25  # 1, fraction of this rotation by which the other finger may move
+_ALONE = 0.25  # 1, maximum motion of the other finger, as a fraction of this rotation
 _MARGIN = 0.03  # rad, margin between the stops and the commanded range
 _Counts = dict[int, int]  # keys: servo IDs
 
@@ -47,8 +47,8 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
 
     Raises
     ------
-    ServoError, CalibrationError, SettingsError
-        If this fails; the profile is then unchanged.
+    ServoError, CalibrationError, SettingsError If the procedure fails; the profile is then
+    unchanged.
     """
     servos = settings.servos
     if servos.backend != "dynamixel":
@@ -92,7 +92,8 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _read(line: ServoLine, ids: list[int]) -> _Counts:
-    """Return all servo positions; raise ServoError if torque is on or one exceeds a turn."""
+    """Return all servo positions; raise ServoError if torque is on or a position exceeds one
+    turn."""
     counts = {}
     for servo in ids:
         table = Registers(line.read(servo, 0, CHECKED) or b"")
@@ -163,7 +164,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write ``new`` to the file, or to a copy of the profile, and preserve all other text."""
+    """Write ``new`` to the file, or to a copy of the profile; all other text is preserved."""
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
     load(source, arguments.dir or own_runtime_folder(), [*arguments.set, *changes])

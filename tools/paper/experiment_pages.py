@@ -106,7 +106,8 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return force and energy along the path: the finger rotates about its root, the object rolls.
+    """Return force and energy along the path: the finger rotates about its root, then the object
+    rolls.
 
     For each final displacement D, the root is D/sin 11.5° away from the tip centre. During the
     rotation, d therefore increases from first touch as D sin |θ|/sin 11.5°. During rolling, d is
@@ -124,7 +125,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
             f"F at d = {deepest} mm [N]": _force(d, tilting),
         }
         force, law = _force(d, rolling), _force_table_i(d, rolling)
-        # If the springs point at the tip centre (Nguyen and Arimoto), N = πE d² at any tilt.
+        # If the springs point towards the tip centre (Nguyen and Arimoto), N = πE d² at any tilt.
         radial = np.full(rolling.shape, math.pi * MODULUS * (d * MILLI) ** 2)
         second |= {
             f"F at d = {deepest} mm [N]": force,
@@ -216,7 +217,7 @@ def integrated_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def _appendix() -> tuple[Sheet, ...]:
-    d = np.arange(1, 81) / 10.0  # The terms cancel at d = 0.
+    d = np.arange(1, 81) / 10.0  # The terms cancel each other at d = 0.
     metres = d * MILLI
     columns = {"d [mm]": d}
     for how, terms in (
