@@ -32,8 +32,8 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-_CONNECT_TIMEOUT = 10.0  # s, time limit for the scheduler connection
-_REDRAW_INTERVAL = 0.1  # s, between two redraws of a bar
+_CONNECT_TIMEOUT = 10.0  # s, time limit for connecting to the scheduler
+_REDRAW_INTERVAL = 0.1  # s, time between two redraws of a bar
 _BAR_WIDTH = 20  # columns
 
 
@@ -51,7 +51,7 @@ class Progress:
         self.on = on and sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
-        """Show ``done`` of the total, with ``note`` instead of the percentage."""
+        """Show the completed amount ``done``, with ``note`` instead of the percentage if given."""
         if not self.on or time.monotonic() - self._shown < _REDRAW_INTERVAL:
             return
         self._shown = time.monotonic()

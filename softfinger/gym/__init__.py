@@ -1,4 +1,4 @@
-"""Provide Gymnasium environments with the simulated hand.
+"""Gymnasium environments with the simulated hand.
 
 Importing this package registers ``SoftFinger-Grasp-v0``, ``SoftFinger-Rotate-v0`` and
 ``SoftFinger-Push-v0``. The simulated hand is loaded when an environment is created, for example
@@ -11,7 +11,8 @@ from softfinger.tools.extras import require
 
 require("gym")
 
-from gymnasium.envs.registration import register  # noqa: E402 - require() explains a missing install
+# Noqa: E402 - require() explains a missing install.
+from gymnasium.envs.registration import register
 
 __all__ = ["SECONDS", "STEP", "TASKS"]
 

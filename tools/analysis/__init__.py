@@ -1,5 +1,4 @@
-"""Analyse recordings: `analyse` computes contacts from frames, and `plot` compares recorded
-contacts with the model.
+"""Analyse recordings: `analyse` computes contacts, and `plot` compares them with the model.
 
 Both commands use the daemon's estimator.
 """

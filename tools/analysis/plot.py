@@ -169,8 +169,7 @@ def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
 
 
 def draw_angle(run: RecordedRun) -> Figure:
-    """Plot F and U versus θ with curves of constant d, and the ratio of measured to model
-    pressure."""
+    """Plot F and U versus θ with curves of constant d, and ratios of measured to model values."""
     tables = run.contacts()
     rows = len(tables)
     figure = style.new_figure(7.2, 1.9 + 3.0 * rows)

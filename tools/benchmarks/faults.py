@@ -132,8 +132,7 @@ class GripTrial:
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
-        """Return (time, channel) for each correct diagnosis, or each wrong one if not
-        ``rightly``."""
+        """Return (time, channel) of all correct or, if not ``rightly``, all wrong diagnoses."""
         names = [
             (t, k.removeprefix(_EVENT_PREFIX))
             for t, k in self.events

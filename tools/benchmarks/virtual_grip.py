@@ -108,8 +108,7 @@ class VirtualGrip(SimulatedDaemon):
         return {}
 
     def until(self, mode: str, seconds: float) -> bool:
-        """Advance until the hand is in ``mode``; return False if this takes longer than
-        ``seconds``."""
+        """Advance until the hand is in ``mode``; return False after a timeout of ``seconds``."""
         end = self.state.t + seconds
         while self.state.mode != mode and self.state.t < end:
             self.loop.advance(self.loop.period)

@@ -38,8 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 class _Quantity(NamedTuple):
-    """Quantity in a file: accepted column names, and accepted units with their factors to SI
-    units."""
+    """Quantity in a file: accepted column names, and accepted units with their SI factors."""
 
     words: set[str]
     units: dict[str, float]

@@ -106,8 +106,7 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return force and energy along the path: the finger rotates about its root, then the object
-    rolls.
+    """Return force and energy while the finger rotates about its root and then the object rolls.
 
     For each final displacement D, the root is D/sin 11.5° away from the tip centre. During the
     rotation, d therefore increases from first touch as D sin |θ|/sin 11.5°. During rolling, d is

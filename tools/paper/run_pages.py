@@ -175,8 +175,7 @@ def _estimates(contact: Contact) -> tuple[float, ...]:
 def _columns(
     rows: Iterable[Row], daemon: Daemon, suffix: str = "", sign: float = 1.0
 ) -> dict[str, FloatArray]:
-    """Return true and estimated values per frame; ``sign`` converts θ to the paper's sign
-    convention."""
+    """Return true and estimated values per frame; ``sign`` converts θ to the paper's convention."""
     truth, estimates = (np.array(each) for each in zip(*rows, strict=True))
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
     contact = daemon.tables[0](d, theta)

@@ -117,8 +117,7 @@ def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
 
 
 def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
-    """Find the root near ``start`` by Newton's method; raise RuntimeError if it does not
-    converge."""
+    """Find the root near ``start`` by Newton's method; raise RuntimeError without convergence."""
     x = start.copy()
     for _ in range(30):
         value = residual(x)

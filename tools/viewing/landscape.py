@@ -23,8 +23,8 @@ from softfinger.kinematics.contact.table_record import TableError
 from softfinger.tools.terminal import heatmap
 
 WIDTH, HEIGHT = 240, 200  # pixels of the landscape
-THETA_END = 45.0  # degrees, range of θ per side
-_TOLERANCE = 1e-6  # relative error of the table for the picture
+THETA_END = 45.0  # degrees, maximum |θ|
+_TOLERANCE = 1e-6  # relative tolerance of the table for the picture
 
 
 class Landscape(NamedTuple):
