@@ -11,8 +11,7 @@ from softfinger.tools.extras import require
 
 require("gym")
 
-# Noqa: E402 - require() explains a missing install.
-from gymnasium.envs.registration import register
+from gymnasium.envs.registration import register  # noqa: E402 - require() explains a missing install
 
 __all__ = ["SECONDS", "STEP", "TASKS"]
 

@@ -94,8 +94,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     .. [1] Ng, Harada & Russell, "Policy invariance under reward transformations", ICML 1999.
     """
 
-    # Noqa: RUF012.
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1.0 / STEP)}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1.0 / STEP)}  # noqa: RUF012
 
     def __init__(
         self,

@@ -78,7 +78,7 @@ def _stroke(
 
 
 def _box(at: NDArray[np.float64], reach: float) -> tuple[slice, slice]:
-    """Return the rows and columns of all pixels within a distance ``reach`` of points [n, 2]."""
+    """Return slices that enclose all pixels within a distance ``reach`` of points [n, 2]."""
     low, high = np.floor(at.min(axis=0) - reach), np.ceil(at.max(axis=0) + reach)
     (x0, y0), (x1, y1) = np.clip((low, high), 0, (_SIDE, HEIGHT)).astype(int).tolist()
     return slice(y0, y1), slice(x0, x1)
@@ -107,8 +107,7 @@ class Window:
         tkinter.Label(self._root, image=self._photo).pack()
 
     def show(self, image: Image, period: float) -> None:
-        """Show an image ``period`` [s] after the last image. A window that the user has closed
-        stays closed."""
+        """Show an image ``period`` [s] after the last image, unless the window has been closed."""
         time.sleep(max(self._shown + period - time.monotonic(), 0.0))
         self._shown = time.monotonic()
         import tkinter

@@ -123,8 +123,7 @@ def _check_counters(backend: Servos | TactileSensor) -> None:
 
 
 def check_shape(settings: Settings) -> None:
-    """Create the object's shape and compare its properties with values computed from its
-    corners."""
+    """Create the object's shape and compare its properties with values from its corners."""
     shape = shape_of(settings)
     assert isinstance(shape, Shape), f"found {type(shape).__name__}, expected a Shape"
     if shape.kind == DISC:

@@ -1,5 +1,4 @@
-"""Emulated hardware on pseudo-terminals: a complete hand in a process, or only servos in a
-thread."""
+"""Emulated hardware on pseudo-terminals: a hand in a process, or only servos in a thread."""
 
 from __future__ import annotations
 
@@ -44,8 +43,8 @@ class EmulatedHand:
 
     Attributes
     ----------
-    folder : folder of the ports, to be passed as ``--dir`` to `softfinger run --config hil` ports :
-    paths of the serial ports ``servos``, ``tactile-left`` and ``tactile-right``
+    folder : folder of the ports, to be passed as ``--dir`` to `softfinger run --config hil`
+    ports : paths of the serial ports ``servos``, ``tactile-left`` and ``tactile-right``
 
     Raises
     ------
@@ -76,6 +75,7 @@ class EmulatedHand:
 
     def fault(self, *words: str) -> None:
         """Start faults such as ``"left:silent"`` or ``"drop=0.01@2"``; ``"well"`` ends all faults.
+
         `softfinger help emulate` lists all faults. Raises Refused if a word is not understood.
         """
         self.send(" ".join(words))
@@ -141,8 +141,8 @@ class EmulatedBus:
     ----------
     model, ids : model and IDs of the servos
     baud : if 0, the servos reply immediately at any baud rate; otherwise they reply only at this
-    baud rate, with its transmission time bus : your own servos instead, for example on another
-    plant
+        baud rate, with its transmission time
+    bus : your own servos instead, for example on another plant
 
     Attributes
     ----------
@@ -170,8 +170,7 @@ class EmulatedBus:
 
     @property
     def port(self) -> str:
-        """Path of the serial port; the path changes when the port is unplugged and plugged in
-        again."""
+        """Path of the serial port; the path changes when the port is plugged in again."""
         return self._terminal.path
 
     def call(self, job: Callable[[], Any]) -> Any:

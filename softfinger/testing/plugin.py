@@ -24,8 +24,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _options(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """Return the options of all markers on the test; the marker closest to the test has
-    priority."""
+    """Return the options of all markers on a test; markers closer to the test have priority."""
     markers = list(reversed(list(request.node.iter_markers("softfinger"))))
     for marker in markers:
         if marker.args:

@@ -164,7 +164,7 @@ class VirtualTimeHand(Hand):
         Parameters
         ----------
         controller : function that is called with each published state, ``stream.state_rate`` times
-        per second, and returns either the next command as a map or None:
+            per second, and returns either None or the next command as a map such as
             ``{"command": "hold", "force": 5.0}``
 
         Returns
@@ -272,7 +272,7 @@ class VirtualHand(VirtualTimeHand):
     profile : name or file of a profile with a simulated hand; None for the default settings
     changes : settings to change, in the form of ``--set``
     plant : settings that apply only to the simulated hand and are unknown to the daemon, in the
-    same form
+        same form
 
     Attributes
     ----------

@@ -209,8 +209,7 @@ _Tick = tuple[
 def _ticks(
     recording: Recording, used: Settings, progress: Callable[[int], None] | None
 ) -> Iterator[_Tick]:
-    """Yield all ticks. A recording contains a tick's frames and commands, then its input and
-    state."""
+    """Yield all ticks. Frames and commands precede the tick's input, which precedes its state."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}

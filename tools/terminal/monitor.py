@@ -111,8 +111,7 @@ class HandKeys:
             self._commander.send(now, label, "grasp", force=self._chosen)
 
     def _rotate(self, step: float, now: float) -> None:
-        """Rotate by one step from the last target, not the current angle, so that presses add
-        up."""
+        """Rotate by one step from the last target, not the current angle, so presses add up."""
         reply, pose = self._commander.reply, self._feed.state.object
         refused = reply is not None and not reply.ok
         if self._target is None or refused or self._feed.mode not in ("rotating", "holding"):
