@@ -21,7 +21,7 @@ __all__ = ["SimulatedDaemon"]
 
 @dataclass(frozen=True)
 class TrueStates:
-    """True states of the simulated hand, one per tick."""
+    """True state of the simulated hand at each tick."""
 
     t: NDArray[np.float64]  # s
     force: NDArray[np.float64]  # N, [n, 2]

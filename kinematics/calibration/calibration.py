@@ -81,7 +81,7 @@ class Tare:
 def tare(frames: ArrayLike) -> Tare:
     """Determine the zero offset and noise of each cell from unloaded frames [n, rows, cols].
 
-    Raises CalibrationError if several cells vary much more than the others, which indicates a
+    Raises CalibrationError if several cells vary much more than other cells, which indicates a
     contact.
     """
     stack = _stack(frames, "tare")
@@ -333,8 +333,8 @@ def fit_centre(
     """Determine centre and rotation from presses at known tilts ``theta`` [n] [rad].
 
     The tilts are in the finger's plane. The fit uses all cells of the ``frames`` [n, rows, cols]
-    [Pa]. The modulus of a spring tip need not be known. Raises CalibrationError if a frame does not
-    show a contact, or if all tilts are equal but nonzero.
+    [Pa]. For a spring tip, a known modulus is not required. Raises CalibrationError if a frame does
+    not show a contact, or if all tilts are equal but nonzero.
     """
     stack = _stack(frames, "centre")
     s = np.sin(np.asarray(theta, np.float64))
@@ -353,7 +353,8 @@ def fit_centre(
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
-    # Add the uncertainty of the upright orientation, which shifts the centroid by lever × angle.
+    # Add the uncertainty of the upright orientation, which shifts the centroid by moment arm ×
+    # angle.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
     std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
     return Centre(found.centre, found.rotation if tilted else None, residual, std)

@@ -246,8 +246,8 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
     tip
         Its radius and physics.
     law
-        Shape of the stress-strain law for a modulus of 1 Pa. None stands for springs with
-        σ = c_1 ε + c_2 ε² + c_3 ε³, whose modulus changes with the depth.
+        Shape of the stress-strain law for a modulus of 1 Pa. None selects springs with σ = c_1 ε +
+        c_2 ε² + c_3 ε³, whose modulus depends on the strain.
 
     Raises
     ------

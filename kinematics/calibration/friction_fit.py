@@ -40,7 +40,7 @@ class FrictionFit(NamedTuple):
     coulomb_std: float
     viscous: float  # [N·m·s/rad]
     viscous_std: float
-    stiction: float  # at break-away; NaN for fewer than three slow starts from standstill
+    stiction: float  # friction at break-away; NaN for fewer than three slow starts from standstill
     stiction_std: float
 
 
@@ -58,8 +58,8 @@ def fit_friction(
 
         torque = F sign(q̇) + b q̇ + J q̈ + c0 + c1 q + c2 q²
 
-    where F is the Coulomb friction and b ≥ 0 the viscous friction. The polynomial covers torques
-    that do not depend on the direction of motion: weight, cables and the current offset. The
+    where F is the Coulomb friction and b ≥ 0 the viscous friction. The polynomial models torques
+    that do not depend on the direction of motion, i.e. weight, cables and the current offset. The
     break-away friction is the maximum torque during a start from standstill with a slow goal.
 
     Parameters
@@ -148,7 +148,7 @@ def _least_squares(
     )
     rounding = step * step / 12.0
     variance = rounding
-    for _ in range(2):  # the second pass uses the noise estimate of the first
+    for _ in range(2):  # the second pass uses the noise estimate from the first pass
         per_sample = _STEP / _CORRELATION_TIME / variance
         covariance = np.linalg.inv(per_sample * columns.T @ columns + weight)
         found = covariance @ (per_sample * columns.T @ values + weight @ prior)

@@ -17,7 +17,7 @@ _STEP = 1e-3  # s, time grid and spacing of the initial delays
 _DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # s, range of latencies to search
 # Minimum closing speed in a ramp [m/s], and the time over which the speed is averaged [s].
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
-_RAMP_MARGIN = 0.2  # s, time before and after a ramp that is included in the ramp
+_RAMP_MARGIN = 0.2  # s, time before and after a ramp that still counts as part of the ramp
 _CLOSING_MIN = 8e-4  # m, minimum closing distance in a ramp, seven encoder counts
 _FRAME_COUNT_MIN = 8  # minimum number of frames
 _TIME_ERROR = 1e-3  # s, standard deviation of the times of ticks, readings and frames

@@ -1,7 +1,7 @@
 """Stress-strain laws of tip materials.
 
 A law σ(ε) is a single polynomial on the strain range ε ∈ [0, 1], with σ(0) = 0 and a positive slope
-everywhere. It is smooth and monotone, so numerical integration converges fast.
+everywhere. The law is smooth and monotonic, so numerical integration converges quickly.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Contact tables of solid and measured tips, and their lookup kernels.
+"""Contact tables for solid and measured tips, and the lookup kernels for these tables.
 
 All six outputs follow from the energy U = E a³ t⁵ g (see `solid_data`), where g(t, sin² θ) is a
 polynomial and t = √(d/a). The outputs are therefore consistent with each other to within rounding.

@@ -2,8 +2,8 @@
 
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
-higher coefficients, and rounding. It assumes that the reference integrals have only rounding
-errors, and that the coefficients beyond the computed ones keep decreasing. Both assumptions hold
+higher coefficients, and rounding. The bound assumes that the reference integrals have only rounding
+errors, and that coefficients beyond the computed ones continue to decrease. Both assumptions hold
 for all supported laws, because each law is a single polynomial. Pieces are halved until the bound
 is within the tolerance.
 """

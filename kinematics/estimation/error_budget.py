@@ -251,7 +251,7 @@ def widen_covariance(state: EstimatorState) -> float:
 
 @fast_inner_kernel
 def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> tuple[float, float]:
-    """Return the sum of the products of row-wise neighbouring residuals [Pa²], and their number.
+    """Return the sum [Pa²] and the number of products of neighbouring residuals in a row.
 
     Only cells with a modelled pressure above ``lowest`` [Pa] are included.
     """
@@ -343,7 +343,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     """Set ``budget.shared``, the covariance of the fit parameters due to common errors.
 
     ``fit.inverse`` must be the covariance for white noise of variance 1 Pa². Returns the sum of
-    squared residuals [Pa²] for common errors of twice their standard deviations.
+    squared residuals [Pa²] that results if each common error equals twice its standard deviation.
     """
     fit = state.fit
     budget = state.budget

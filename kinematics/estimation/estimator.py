@@ -213,8 +213,8 @@ def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> ND
     The model may be inaccurate at the rim, where the stress of a bonded base is singular and
     depends on the mesh. Compared with frames from independent finite elements, the model's rms
     error is 3 % if the rim cells are included and 0.6 % otherwise. If a lying base is tilted, the
-    model predicts tension at the rim, where real rubber lifts off. The mask also allows for an
-    uncertain tip position.
+    model predicts tension at the rim, where real rubber lifts off. The mask also takes the
+    uncertainty of the tip position into account.
     """
     margin = max(_RIM_WIDTH[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
     cells = grid.on(tip)
@@ -281,7 +281,7 @@ class ContactEstimator:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
         readings = readings or Readings()
         self.grid = grid
-        self._full = math.nan  # saturation for the type of the last frame
+        self._full = math.nan  # saturation value for the type of the last frame
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         known = known or Uncertainty()

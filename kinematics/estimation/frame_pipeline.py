@@ -34,7 +34,7 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import points_in
 
-# Clipping of the noise at 0 raises the sums of neighbourhoods. Increasing the detection level by
+# Clipping the noise at 0 increases the sums over neighbourhoods. Increasing the detection level by
 # this amount restores the false alarm rate.
 CLIPPED_LEVEL_INCREASE = 0.5
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # range of the gain for a contact of this tip on this sensor
@@ -57,7 +57,7 @@ SHARED_MAX = 0.5  # maximum standard deviation of d due to known uncertainties, 
 
 @inner_kernel
 def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Fit by maximum likelihood from the last estimate, or from the frame alone if that fails."""
+    """Fit by maximum likelihood from the last estimate or, if this fails, from the frame alone."""
     estimate = state.estimate
     options = state.options
     signal = state.signal
@@ -264,8 +264,8 @@ def estimate_frame(
     rejected = without_outliers(state, frame, cells.height)
     strong = False
     if state.options.is_solid and signal.is_finite:
-        # Every contact matches the pattern. A strong signal without the pattern is not a contact of
-        # this tip. A small common zero offset does not count as a signal.
+        # Every contact of a solid tip matches the pattern. A strong signal without the pattern is
+        # not a contact of this tip. A small common zero offset does not count as a signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > STRONG_PEAK * signal.noise
         signal.contact = shows_pattern(state, frame, cells)

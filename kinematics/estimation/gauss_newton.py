@@ -368,7 +368,7 @@ def _apply_step(state: EstimatorState) -> bool:
 
 @inner_kernel
 def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
-    """Set the covariance of (d, n_x, n_y, gain) from that of the fit parameters."""
+    """Set the covariance of (d, n_x, n_y, gain) from the covariance of the fit parameters."""
     for i in range(4):
         for j in range(4):
             out[(i + 3) % 4, (j + 3) % 4] = variance * inverse[i, j]
@@ -427,7 +427,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
         y = fit.shear[1] + own * fit.n_y
         estimate.shear_x = along * x - across * y
         estimate.shear_y = across * x + along * y
-    # Noise may push the fit beyond the limits of the model; clamp the result.
+    # Clamp the result, because noise may push the fit beyond the limits of the model.
     within = min(1.0, options.sine_max / max(math.sqrt(square), 1e-9))
     estimate.d = min(fit.d, options.deepest)
     estimate.n_x = within * fit.n_x
@@ -450,7 +450,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
 def fit(
     state: EstimatorState, model: Model, frame: FloatArray, cells: Cells, tolerance: float
 ) -> bool:
-    """Run Gauss-Newton from the contact in ``state.estimate`` and store the new estimate there.
+    """Run the Gauss-Newton method from the contact in ``state.estimate``; store the result there.
 
     The iteration stops if the predicted decrement is below ``tolerance`` · variance, where
     ``tolerance`` is the squared ratio of the step to the noise floor. Returns False if the frame

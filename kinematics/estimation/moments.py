@@ -1,6 +1,6 @@
 """Kernels for the initial contact estimate from the sum, centroid and extent of a frame.
 
-The pressure moments over the footprint are compared with those of the model, which are tabulated
+The pressure moments over the footprint are compared with the model's moments, which are tabulated
 versus d. The force or the extent determines d, and the centroid determines the tilt.
 """
 
@@ -91,7 +91,7 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
         if not m.total > 0.0:
             at = signal.row * state.grid.cols + signal.col
             m.total, m.x, m.y, m.number = 1.0, cells.x[at], cells.y[at], 1.0
-        # About three quarters of the cells of a weak contact exceed the threshold.
+        # In a weak contact, about three quarters of the cells exceed the threshold.
         _set_from_area(m, state.grid, 1.3 * m.number if weak else m.number)
         _refine(state, frame, cells)
         _refine(state, frame, cells)

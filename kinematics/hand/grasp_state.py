@@ -3,8 +3,8 @@
 Coordinates and signs follow :mod:`hand.geometry`. The tips roll without slipping, and the joints
 are at standstill. Because a pressure grid cannot measure shear, the load along the faces is
 estimated from the joint torques. The contributions of the normal forces and of the tips' turning
-moments are subtracted from the torques. The residual is the shear force times its moment arm about
-the pivot.
+moments ∂U/∂θ are subtracted from the torques. The residual is the shear force times its moment arm
+about the pivot.
 
 The object's faces may be inclined by a taper α, which is positive if the object is wider at the
 palm. Then θ = φ + q1 − α/2 at the left tip and θ = φ − q2 + α/2 at the right tip, where the

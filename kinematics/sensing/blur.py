@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 
 # Width in points; moment-matching weights are used below it, and Gaussian samples above it.
 _MOMENT_MATCHED_MAX = 0.75
-_CUTOFF = 4.5  # standard deviations, truncation of the Gaussian
+_CUTOFF = 4.5  # truncation of the Gaussian, in standard deviations
 
 
 def axis_points(
@@ -25,9 +25,9 @@ def axis_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the positions of points [count, cells] and their weights in the mean of one cell.
 
-    There are ``number`` cells of width ``pitch``, beginning at ``start``. On both sides, cells
-    within the range of the blur are added. The value of cell j is the sum over m and q of
-    weights[m, q] times point m of cell j + q.
+    The axis has ``number`` cells of width ``pitch``, and the first cell begins at ``start``. On
+    both sides, cells within the range of the blur are added. The value of cell j is the sum of
+    weights[m, q] times point m of cell j + q, over all m and q.
     """
     mean = np.convolve(stencil(blur * count / pitch), np.full(count, 1.0 / count))
     half = (len(mean) - count) // 2

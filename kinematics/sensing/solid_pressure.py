@@ -67,12 +67,12 @@ def weights_of(tip: Fingertip, material: Material) -> Weights:
 
 
 def image_count(harmonics: IntArray) -> int:
-    """Return the number of images that the modes need."""
+    """Return the number of images required for the modes."""
     return int(len(harmonics) + np.count_nonzero(harmonics))
 
 
 def images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
-    """Return the mode images, then those of shear along x and y, float64 [·, rows · cols]."""
+    """Return the mode images, followed by the images for shear along x and y, [·, rows · cols]."""
     if blur > 0.0:
         return _blurred_images(tip, cells, blur)
     data = solid_data(tip)
@@ -136,7 +136,7 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
 
 @inner_kernel
 def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
-    """Set the image weights of a contact (for Pa) and their partials in d, n_x and n_y."""
+    """Set a contact's image weights (for images in Pa) and their partials in d, n_x and n_y."""
     table = weights.table
     square = n_x * n_x + n_y * n_y
     t = math.sqrt(d * table.inverse_radius)

@@ -44,7 +44,7 @@ _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 
 
 class SpringPoints(NamedTuple):
-    """Sample points of a grid under a tip, in the layout that the kernels use.
+    """Sample points of a grid under a tip, in the memory layout that the kernels use.
 
     Each row of points is one array. It contains the points at the first position in each cell,
     followed by the points at the second position, and so on. The array also includes cells outside

@@ -58,7 +58,7 @@ class Samples(NamedTuple):
 
 
 def ring_means(base_radius: FloatArray) -> FloatArray:
-    """Return the matrix (R, B) of ring area means from quadratic elements with the given nodes."""
+    """Return the matrix (R, B) that averages the nodal values of quadratic elements over rings."""
     points, gauss = GAUSS
     ends = base_radius[::2]
     cuts = np.unique(np.concatenate([RING_EDGES, ends]))

@@ -320,7 +320,7 @@ class Body:
         return stress, density, four, swell
 
     def solve(self, numbers: FloatArray, right: FloatArray, known: FloatArray) -> FloatArray:
-        """Solve for the dofs under forces ``right``; ``known`` has the given dofs, otherwise NaN."""
+        """Solve for the dofs under forces ``right``; ``known`` has the given dofs, or NaN."""
         if self.moves is not None:
             return self._solve_at_rest(right, known)
         given = ~np.isnan(known)

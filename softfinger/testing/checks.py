@@ -26,7 +26,7 @@ _POLL = 1e-3  # s, poll interval, like a control tick
 
 
 def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:
-    """Open each finger's tactile board twice and check ``frames`` frames.
+    """Open each finger's tactile board twice, and check the given number of ``frames``.
 
     ``patience`` [s] is the maximum waiting time. The check works without an object in the hand.
     """

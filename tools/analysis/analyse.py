@@ -114,7 +114,7 @@ _NOISE_RATIO = 1.5  # multiple of tactile.noise above which the noise is reporte
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
-    """Explain why no frame contains a contact: maximum reading, threshold and likely cause."""
+    """Explain a lack of contacts by the maximum reading, the threshold and the likely cause."""
     from softfinger.kinematics.estimation.estimator import PEAK_LEVEL
 
     scale = tactile.pascal_per_count if recording.whole else 1.0

@@ -67,9 +67,8 @@ class TwoPhased(Altered):
     """Serial two-phased controller from the literature.
 
     Phase one integrates the object angle error with ``bandwidth`` [Hz] into an antisymmetric joint
-    goal. Phase two is a PD law that moves the joints to this goal, in addition to equal bias
-    torques for the grip. The measured force is not used: the bias is computed from the requested
-    force.
+    goal. Phase two is a PD law that moves the joints to this goal; equal bias torques for the grip
+    are added. The measured force is not used: the bias is computed from the requested force.
     """
 
     def __init__(

@@ -84,7 +84,7 @@ def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
 
 
 def lookups(rounds: int, count: int = 512) -> Report:
-    """Return the time per point [ns] for ``count`` points, all at once and one by one."""
+    """Return the time per point [ns] for ``count`` points, in one call and in separate calls."""
     rng = np.random.default_rng(3)
     even = rng.uniform(0.0, _D_MAX, count)
     spread = 10.0 ** rng.uniform(-6.0, np.log10(_D_MAX), count)
@@ -117,7 +117,7 @@ def lookups(rounds: int, count: int = 512) -> Report:
 
 
 def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) -> dict[str, Any]:
-    """Return time per point and error of SciPy's bicubic spline for F alone."""
+    """Return the time per point and the error of SciPy's bicubic spline for F only."""
     interpolate: Any = import_module("scipy.interpolate")
     at = np.linspace(0.0, _D_MAX, 129), np.linspace(-_TILT_MAX, _TILT_MAX, 65)
     spline = interpolate.RectBivariateSpline(*at, integrate(TIP, _LAW, *np.meshgrid(*at)).force.T)

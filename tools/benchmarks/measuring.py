@@ -18,7 +18,7 @@ from softfinger.tools.terminal.text_layout import plain_table, table_text
 # Result of one measurement. Each key is a column heading; "name" is the first column.
 Row = dict[str, Any]
 
-# s per repetition: short enough to avoid most interruptions, but long compared with the clock
+# s per repetition; short enough to avoid most interruptions, but long compared with the clock
 # resolution.
 _SLICE = 4e-4
 

@@ -46,7 +46,8 @@ class HandCase:
 
     name: str
     force: float
-    hand: Sections = field(default_factory=dict)  # differences from the daemon's settings
+    # Hand settings that differ from the daemon's settings.
+    hand: Sections = field(default_factory=dict)
     daemon: Sections = field(default_factory=dict)
     torque: float = 1.0  # true torque constant divided by the one in the settings
     words: str = ""  # faults in `softfinger emulate --fault` syntax, started in the hold
@@ -104,7 +105,7 @@ NAMES = (
 
 
 def drawn(seed: int) -> HandCase:
-    """Draw a hand for the ensemble; all its parameters differ from the settings."""
+    """Draw a random hand for the ensemble; all its parameters differ from the settings."""
     chance = random.Random(f"{_ENSEMBLE}{seed}")
 
     def span(low: float, high: float) -> float:

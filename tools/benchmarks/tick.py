@@ -47,7 +47,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def _simulated(title: str, seconds: int) -> Report:
-    """Time the complete daemon with the simulated hand, per virtual second and per tick."""
+    """Measure the complete daemon with the simulated hand, per virtual second and per tick."""
     with virtual_daemon() as daemon:
         hold(daemon)
         second = timed(partial(daemon.loop.advance, 1.0), seconds)
@@ -60,12 +60,12 @@ def _simulated(title: str, seconds: int) -> Report:
 
 
 def _in_turns(title: str, rounds: int) -> Report:
-    """Time only the pipeline: back to back with and without subscribers, in place at three rates.
+    """Measure only the pipeline: back to back, with and without subscribers; in place, at 3 rates.
 
     SCHED_FIFO is used if permitted.
     """
     samples: dict[str, list[float]] = {}
-    used: dict[str, float] = {}  # processor load averaged over all rounds, as a fraction
+    used: dict[str, float] = {}  # 1, processor load averaged over all rounds
     with virtual_daemon() as quiet, virtual_daemon(schema.STATE, schema.TACTILE) as heard:
         for daemon in (quiet, heard):
             hold(daemon)
@@ -119,7 +119,7 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
 
 
 def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Time ticks over ptys during a hold, alternating with the servo exchanges alone.
+    """Measure ticks over ptys during a hold, and the servo exchanges separately, alternately.
 
     A ``baud`` of 0 disables pacing, and ``changes`` override the profile. Raises RigError if the
     hand loses its grip, e.g. on a busy machine.

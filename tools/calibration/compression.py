@@ -76,8 +76,8 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     """Read the known columns of a file in SI units.
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
-    semicolon. Units follow the column names in the header, or are in a separate row below. Other
-    columns, empty lines and lines that begin with # are ignored.
+    semicolon. Units follow the column names in the header, or are in a separate row below the
+    header. Other columns, empty lines and lines that begin with # are ignored.
 
     Raises
     ------

@@ -102,7 +102,7 @@ def _told(fit: FrictionFit) -> str:
 
 
 def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArray[Any]]:
-    """Sweep the joints one after the other and return all states."""
+    """Sweep one joint at a time, and return all states."""
     names = sorted(settings.scene.fingers)
     ways = {name: _way(settings, name) for name in names}
     told = ", ".join(

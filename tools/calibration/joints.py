@@ -101,7 +101,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
         if table[reg.TORQUE_ENABLE]:
             raise ServoError(f"servo {servo}: torque is on: end `softfinger run`, or disarm")
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # After power-up, the position equals the encoder count, which is less than one turn.
+        # After power-up, a servo's position is the encoder count, which is less than one turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder

@@ -174,7 +174,7 @@ class Terms(NamedTuple):
     third: FloatArray  # 1/m, eq. 19
 
     def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
-        """Return U(d, 0) [J] according to eq. 12."""
+        """Return U(d, 0) [J] from eq. 12."""
         first, second, third = self.terms(radius, modulus, d)
         return first + second + third
 
@@ -186,7 +186,7 @@ class Terms(NamedTuple):
 
 
 def limits(radius: float, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return θ_max and p [rad] from eqs. 15 and 17: the values of θ and t at the contact rim."""
+    """Return θ_max and p [rad] (eqs. 15 and 17), i.e. the values of θ and t at the contact rim."""
     h = radius - d
     theta_max = np.arctan(np.sqrt(radius**2 - h**2) / h)
     return theta_max, np.arccos(h / radius * np.tan(theta_max))

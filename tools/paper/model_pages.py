@@ -62,7 +62,7 @@ def _tangent(material: Material, strain: FloatArray) -> FloatArray:
 
 
 def law() -> tuple[Sheet, ...]:
-    """Tabulate the law versus strain, and compare Table I with the law at the same strains."""
+    """Tabulate the law versus strain, and compare the law with Table I at the table's strains."""
     material = Material.table_i()
     strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
     curve = {

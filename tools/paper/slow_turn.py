@@ -45,7 +45,7 @@ _FREE = {"table_friction": 0.0, "joint_friction": 0.0}
 
 
 class Held(NamedTuple):
-    """Pose of hand and object, and both tip contacts."""
+    """Pose of the hand and the object, and contacts of both tips."""
 
     q: FloatArray
     pose: FloatArray
@@ -165,7 +165,7 @@ def potential(there: Held, start: Held) -> float:
 def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
     """Return V at the object angle of ``floor`` plus each offset in ``aside`` [rad].
 
-    The antisymmetric joint angle is that of ``floor``, and V is minimised over all other
+    The antisymmetric joint angle equals that of ``floor``, and V is minimised over all other
     coordinates. The tips roll to each pose from ``start`` in one step. V is NaN where a tip would
     slip.
     """

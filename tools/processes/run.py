@@ -162,7 +162,7 @@ def _serve(
 
 @contextmanager
 def _service(loop: Any) -> Iterator[None]:
-    """Notify systemd, if requested: ready on the first tick, alive on each tick, and stopping."""
+    """Notify systemd, if requested, when the daemon is ready, on each tick, and when it stops."""
     service = Service.of_environment()
     if service is None:
         yield

@@ -264,7 +264,8 @@ class Recording:
             for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
                 if (message := self._take_record(kind, content)) is not None:
                     yield message
-        except Exception as error:  # Format and compression errors have no common base class.
+        # The exceptions for format and compression errors do not have a common base class.
+        except Exception as error:
             self._damaged(error)
 
     def _take_record(self, kind: int, content: bytes) -> tuple[int, int, bytes] | None:
@@ -290,7 +291,7 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
-        # In a recording by softfinger, an unknown topic comes from a newer version.
+        # An unknown topic in a softfinger recording was written by a newer version.
         if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
             self._other_names[channel.id] = channel.topic
             return

@@ -106,9 +106,9 @@ class RecordingWriter:
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
         """Write one message, possibly modifying its map. Raises RecordingError.
 
-        A repeated message (``again``) contains its original time, which precedes the recording. Its
-        log time is therefore set to that of the previous message, so that all log times are within
-        the recording.
+        A repeated message (``again``) contains its original time, which precedes the recording. To
+        keep all log times within the recording, its log time is set to the log time of the previous
+        message.
         """
         assert not self._ended
         stamp = message.get("timestamp")
@@ -188,7 +188,7 @@ class RecordingWriter:
 
     def _failed(self, error: OSError) -> RecordingError:
         self._ended = True
-        # The remaining buffer cannot be written either and is dropped.
+        # The rest of the buffer cannot be written either, so drop it.
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):

@@ -128,7 +128,7 @@ class StreamState:
         self.events: list[ShownEvent] = []
         self._news: deque[ShownEvent] = deque(maxlen=EVENT_COUNT_MAX)
         self._event_times: deque[tuple[float, float]] = deque(maxlen=2 * EVENT_COUNT_MAX)
-        self.times: schema.LoopStatistics | None = None  # statistics for all ticks so far
+        self.times: schema.LoopStatistics | None = None  # statistics of all previous ticks
         # s; a warning is shown if a servo reaches its temperature limit sooner
         self.heat_warning_time = 0.0
         self._lease_holder = "", -math.inf  # holder of the command lease, end of the lease [s]

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from softfinger.daemon.errors import SoftfingerError
 
-with contextlib.suppress(ModuleNotFoundError):  # Windows supports only `monitor --plain`
+with contextlib.suppress(ModuleNotFoundError):  # only `monitor --plain` is supported on Windows
     import termios
     import tty
 

@@ -28,7 +28,8 @@ _SILENCE_TIME = 2.0  # s, time without messages before a notice is printed
 _DRAW_PAUSE_MAX = 1.0  # s, maximum time between pictures if drawing is slow
 _MARK_COUNT_MAX = 2_000  # maximum number of marks shown for a recording
 _SPEED_RANGE = 0.1, 10.0
-# messages queued between reads, enough for 2 s of state and truth at 1 kHz, with frames.
+# Maximum number of messages queued between reads; enough for 2 s of states, truth and frames at 1
+# kHz.
 _QUEUE_LENGTH = 5_000
 
 
