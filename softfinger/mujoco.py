@@ -8,8 +8,8 @@ pressure under each tip. :class:`MujocoHand` is a profile's hand; the daemon use
 The contact law is the kernel that the simulated hand uses (`simulation.physics.tip`). In 3D, the
 shear is a vector in the face. The component along the tilt is d_t. The component across the tilt is
 treated as a variance, because U contains ρ(ζ² + v). The forces f are computed for the end of the
-step (docs/mujoco.md). They are linearly implicit in d, θ and both shears, whose Jacobian rows are
-R:
+step (docs/mujoco.md). The forces are linearly implicit in d, θ and both shears, whose Jacobian rows
+are R:
 
     (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
 
@@ -71,7 +71,7 @@ _IMPEDANCE = 0.9999
 
 
 class Touch(Record):
-    """One tip on a face in 3D, with vectors in world coordinates."""
+    """Contact of one tip with a face in 3D; vectors are in world coordinates."""
 
     contact: TipContact
     normal: FloatTriple  # m, unit vector from the tip's centre into the face
@@ -235,7 +235,7 @@ class SoftTips:
         represented by its tangent plane. Disable MuJoCo's own collisions for these geoms and for
         the tips.
     table
-        The tip's contact table. If None, it is built from the settings.
+        The tip's contact table. If None, the table is built from the settings.
 
     Raises
     ------
@@ -296,7 +296,7 @@ class SoftTips:
         return self._grids[k].pressure(*self._law, d, x, y, self._scale * tip.gain, out)
 
     def add_forces(self, model: Any, data: Any) -> None:
-        """Add the tip forces to ``qfrc_passive``. This is the `mjcb_passive` callback."""
+        """Add the tip forces to ``qfrc_passive``. This method is the `mjcb_passive` callback."""
         if data is not self.data:
             return
         geometry, touching, fromto = self._geometry, self._touching, np.zeros(6)
@@ -319,7 +319,7 @@ class SoftTips:
         solve(*law, work, self._inertial, data.qacc, data.qfrc_passive, self._own)
 
     def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
-        """Set the pressure sensors in each step, because MuJoCo clears them (`mjcb_sensor`)."""
+        """Set the pressure sensors on each step, since MuJoCo clears them (`mjcb_sensor`)."""
         if data is self.data and stage == mujoco.mjtStage.mjSTAGE_VEL:
             is_due = data.time >= self._due
             self._due = data.time + self._period - 1e-9 if is_due else self._due

@@ -1,8 +1,8 @@
 """Parse the command line and run the selected subcommand.
 
-Each subcommand is a module in a ``tools/`` package and is imported only when called. It defines
-``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user can
-correct, it raises SettingsError (exit status 2), another SoftfingerError, or OSError for a file
+Each subcommand is a module in a ``tools/`` package and is imported only when called. The module
+defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user
+can correct, it raises SettingsError (exit status 2), another SoftfingerError, or OSError for a file
 (exit status 1).
 """
 

@@ -38,7 +38,7 @@ _BAR_WIDTH = 20  # columns
 
 
 class SweepError(SoftfingerError):
-    """The sweep cannot continue; the message gives the reason."""
+    """Error raised if a sweep cannot continue; the message gives the reason."""
 
 
 class Progress:

@@ -470,8 +470,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
         memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
         columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
         fits = []
-        # There are few terms, so try every subset of them and keep the best subset with positive
-        # strengths.
+        # Try every subset of the few terms, and keep the best subset with positive strengths.
         for chosen in itertools.product((False, True), repeat=len(told)):
             used = np.flatnonzero((True, *chosen))
             found = np.linalg.lstsq(columns[:, used], load[held:], rcond=None)[0]

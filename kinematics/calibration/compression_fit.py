@@ -42,7 +42,8 @@ _TOLERANCE = 1e-7  # relative tolerance of the tables
 _EDGE = 1.0 - 1e-4  # usable fraction of a table's range; leaves room for the step
 _TOO_DEEP = "the run is deeper or more tilted than its data"
 _NO_BEGINNING = "no zero of d fits: the run must show where the contact begins"
-# Higher-order coefficients of three laws. Their forces span those of σ = c_1 ε + c_2 ε² + c_3 ε³.
+# Higher-order coefficients of three laws. The forces for σ = c_1 ε + c_2 ε² + c_3 ε³ are linear
+# combinations of the forces for these laws.
 _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
 
 
@@ -100,7 +101,7 @@ def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
     Raises
     ------
     CalibrationError
-        If the rows are not in the order of a test, are an unloading, or carry no load.
+        If the rows are not in test order, contain only unloading, or do not show a load.
     """
     depth, load = np.asarray(d, np.float64), np.asarray(force, np.float64)
     used, cycles = rising(depth)
@@ -242,9 +243,9 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
     Parameters
     ----------
     runs
-        The loading branches.
+        Loading branches.
     tip
-        Its radius and physics.
+        Fingertip with its radius and physics.
     law
         Shape of the stress-strain law for a modulus of 1 Pa. None selects springs with σ = c_1 ε +
         c_2 ε² + c_3 ε³, whose modulus depends on the strain.
@@ -252,7 +253,7 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
     Raises
     ------
     CalibrationError
-        If the runs are too deep for the law, or contradict it.
+        If the runs are too deep for the law or contradict the law.
     """
     tables, deepest = _tables(tip, law), max(run.depth for run in runs)
     end = _end(tables[0], tip, max(abs(run.theta) for run in runs))

@@ -104,7 +104,7 @@ def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | 
 
     Filled rubber softens over its first cycles (Mullins, 1948), so one fit cannot describe both
     first and repeated presses. The mean is taken over all pairs of ``d`` [n] [m] and ``theta`` [n]
-    [rad] that are pressed more than once. The result is None without such pairs.
+    [rad] that are pressed more than once. The result is None if no pair is repeated.
     """
     poses = np.round(np.stack([d / _REPEATED_D, theta / _REPEATED_THETA], axis=1))
     _, which = np.unique(poses, axis=0, return_inverse=True)
@@ -119,11 +119,11 @@ class TipFit:
 
     ``law`` is the material law for a modulus of 1 Pa at zero strain. The fit determines ``modulus``
     [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the mean
-    squared residual per cell divided by the noise variance. The errors are errors of the estimator
-    for this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors. ``force_error`` is the
-    rms difference between the estimated force and the frame sum, divided by the rms frame sum. The
-    errors include only frames with a valid estimate; ``valid`` is the fraction of such frames.
-    ``trend`` contains the value of E from each individual press.
+    squared residual per cell divided by the noise variance. The following errors are errors of the
+    estimator for this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors.
+    ``force_error`` is the rms difference between the estimated force and the frame sum, divided by
+    the rms frame sum. The errors include only frames with a valid estimate; ``valid`` is the
+    fraction of such frames. ``trend`` contains the value of E from each individual press.
     """
 
     tip: Fingertip

@@ -4,10 +4,10 @@ No other module uses Numba's private interfaces. This module is imported only wi
 versions; otherwise `plain` replaces it.
 
 `KernelCompiler` runs only the passes that kernels need. The compiler omits the passes for closures,
-`with` statements and parallel loops. It also omits the pruning of constant branches, which LLVM
-performs anyway, and the type annotations, which would fill the cache. The compiler caches the
-result types of operations and the sizes of LLVM types. Without these caches, Numba would search
-dozens of candidates for each operation and let LLVM parse a module for each size.
+`with` statements and parallel loops. `KernelCompiler` also omits the pruning of constant branches,
+which LLVM performs anyway, and the type annotations, which would fill the cache. The compiler
+caches the result types of operations and the sizes of LLVM types. Without these caches, Numba would
+search dozens of candidates for each operation and let LLVM parse a module for each size.
 
 A `BitcodeKernel` can be called only by other kernels and is compiled to LLVM bitcode, never to
 machine code. By default, Numba compiles each function called by a kernel as if Python might call

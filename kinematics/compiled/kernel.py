@@ -56,8 +56,8 @@ _compiler, why_plain = _chosen_compiler()
 def kernel(function: Function) -> Function:
     """Compile ``function`` with Numba, with an on-disk cache and IEEE arithmetic.
 
-    The kernel keeps the GIL. Otherwise, the control loop might wait a whole switch interval to
-    reacquire it.
+    The kernel keeps the GIL. If the GIL were released, the control loop might wait a whole switch
+    interval to reacquire it.
     """
     return cast(Function, _compiler.compiled(function, _OPTIONS))
 

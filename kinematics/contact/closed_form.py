@@ -131,7 +131,7 @@ def theta_limit(radius: float, d: float) -> float:
 
 
 def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
-    """Broadcast the arguments; return the shape and each argument as a flat float64 array.
+    """Broadcast the arguments; return the common shape and the arguments as flat float64 arrays.
 
     Raises TypeError for arguments that are not real numbers.
     """

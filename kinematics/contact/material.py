@@ -104,8 +104,8 @@ class Material:
         """Return a smooth law of the polyurethane measured in Table I of the paper.
 
         The paper gives slopes of the stress-strain curve ('Young's modulus, which corresponds to
-        the slope'). They are used as the tangent modulus dσ/dε: 0.135 MPa at zero strain, then
-        0.149, 0.182, 0.201, 0.207 and 0.255 MPa at strains of 20 to 100 %. The modulus is
+        the slope'). These slopes are used as the tangent modulus dσ/dε: 0.135 MPa at zero strain,
+        then 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at strains of 20 to 100 %. The modulus is
         interpolated by the lowest-degree polynomial with zero slope at zero strain, because the
         paper calls the first value the smallest. This polynomial increases on [0, 1]. The largest
         modulus in the paper, 0.304 MPa, occurs above 100 % strain and is not used.
@@ -126,8 +126,8 @@ class Material:
         Returns
         -------
         Material
-            Fitted material. Its ``misfits`` [2, n] contain the strain of each point and the
-            absolute difference between law and point [Pa].
+            Fitted material. The material's ``misfits`` [2, n] contain the strain of each point and
+            the absolute difference between law and point [Pa].
 
         Raises
         ------

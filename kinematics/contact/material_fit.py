@@ -1,7 +1,7 @@
 """Fit a smooth, monotonic stress-strain law, or a modulus, to measured points.
 
-The tangent modulus is a Bernstein polynomial on [0, 1], fitted by bounded least squares. Its
-coefficients are positive, so the modulus is positive everywhere.
+The tangent modulus is a Bernstein polynomial on [0, 1], fitted by bounded least squares. The
+polynomial's coefficients are positive, so the modulus is positive everywhere.
 """
 
 from __future__ import annotations

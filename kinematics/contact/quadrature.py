@@ -203,9 +203,9 @@ def integrate(
 ) -> ClosedForms:
     """Integrate force, energy and first partials for any material, to a relative error of 1e-14.
 
-    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. They are NaN outside
-    the domain, which ends at d = a and at the limit on θ. ``nodes`` is the number of Gauss points
-    per piece; by default it depends on the degree of the law.
+    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. The results are NaN
+    outside the domain, which ends at d = a and at the limit on θ. ``nodes`` is the number of Gauss
+    points per piece; by default it depends on the degree of the law.
     """
     shape, (depth, tilt) = flatten(d, theta)
     radius = tip.radius

@@ -5,10 +5,10 @@ The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3
 configuration.
 
 The data file contains dimensionless polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, which
-are scaled by Young's modulus E and the radius a. Its ``notes`` describe the computation and the
-remaining errors. This module evaluates the polynomials for one value of ν. The energy is U = E a³
-t⁵ g(t, sin² θ). The partials of U are the force along the face's normal, N = ∂U/∂d, and the moment
-∂U/∂θ. With the base force F, the base pressure is
+are scaled by Young's modulus E and the radius a. The ``notes`` in the file describe the computation
+and the remaining errors. This module evaluates the polynomials for one value of ν. The energy is U
+= E a³ t⁵ g(t, sin² θ). The partials of U are the force along the face's normal, N = ∂U/∂d, and the
+moment ∂U/∂θ. With the base force F, the base pressure is
 
     p(r, φ) = F/a² B_0(r) + N/a² Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r).
 

@@ -61,9 +61,9 @@ class ContactForces(NamedTuple):
 class Certificate(NamedTuple):
     """Bound on the relative error of all outputs, and the approximate location of the maximum.
 
-    The bound covers the whole domain including its edges, and rounding. Its assumptions are listed
-    in `table_build`. For softening laws, ∂F/∂θ may pass through zero. Its error is therefore
-    relative to the larger of ∂F/∂θ and F tan θ.
+    The bound covers the whole domain including its edges, and rounding. The assumptions behind the
+    bound are listed in `table_build`. For softening laws, ∂F/∂θ may pass through zero. The error of
+    ∂F/∂θ is therefore relative to the larger of ∂F/∂θ and F tan θ.
 
     Attributes
     ----------

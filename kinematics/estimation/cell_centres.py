@@ -21,8 +21,8 @@ def cell_centres(
     """Return height, x and y of the cells as flat arrays; ``active`` [rows, cols] masks cells.
 
     The height is √(a² − x² − y²) at the cell centre, or at the corner nearest to the tip centre if
-    the cell centre is outside the rim. It is −∞ for inactive cells and for cells outside the disc
-    of ``radius`` [m] around the tip centre.
+    the cell centre is outside the rim. The height is −∞ for inactive cells and for cells outside
+    the disc of ``radius`` [m] around the tip centre.
     """
     a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
     rows, cols = active.shape

@@ -1,7 +1,7 @@
 """Error budget: propagate errors other than white cell noise into the covariance of an estimate.
 
-White noise of variance σ² gives the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit. The
-other errors are propagated linearly:
+White noise of variance σ² gives the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit.
+Errors other than white noise are propagated linearly:
 
     shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                        (`set_shared_errors`)
       residuals        Σ size² qᵀq − m·(size Jᵀq)

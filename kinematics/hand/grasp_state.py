@@ -131,7 +131,7 @@ def holding_moment_arms(
     mean shear force. Tapered faces push the object out, so the shear force is T − N tan(α/2) at the
     left tip and T + N tan(α/2) at the right tip; α is the ``taper`` [rad]. F is the mean contact
     force of both tips, so a common modulus cancels in the moment arms τ/F [m]. N is the mean of the
-    normal forces N1 and N2 [N]. They differ if the surroundings exert friction on the object.
+    normal forces N1 and N2 [N]. N1 and N2 differ if the surroundings exert friction on the object.
     ``data1`` and ``data2`` are the contact table arrays. All results are zero unless both tips are
     in contact.
     """
@@ -222,9 +222,9 @@ def load_torques(
 ) -> tuple[float, float, float, float]:
     """Return the residual torques and the load model of a held object.
 
-    δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t axis
-    can explain. If each tip carries a force L [N], i.e. half of a total load of 2 L, the torques
-    are
+    δ1 and δ2 [N·m] are the parts of the joint torques that can be caused only by a load along the
+    object's t axis. If each tip carries a force L [N], i.e. half of a total load of 2 L, the
+    torques are
 
         τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L

@@ -2,10 +2,10 @@
 
 Two mirrored fingers hold an object of width W between parallel faces with a displacement d at each
 tip. The small antisymmetric motions are the object's angle φ and the antisymmetric joint angle
-δ = (q1 − q2)/2. They change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual spring k
-between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by kδ. For a
-normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ + σ,
-where c is 2/3 for the spring model of the paper. With b = k/(N B) and pivots 2B apart,
+δ = (q1 − q2)/2. These motions change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual
+spring k between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by
+kδ. For a normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ
++ σ, where c is 2/3 for the spring model of the paper. With b = k/(N B) and pivots 2B apart,
 
     T = N (φ − bδ)                                       the forces of both fingers are collinear
     W T = N ((W + 2(a − d))φ − 2ℓδ) + 2 ∂U/∂θ            moment balance of the object

@@ -255,7 +255,7 @@ def _add_images(
 
 @inner_kernel
 def add_images(weights: Weights, of: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
-    """Add all images, stored consecutively in ``pixels``, multiplied by the weights ``of``.
+    """Add all images in ``pixels``, which are stored consecutively, with the weights in ``of``.
 
     The last group of images may include the shear images, whose weights are 0 here.
     """

@@ -46,9 +46,10 @@ _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 class SpringPoints(NamedTuple):
     """Sample points of a grid under a tip, in the memory layout that the kernels use.
 
-    Each row of points is one array. It contains the points at the first position in each cell,
-    followed by the points at the second position, and so on. The array also includes cells outside
-    the grid that are within the range of the blur. One-dimensional arrays allow vectorised loops.
+    Each row of points is one array. Each array contains the points at the first position in each
+    cell, followed by the points at the second position, and so on. The array also includes cells
+    outside the grid that are within the range of the blur. One-dimensional arrays allow vectorised
+    loops.
     """
 
     x: FloatArray  # from the tip centre [m], one row

@@ -8,8 +8,8 @@ tilted plane, it covers half a turn, with the symmetry plane y = 0. For an uprig
 thin wedge, and all nodes at the same r and z have the same motion.
 
 Contact occurs between the plane and nodes. An active node lies in the plane and transmits a normal
-force. It moves freely along the plane unless the face is sticking. Each Newton step also updates
-the active set. The linear solver is pypardiso.
+force. An active node moves freely along the plane unless the face is sticking. Each Newton step
+also updates the active set. The linear solver is pypardiso.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Changes to settings, in the same form as for ``--set``.
     shaped
         Add potential-based shaping to the reward of ``grasp``: up to 10 for closing the fingers
-        and up to 10 for both forces. It rewards progress before the first touch and leaves the
+        and up to 10 for both forces. Shaping rewards progress before the first touch and leaves the
         optimal policy unchanged [1]_.
     render_mode
         ``rgb_array`` makes `render` return an image [300, 550, 3]; ``human`` shows each step in a

@@ -1,8 +1,8 @@
 """Conformance checks for backend plugins.
 
 Each check takes the settings of a profile that uses the backend, for example
-``check_tactile(load(Path("profile.toml")))``. It creates the backend in the same way as the daemon.
-If the check fails, it raises AssertionError with the value found and the value expected.
+``check_tactile(load(Path("profile.toml")))``. The check creates the backend in the same way as the
+daemon. If the check fails, it raises AssertionError with the value found and the value expected.
 """
 
 from __future__ import annotations

@@ -170,8 +170,8 @@ class VirtualTimeHand(Hand):
         Returns
         -------
         list[Refused]
-            Refusals of the controller's commands. They may be caused by events that occurred after
-            the controller's state.
+            Refusals of the controller's commands. Refusals may be caused by events that occurred
+            after the controller's state.
 
         Raises
         ------

@@ -7,9 +7,9 @@ depend on the machine's speed.
 
 The daemon's control laws are compared with two laws from the literature. *Equal torques* is the
 `upright` law without its spring and dither. *Two-phased* is the serial two-phased controller for
-soft-fingered manipulation, :class:`TwoPhased`. It was published with a camera that measures the
-object angle with a delay. Both this controller and the daemon's law are therefore also tested with
-angles that are up to 0.3 s old.
+soft-fingered manipulation, :class:`TwoPhased`. The two-phased controller was published with a
+camera that measures the object angle with a delay. The two-phased controller and the daemon's law
+are therefore also tested with angles that are up to 0.3 s old.
 """
 
 from __future__ import annotations

@@ -50,10 +50,11 @@ _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 @dataclass(frozen=True)
 class FaultCase:
-    """One kind of grip, and its fault.
+    """Kind of grip, with its fault.
 
     ``words`` are faults in the syntax of `softfinger emulate --fault`, with ``{side}`` as a
-    placeholder for the finger. They start during the hold, or before the grasp if ``before``.
+    placeholder for the finger. The faults start during the hold or, if ``before`` is True, before
+    the grasp.
     """
 
     name: str

@@ -1,10 +1,10 @@
 """Measure how a grip reacts to a sudden load increase.
 
-A 10 N grip carries a standing load along the object faces, away from the palm. Then a larger load
-is applied and maintained: either a push, or a twist with the same force at the faces. Trials run on
-virtual time, and the results are computed from the simulated hand's true state. *Lost*: the object
-is no longer between the tips. *Slid*: object displacement along its faces. The displacement is
-measured from the midpoint of both tips, so that leaning fingers do not affect it. *Answer*: time
+A 10 N grip carries a standing load along the object faces, away from the palm. A larger load is
+then applied and maintained: either a push, or a twist with the same force at the faces. Trials run
+on virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
+object is no longer between the tips. *Slid*: object displacement along its faces. The displacement
+is measured from the midpoint of both tips, so that leaning fingers do not affect it. *Answer*: time
 from the onset of slip until the goal currents have increased by a quarter. *Said*: time from object
 loss until the hand leaves the grip modes.
 """

@@ -150,8 +150,8 @@ class CannedSensor(_Canned):
 def can(daemon: Daemon) -> None:
     """Replace a daemon's backends with canned ones, so that only the tick itself is timed.
 
-    The canned backends repeat the next frames and the last reading. They use several frames,
-    because the daemon would detect one repeated frame as a frozen sensor.
+    The canned backends repeat the next frames and the last reading. Several frames are used,
+    because the daemon would detect a single repeated frame as a frozen sensor.
     """
     loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate
     fingers = loop.perception.fingers

@@ -204,8 +204,8 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write a finger's calibration factors to its file and return a summary line.
 
     The sensor gain changes whenever the sensor is remounted, and the tip modulus may be known only
-    roughly. Both are estimated during a grip (`daemon.perception.hand_state`). A daemon that starts
-    with these factors reaches the correct force in its first grip.
+    roughly. Gain and modulus are estimated during a grip (`daemon.perception.hand_state`). A daemon
+    that starts with these factors reaches the correct force in its first grip.
 
     Raises
     ------

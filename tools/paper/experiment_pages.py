@@ -1,9 +1,9 @@
 """Draw Figs. 7, 10 and 11: model curves for the paper's two experiments and for its appendix.
 
 The paper shows its measurements only as plots, so the measured points are not reproduced. The
-appendix splits U(d, 0) (eq. 12) into three terms. They are computed both by integration and from
-the printed equations. `terms` and `limits` use SI units and the paper's dimensions: eq. 16 is a
-length, eq. 18 is dimensionless, and eq. 19 is an inverse length.
+appendix splits U(d, 0) (eq. 12) into three terms. The terms are computed both by integration and
+from the printed equations. `terms` and `limits` use SI units and the paper's dimensions: eq. 16 is
+a length, eq. 18 is dimensionless, and eq. 19 is an inverse length.
 """
 
 from __future__ import annotations

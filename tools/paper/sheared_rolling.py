@@ -11,8 +11,8 @@ For the springs of the parallel distributed model, with equal lateral and axial 
 
 F is the sum of the spring forces on the base. A sensor under the tip measures this sum. The terms
 with ζ sin θ and ζ tan θ have the sign of θ, so the minima of F and U are before the upright
-position. ∂U/∂d is the force on the face at fixed tilt and shear. Its minimum lies between the
-minima of F and U.
+position. ∂U/∂d is the force on the face at fixed tilt and shear. The minimum of ∂U/∂d lies between
+the minima of F and U.
 
 *Plant* is the simulated tip, which integrates the shear. The force on the base of the plant's tip
 is N cos θ + T sin θ. This force exceeds F by πE ζ² cos θ, because the plant's springs shear from

@@ -1,7 +1,7 @@
 """Compute quasi-static manipulation (Sec. V) from equations and compare with the simulated hand.
 
-Both tips consist of the paper's springs and stick to the object. There is no other friction. For a
-tip with shear ζ
+Both tips consist of the paper's springs and stick to the object. The model does not include any
+other friction. For a tip with shear ζ
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 

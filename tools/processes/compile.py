@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Built(NamedTuple):
-    """Result of a build: the number of missing parts, and a flag for failures."""
+    """Result of a build: number of missing parts, and whether a part has failed."""
 
     parts: int
     failed: bool

@@ -30,7 +30,7 @@ _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warnin
 
 
 class EventLog:
-    """Log for people or programs, whose ``line`` method never blocks or fails.
+    """Log that is readable by people or programs; the ``line`` method never blocks or fails.
 
     Lines are appended to an existing ``file``. Raises OSError if the file cannot be opened.
     """

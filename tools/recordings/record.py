@@ -238,7 +238,8 @@ class _Recorder:
         self._ending = ending
         self._keys = client_keys(arguments.keys)  # Any errors must occur before a file is created.
         self._gaps: dict[bytes, Gaps] = {}
-        self._writers = [RecordingWriter(arguments.file)]  # The last writer is the active one.
+        # The last writer in this list is the active writer.
+        self._writers = [RecordingWriter(arguments.file)]
         self._opened = time.monotonic()
         self._messages = 0  # number of messages received to be written
         self._unreadable = 0

@@ -1,7 +1,7 @@
 """Run ``softfinger doctor``: check ports, servos, boards and the machine, and suggest fixes.
 
-Each check prints one line. This module handles the arguments, the order of the checks, printing and
-the exit status. The checks are in :mod:`softfinger.daemon.diagnosis`.
+Each check prints one line of results. This module handles the arguments, the order of the checks,
+printing and the exit status. The checks are in :mod:`softfinger.daemon.diagnosis`.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ class ShownFrame(NamedTuple):
 
 
 class ShownEvent(NamedTuple):
-    """One ``hand/event``, prepared for drawing."""
+    """A single ``hand/event``, prepared for drawing."""
 
     timestamp: float  # Unix time [s], NaN if unknown
     level: str

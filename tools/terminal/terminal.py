@@ -89,7 +89,7 @@ class Terminal:
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
             self._attributes = termios.tcgetattr(self._keyboard)
-            tty.setcbreak(self._keyboard)  # This also discards keys that were typed earlier.
+            tty.setcbreak(self._keyboard)  # This call also discards keys that were typed earlier.
             # Otherwise, Ctrl-Z would also suspend the daemon while the torque is on.
             if not self._suspendable:
                 ours = termios.tcgetattr(self._keyboard)

@@ -1,9 +1,9 @@
 """Serve the ``softfinger view`` page, its pictures and its commands on the loopback interface.
 
-One thread serves the pages. The main thread reads the stream or plays a recording, and creates each
-picture once for all pages. A page requests the next picture after drawing the last one, so a slow
-page skips pictures without delaying the others. The terminal prints a token. Pages with this token
-may send commands, and each page is a separate client.
+A single thread serves the pages. The main thread reads the stream or plays a recording, and creates
+each picture once for all pages. A page requests the next picture after drawing the last one, so a
+slow page skips pictures without delaying the others. The terminal prints a token. Pages with this
+token may send commands, and each page is a separate client.
 """
 
 from __future__ import annotations
@@ -201,7 +201,8 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Redirect a browser that has the one-time code to the page with the token, or refuse."""
+        """Redirect a browser with a valid one-time code to the page with the token, or refuse
+        it."""
         if not self._code or not _has(request, "code", self._code):
             said = "This page needs the newest address that softfinger view prints; each works once"
             return connection.respond(403, said)
@@ -242,7 +243,7 @@ class Site:
             await page.send(f'{picture[:-1]},"rows":[{",".join(fresh)}]}}')
 
     async def _command(self, page: ServerConnection) -> None:
-        """Execute the commands of a page that has the token, and send the replies."""
+        """Execute commands from a page that has the token, and send the replies."""
         assert page.request is not None
         allowed = self._send is not None and self._allows(page.request)
         async for text in page:
