@@ -372,7 +372,7 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
 
 @kernel
 def set_currents(plants: Records[Plant], control: FloatArray) -> None:
-    """Set both servos' current references [A], which the motor currents follow with a lag."""
+    """Set the current references [A] of both servos; the motor currents follow with a lag."""
     state = plants[0].state
     for j in range(2):
         control[j] = current_reference(plants[0], j, state.position[j], state.velocity[j])

@@ -127,7 +127,7 @@ def _with_cached_lookups(flags: Any) -> Iterator[None]:
                 return None
             _SIGNATURES[key] = found, function._impl_keys[found.args]
         found, body = _SIGNATURES[key]
-        function._impl_keys[found.args] = body  # Numba looks up the implementation here
+        function._impl_keys[found.args] = body  # Numba looks up the implementation in this map
         return found
 
     def size(context: Any, kind: Any) -> int:

@@ -41,7 +41,7 @@ def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) 
                 _check_counters(sensor)
             finally:
                 sensor.close()
-            sensor.latest()  # This call must not raise an exception.
+            sensor.latest()  # calling `latest` after `close` must not raise an exception
         sensor.close()
 
 

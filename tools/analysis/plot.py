@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Missing(SoftfingerError):
-    """The recording lacks data for a figure; the message says which."""
+    """Error raised if the recording lacks data for a figure; the message names the data."""
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _read(line: ServoLine, ids: list[int]) -> _Counts:
-    """Return all servo positions; raise ServoError if torque is on or one is not in one turn."""
+    """Return all servo positions; raise ServoError if torque is on or a value exceeds one turn."""
     counts = {}
     for servo in ids:
         table = Registers(line.read(servo, 0, CHECKED) or b"")

@@ -183,7 +183,7 @@ class Wire:
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
         """Publish one message as soon as the gateway can accept it."""
-        if topic not in schema.TOPICS:  # a topic from another version
+        if topic not in schema.TOPICS:  # the topic comes from another version
             return
         self._link.wait_for_room(_SEND_TIMEOUT)
         index = GATEWAY_TOPICS.index(topic.decode())

@@ -19,8 +19,8 @@ FloatArray = NDArray[np.float64]
 LEVELS = 32  # number of colours; fewer colours make redraws faster
 SHADES = " ·░▒▓█"  # shades for terminals with too few colours
 
-# Lightness increases in equal steps from dark blue to bright yellow, so the order of the colours
-# also shows in greyscale and to colour-blind users.
+# Lightness increases in equal steps from dark blue to bright yellow, so the order of the colours is
+# also visible in greyscale and to colour-blind users.
 _ANCHORS = (
     (24, 18, 56),
     (50, 46, 110),

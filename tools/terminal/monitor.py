@@ -34,7 +34,8 @@ from softfinger.tools.terminal.stream_state import Commander, StreamReader, Stre
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
 STEP_ANGLE = math.radians(5.0)  # rad, object rotation per press of an arrow key
-_STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # (upper force limit [N], step below it [N])
+# (upper limit of a force range [N], step in this range [N]).
+_STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
 _ACCUMULATION_TIME = 1.0  # s, interval within which key presses add up
 _CONFIRMATION_TIME = 3.0  # s, time limit for the second press of d, which confirms disarming
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}

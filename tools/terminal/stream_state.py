@@ -1,7 +1,7 @@
 """Collect the live page's data from the daemon's sockets, without drawing it.
 
-Message contents are not trusted. Fields that are missing or have the wrong type become NaN or
-empty. Messages that cannot be decoded are counted and skipped.
+The contents of messages are not trusted. Fields that are missing or have the wrong type become NaN
+or empty. Messages that cannot be decoded are counted and skipped.
 """
 
 from __future__ import annotations

@@ -201,8 +201,7 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Redirect a browser with a valid one-time code to the page with the token, or refuse
-        it."""
+        """Redirect browsers with the one-time code to the page with the token; refuse others."""
         if not self._code or not _has(request, "code", self._code):
             said = "This page needs the newest address that softfinger view prints; each works once"
             return connection.respond(403, said)
