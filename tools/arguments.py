@@ -173,7 +173,8 @@ def number(
 
     Raises
     ------
-    ArgumentTypeError The message contains ``text`` and ``what``, the description of a valid number.
+    ArgumentTypeError
+        The message contains ``text`` and ``what``, the description of a valid number.
     """
     try:
         value = float(text)

@@ -318,6 +318,9 @@ class VirtualHand(VirtualTimeHand):
     def fault(self, *words: str) -> None:
         """Start loads and measurement faults such as ``"push=3@0.5"`` or ``"left:gain=0.8"``.
 
+        `softfinger help emulate` lists all faults. Times are relative to this call. ``"well"`` ends
+        all faults.
+
         Raises
         ------
         FaultError

@@ -47,8 +47,8 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
 
     Raises
     ------
-    ServoError, CalibrationError, SettingsError If the procedure fails; the profile is then
-    unchanged.
+    ServoError, CalibrationError, SettingsError
+        If the procedure fails; the profile is then unchanged.
     """
     servos = settings.servos
     if servos.backend != "dynamixel":
