@@ -40,7 +40,7 @@ def cell_centres(
 
 @fast_inner_kernel
 def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
-    """Return Σ p, Σ p² and max(p, 0); if any cell is not finite, Σ p is not finite either."""
+    """Return Σ p, Σ p² and the maximum of 0 and all p; non-finite cells make Σ p non-finite."""
     total = 0.0
     energy = 0.0
     peak = np.int64(0)

@@ -433,7 +433,8 @@ class ContactEstimator:
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
         """Estimate the contact from this frame alone, and return a new result.
 
-        See :meth:`update` for the arguments and exceptions.
+        Earlier frames do not affect the result. See :meth:`update` for the arguments and
+        exceptions.
         """
         estimate = self.state.estimate
         before, seq, last = self._estimate.copy(), self._seq, self._last
