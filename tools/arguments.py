@@ -1,7 +1,7 @@
 """Command-line arguments shared by several subcommands.
 
-Settings are imported only when a profile is loaded, because clients of a running hand do not need
-them.
+The settings module is imported only when a profile is loaded, because clients of a running hand do
+not need it.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def addresses(text: str) -> tuple[str, str]:
 def waiting(address: str, folder: Path | None) -> str:
     """Return the message shown while waiting for the stream, with a hint if there are no keys.
 
-    A daemon that requires keys appears unreachable to a client without keys.
+    To a client without keys, a daemon that requires keys appears unreachable.
     """
     return f"waiting for a stream from {address}{_hint(folder)}"
 

@@ -1,8 +1,8 @@
 """Parse the command line and run the selected subcommand.
 
-Each subcommand is a module in a ``tools/`` package and is imported only when called. It defines
-``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user can
-correct, it raises SettingsError (exit status 2), another SoftfingerError, or OSError for a file
+Each subcommand is a module in a ``tools/`` package and is imported only when called. The module
+defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user
+can correct, it raises SettingsError (exit status 2), another SoftfingerError, or OSError for a file
 (exit status 1).
 """
 
@@ -77,14 +77,14 @@ The help of a subcommand lists its additional exit statuses."""
 
 
 def _open_standard_streams() -> None:
-    """Open /dev/null for closed standard streams, so that no other file gets their descriptors.
+    """Open /dev/null for closed standard streams, so that other files cannot get their descriptors.
 
     Also replace characters that a terminal or pipe cannot encode, such as θ.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
-            os.set_inheritable(descriptor, True)  # let child processes inherit it
+            os.set_inheritable(descriptor, True)  # let child processes inherit the descriptor
             setattr(sys, name, os.fdopen(descriptor, mode))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -148,7 +148,7 @@ def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any,
     return parser, made
 
 
-# Parts of the shared-library loader's messages when memory is exhausted.
+# Parts of the messages that the shared-library loader prints when memory is exhausted.
 _NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "libllvmlite")
 
 
@@ -176,7 +176,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(argv: Sequence[str] | None) -> int:
-    # Let Ctrl-C end the process without a traceback until the subcommand installs its own handler.
+    # Until the subcommand installs its own handler, Ctrl-C ends the process without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _open_standard_streams()
     words = list(sys.argv[1:] if argv is None else argv)

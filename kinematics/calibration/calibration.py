@@ -40,19 +40,20 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD_RESPONSE = 0.2  # fraction of the median response, below which a cell is dead
+DEAD_RESPONSE = 0.2  # fraction of the median response below which a cell is considered dead
 _EXPONENTS = (0.3, 3.0)
-_UNREST_SIGMA = 8.0  # multiple of the median noise, above which a cell is unsteady
-_UNREST_CELL_COUNT = 4  # unsteady cells at which the tare fails; fewer cells may be faulty
-_TILT_MIN = math.radians(3.0)  # minimum tilt range that determines the rotation
+_UNREST_SIGMA = 8.0  # multiple of the median noise above which a cell is unsteady
+# Minimum number of unsteady cells for a failed tare; fewer cells may be faulty.
+_UNREST_CELL_COUNT = 4
+_TILT_MIN = math.radians(3.0)  # minimum tilt range from which the rotation can be determined
 _UPRIGHT_ERROR = math.radians(0.5)
-_PRESSED_SIGMA = 6.0  # multiple of the noise that the largest reading of a contact must exceed
+_PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, relative to the noise
 _LAG_MAX = 8  # cells, maximum lag of the noise correlation
-_SIGNIFICANT_SIGMA = 4.0  # standard errors of a significant result
-# Noise standard deviations; a zero offset below this is affected by clipping at 0.
+_SIGNIFICANT_SIGMA = 4.0  # standard errors above which a result is significant
+# Clipping at 0 affects zero offsets below this number of noise standard deviations.
 _CLIPPED_SIGMA = 4.0
 _HOLD_RATIO_MIN = 2.0  # minimum hold time, relative to the longest time constant
-_ITERATIONS = 25  # alternating iterations for the strengths and the press
+_ITERATIONS = 25  # number of iterations that alternate between the strengths and the press
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -64,10 +65,10 @@ class Tare:
     """Result of `tare`: zero offset and noise of the cells.
 
     ``zero`` and ``noise`` are the mean and the standard deviation of the unloaded counts, both
-    float64 [rows, cols]. ``correlation`` [k, m] is the noise correlation of two cells by their
-    distance in rows and columns; it is empty if it is not significant. ``drift`` [counts] is the
-    standard deviation of the motion common to all cells. ``excess`` [counts] is the mean of
-    max(reading − zero, 0).
+    float64 [rows, cols]. ``correlation`` [k, m] is the noise correlation of two cells that are k
+    rows and m columns apart; the array is empty if the correlation is not significant. ``drift``
+    [counts] is the standard deviation of the drift common to all cells. ``excess`` [counts] is the
+    mean of max(reading − zero, 0).
     """
 
     zero: FloatArray
@@ -80,7 +81,7 @@ class Tare:
 def tare(frames: ArrayLike) -> Tare:
     """Determine the zero offset and noise of each cell from unloaded frames [n, rows, cols].
 
-    Raises CalibrationError if several cells vary much more than the others, which indicates a
+    Raises CalibrationError if several cells vary much more than other cells, which indicates a
     contact.
     """
     stack = _stack(frames, "tare")
@@ -114,7 +115,7 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     shape = rows + _LAG_MAX, cols + _LAG_MAX
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
-    # Average over both signs of one lag, and therefore over both diagonal directions.
+    # Average the correlation over both signs of one lag, i.e. over both diagonal directions.
     both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAG_MAX, :_LAG_MAX]
     pairs = (n - 1.0) * np.outer(rows - np.arange(_LAG_MAX), cols - np.arange(_LAG_MAX))
     if rows < _LAG_MAX or cols < _LAG_MAX or not both[0, 0] > 0.0:
@@ -192,8 +193,8 @@ def fit_curve(
 ) -> SensorCurve:
     """Fit the pressure curve of the cells to known forces.
 
-    The sum of pressure times cell area over all cells is fitted to the forces. The fit minimises
-    the squared relative errors.
+    The pressure times the cell area, summed over all cells, is fitted to the forces. The fit
+    minimises the squared relative errors.
 
     Parameters
     ----------
@@ -207,7 +208,7 @@ def fit_curve(
     area
         Cell area [m²].
     full
-        Maximum possible x. A cubic curve must increase up to this value.
+        Maximum possible value of the reading x. A cubic curve must be increasing up to this value.
 
     Raises
     ------
@@ -273,9 +274,10 @@ def _power(
 
 
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
-    """Set mean readings [rows, cols] over ``frames`` frames to 0 if they are within 4 σ of 0.
+    """Set mean readings [rows, cols] over ``frames`` frames to 0 where they are within 4 σ of 0.
 
-    Clipped noise has a positive mean. Summed over all cells, it may be as large as a contact.
+    Clipped noise has a positive mean. Summed over all cells, this mean may be as large as the force
+    of a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)
@@ -330,9 +332,9 @@ def fit_centre(
 ) -> Centre:
     """Determine centre and rotation from presses at known tilts ``theta`` [n] [rad].
 
-    The tilts are in the finger's plane. All cells of the ``frames`` [n, rows, cols] [Pa] are
-    fitted. The modulus of a spring tip need not be known. Raises CalibrationError if a frame shows
-    no contact, or if all tilts are equal but not zero.
+    The tilts are in the finger's plane. The fit uses all cells of the ``frames`` [n, rows, cols]
+    [Pa]. For a spring tip, a known modulus is not required. Raises CalibrationError if a frame does
+    not show a contact, or if all tilts are equal but nonzero.
     """
     stack = _stack(frames, "centre")
     s = np.sin(np.asarray(theta, np.float64))
@@ -351,7 +353,8 @@ def fit_centre(
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
-    # Add the uncertainty of the upright orientation, which shifts the centroid by lever × angle.
+    # Add the uncertainty of the upright orientation, which shifts the centroid by moment arm ×
+    # angle.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
     std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
     return Centre(found.centre, found.rotation if tilted else None, residual, std)
@@ -362,7 +365,7 @@ class Modulus:
     """Result of `fit_modulus` for the model F(d − d₀, θ).
 
     ``modulus`` is E [Pa], ``offset`` is d₀ [m], ``errors`` [n] are the relative force errors, and
-    ``trend`` contains the value of E from each load alone.
+    ``trend`` contains the value of E from each individual load.
     """
 
     modulus: float
@@ -420,7 +423,7 @@ class Relaxation:
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
-    """Integrate ḣ = (F∞ − h)/τ from h = 0; ``lasting`` is F∞, linear between the times ``t``."""
+    """Integrate ḣ = (F∞ − h)/τ from h = 0, with F∞ = ``lasting`` interpolated linearly in ``t``."""
     out = np.zeros_like(lasting)
     for k in range(1, t.size):
         step = (t[k] - t[k - 1]) / time
@@ -433,14 +436,14 @@ def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
 def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
     """Fit non-negative relaxation strengths to the force of a press and the following hold.
 
-    F∞ is constant during the hold. During the press, it follows from F and the strengths.
-    Therefore F∞ and the strengths are determined alternately.
+    F∞ is constant during the hold. During the press, F∞ follows from F and the strengths. Therefore
+    F∞ and the strengths are determined alternately.
 
     Parameters
     ----------
     t, force
-        Time [s] and force [N]. The press may have any speed and depth. It must begin without
-        contact, because earlier relaxation would not be included.
+        Time [s] and force [N]. The press may have any speed and depth. The press must begin without
+        contact, because the fit does not include earlier relaxation.
     times
         Time constants τ_i [s]. If a time constant is shorter than two frames, its strength cannot
         be determined and is set to 0.
@@ -467,7 +470,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
         memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
         columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
         fits = []
-        # There are few terms, so try every subset and keep the best one with positive strengths.
+        # Try every subset of the few terms, and keep the best subset with positive strengths.
         for chosen in itertools.product((False, True), repeat=len(told)):
             used = np.flatnonzero((True, *chosen))
             found = np.linalg.lstsq(columns[:, used], load[held:], rcond=None)[0]

@@ -25,8 +25,8 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 _PRESS_COUNT_MIN = 6  # minimum number of presses
 _UPRIGHT_TILT = math.radians(1.0)
 _TILTED_MIN = math.radians(5.0)
-_CURVE_ERROR_MAX = 0.05  # maximum curve error, relative to the force and to the radius
-_STAGE_ERROR = 2e-3  # minimum relative error of a stage and a sensor
+_CURVE_ERROR_MAX = 0.05  # maximum errors of the curves, relative to the force and to the radius
+_STAGE_ERROR = 2e-3  # minimum assumed relative error of a stage and a sensor
 
 
 class CurvesError(SoftfingerError, ValueError):
@@ -37,10 +37,10 @@ class CurvesError(SoftfingerError, ValueError):
 class PressSums:
     """Presses at d [n] [m] and θ [n] [rad] in the finger's plane.
 
-    ``frames`` contains the frames of each press [k, rows, cols] [Pa], as the daemon will receive
-    them. ``pressures`` [n, rows, cols] are the mean frames, corrected for the bias of noise clipped
-    at 0. ``rest`` [rows, cols] is this bias without contact. ``gain`` is the ratio of the true
-    force to the sensor's force.
+    ``frames`` contains the frames [k, rows, cols] [Pa] of each press, processed as in the daemon.
+    ``pressures`` [n, rows, cols] are the mean frames, corrected for the bias of noise clipped at 0.
+    ``rest`` [rows, cols] is the bias without contact. ``gain`` is the ratio of the true force to
+    the sensor's force.
     """
 
     d: FloatArray
@@ -171,7 +171,7 @@ def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], fl
     weight /= weight.sum()
     centre = float(weight @ x), float(weight @ y)
     along = np.sin(theta) * sums[0]
-    # In sensor axes, the finger's x axis is (cos, −sin) of the rotation.
+    # For a rotation ρ, the finger's x axis is (cos ρ, −sin ρ) in sensor axes.
     return centre, math.atan2(-float(along @ (y - centre[1])), float(along @ (x - centre[0])))
 
 

@@ -1,7 +1,7 @@
-"""Fit a smooth monotone stress-strain law, or a modulus, to measured points.
+"""Fit a smooth, monotonic stress-strain law, or a modulus, to measured points.
 
-The tangent modulus is a Bernstein polynomial on [0, 1], fitted by bounded least squares. Its
-coefficients are positive, so the modulus is positive everywhere.
+The tangent modulus is a Bernstein polynomial on [0, 1], fitted by bounded least squares. The
+polynomial's coefficients are positive, so the modulus is positive everywhere.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ __all__ = ["MaterialError"]
 FloatArray = NDArray[np.float64]
 
 MIN_POINTS = 4
-_DEGREES = range(11)  # polynomial degrees of the modulus, tried in turn
+_DEGREES = range(11)  # polynomial degrees tried for the modulus, in this order
 _NEGLIGIBLE_MISFIT = 1e-9  # negligible misfit, relative to the maximum stress
-_MISFIT_RATIO_MAX = 1.5  # a lower degree is accepted up to this multiple of the smallest misfit
-_MISFIT_MAX = 0.05  # misfit above which the fit fails, relative to the maximum stress
+# Maximum misfit of an accepted lower degree, relative to the smallest misfit.
+_MISFIT_RATIO_MAX = 1.5
+_MISFIT_MAX = 0.05  # maximum misfit of a successful fit, relative to the maximum stress
 _MODULUS_MIN = 1e-3  # minimum modulus, relative to the mean
 _EXTENSION_WEIGHT = 0.1  # weight of the points that extend the curve
 _SMOOTHING = 1e-7  # weight of the modulus's second differences; prevents oscillation between points
@@ -33,7 +34,7 @@ class MaterialError(SoftfingerError, ValueError):
 
 
 def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the points up to strain 1 without the origin; raise MaterialError if invalid."""
+    """Return the points up to strain 1, without the origin; raise MaterialError if invalid."""
     x = np.asarray(strain, dtype=np.float64)
     y = np.asarray(stress, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape:
@@ -104,7 +105,7 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Extend the points to strain 1 using their slope at the end."""
     if x[-1] > 0.95:
         return x, y
-    # Fit a parabola to the last third of the points. Its end slope is limited to 0.5 to 2 times
+    # Fit a parabola to the last third of the points. Limit the slope at its end to 0.5 to 2 times
     # the mean slope of the last quarter.
     last = max(3, x.size // 3)
     back = x[-last:] - x[-1]

@@ -11,7 +11,7 @@ class Invalid(IntEnum):
     """Reason why an estimate is invalid, or ``NONE`` if it is valid.
 
     ``text`` is the message for users. If several reasons apply, a fault in the readings takes
-    precedence over its effect on the fit.
+    precedence over problems of the fit.
     """
 
     text: str

@@ -87,7 +87,8 @@ class SensorGrid:
         pitch_x, pitch_y = self.pitches
         x = -0.5 * self.cols * pitch_x - self.centre[0]
         y = -0.5 * self.rows * pitch_y - self.centre[1]
-        # The values are in field order. Setting the fields one by one takes ten times as long.
+        # The values are in field order. Setting the fields individually would take ten times as
+        # long.
         fields = (tip.radius, x, y, pitch_x, pitch_y, self.rows, self.cols)
         return Grid(np.array([fields], Grid.dtype))
 
@@ -110,9 +111,10 @@ class SensorGrid:
     ) -> FloatArray:
         """Return the pressure [Pa] of a contact, averaged over each cell.
 
-        For a spring tip, the error is at most 1e-5 of the modulus, including cells at the outline.
-        It is 1e-4 above 30° and 1e-3 where the outline almost reaches the rim. The accuracy of a
-        solid tip is that of `solid_data`; contacts outside the range of its data are clamped.
+        For a spring tip, the error is at most 1e-5 of the modulus, even in cells at the outline.
+        The error is 1e-4 for tilts above 30° and 1e-3 where the outline almost reaches the rim. For
+        a solid tip, the accuracy equals that of `solid_data`, and contacts outside the range of its
+        data are clamped.
 
         Parameters
         ----------
@@ -154,7 +156,8 @@ class SensorGrid:
         return _images(replace(self, rotation=0.0), tip)
 
 
-@lru_cache(maxsize=16)  # grids of two fingers and their shifted copies for the error budget
+# Cache size: the grids of two fingers, and shifted copies for the error budget.
+@lru_cache(maxsize=16)
 def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     return images(tip, grid.on(tip), grid.blur)
 

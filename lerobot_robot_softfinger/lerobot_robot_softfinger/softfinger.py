@@ -57,7 +57,8 @@ class Softfinger(Robot):
         config = self.config
         hand = Hand(config.address, client="lerobot", timeout=config.timeout, keys=config.keys)
         try:
-            hand.state(config.start_timeout)  # The first start is slow because of compilation.
+            # The daemon's first start is slow because of compilation.
+            hand.state(config.start_timeout)
             hand.status()
             self._waiting = hand.frames()
             self._frames: dict[str, TactileFrame] = {}

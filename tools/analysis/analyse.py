@@ -1,7 +1,7 @@
 """Run ``softfinger analyse FILE``: compute d, θ, force and energy versus time from frames.
 
 The frames are processed with the daemon's perception code. A stream recording (.mcap) contains its
-own settings and calibrations. A file that contains only frames (.npz, .npy, a folder of these, or a
+own settings and calibrations. A source with only frames (.npz, .npy, a folder of such files, or a
 Tekscan-style export) is analysed with the profile's left sensor. The number of cells, and the pitch
 if given, are taken from the file.
 """
@@ -110,11 +110,11 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 
 _EIGHT_BITS = 255
-_NOISE_RATIO = 1.5  # times tactile.noise; more noise is named
+_NOISE_RATIO = 1.5  # multiple of tactile.noise above which the noise is reported
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
-    """Explain why no frame contains a contact: maximum reading, threshold and likely cause."""
+    """Explain a lack of contacts by the maximum reading, the threshold and the likely cause."""
     from softfinger.kinematics.estimation.estimator import PEAK_LEVEL
 
     scale = tactile.pascal_per_count if recording.whole else 1.0
@@ -176,7 +176,7 @@ class Source:
 
     @property
     def truths(self) -> dict[str, NDArray[np.float64]]:
-        """True contact per frame, by name, if a single-sensor file contains it."""
+        """True contact for each frame, by quantity, if a single-sensor file contains it."""
         return {} if self.recording is None else self.recording.truths
 
 
@@ -186,8 +186,8 @@ def open_source(path: Path, settings: Settings, own: bool) -> Source:
     Parameters
     ----------
     own
-        For stream recordings, use the recorded settings instead of ``settings``. Files with only
-        frames always use ``settings``, including the pitch unless the file contains one.
+        If True, use the settings in a stream recording instead of ``settings``. For files with only
+        frames, ``settings`` are always used, including the pitch unless the file contains a pitch.
 
     Raises
     ------
@@ -297,7 +297,7 @@ class Contacts:
 
 
 class _Pass:
-    """Perception for one sensor, with the rows computed so far."""
+    """Perception code for one sensor, with the rows computed so far."""
 
     def __init__(
         self, source: Source, models: tuple[FingerModel, FingerModel], finger: int

@@ -120,7 +120,8 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
         more["sweep"] = sweep
     try:
         tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
-    except (RuntimeError, SoftfingerError) as error:  # for example, a grip lost on a busy machine
+    # For example, because a grip was lost on a busy machine.
+    except (RuntimeError, SoftfingerError) as error:
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
         for note in table.notes if table.failed else ():
@@ -147,7 +148,7 @@ def _page(tables: list[Report]) -> list[Row]:
 
 
 def _processor() -> str:
-    """Return the processor name from Linux, or else the machine type."""
+    """Return the processor name reported by Linux, or the machine type on other systems."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))

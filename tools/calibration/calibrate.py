@@ -33,10 +33,11 @@ STEPS = (
     "scales",
 )
 _OF_PROFILE = STEPS[: STEPS.index("tare")]  # all other steps calibrate a tip
-# Fraction of the prior standard deviation of a sensor's gain. Above it, the gain has not been
-# measured in a grip.
+# Fraction of the prior standard deviation of a sensor's gain. If the standard deviation is above
+# this fraction, the gain has not been measured in a grip.
 _LEARNT = 0.8
-# Minimum relative standard deviation per factor, because rubber and joints vary day by day.
+# Minimum relative standard deviation of each factor, because rubber and joints vary from day to
+# day.
 _LEAST = 0.02
 _EPILOG = """\
 steps of a hand; FILE is a profile, copied from --config's if absent:
@@ -203,8 +204,8 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write a finger's calibration factors to its file and return a summary line.
 
     The sensor gain changes whenever the sensor is remounted, and the tip modulus may be known only
-    roughly. Both are estimated during a grip (`daemon.perception.hand_state`). A daemon that starts
-    with these factors reaches the correct force in its first grip.
+    roughly. Gain and modulus are estimated during a grip (`daemon.perception.hand_state`). A daemon
+    that starts with these factors reaches the correct force in its first grip.
 
     Raises
     ------

@@ -32,7 +32,7 @@ from softfinger.tools.arguments import to_stderr
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
 _PATIENCE = 10.0  # s, maximum interval without a new frame
 _WAIT = 60.0  # s, time limit for --move
-_BEFORE = 4000  # maximum number of frames stored before a hold
+_BEFORE = 4000  # maximum number of stored frames from before a hold
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
                 raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
-            # If there is one recording of the whole run, each frame with contact is a load.
+            # If a single recording contains the whole run, each frame with a contact is a load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
             frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
             return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
@@ -127,7 +127,7 @@ def _live(
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
                 bring(arguments, told, {"load": k + 1, **load})
-            # Frames scanned earlier may still show the previous load.
+            # Frames that were scanned earlier may still show the previous load.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads
@@ -176,7 +176,7 @@ def _move(command: str, load: Mapping[str, float | str]) -> None:
 
 @contextlib.contextmanager
 def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[TactileSensor]:
-    """Yield the finger's sensor, opened for this context; may raise TactileError."""
+    """Open the finger's sensor for the duration of this context; may raise TactileError."""
     hand = None
     if settings.tactile.backend == "simulated":
         from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand

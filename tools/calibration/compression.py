@@ -65,10 +65,10 @@ _QUANTITIES = {
 _EXAMPLE = "`d [mm],F [N],tilt [deg]` or `strain [%],stress [kPa]`"
 _NAMED = re.compile(r"^(.*?)\s*(?:[\[(]\s*(.*?)\s*[\])]|[/_]\s*([^\s/_]+))?$")
 _SAME_TILT = 2e-4  # rad, maximum tilt difference within a run
-_POINTS = 10  # points of a fitted law
+_POINTS = 10  # number of points that represent a fitted law
 _BINS = 20  # maximum number of points of a measured stress-strain law
 _TOE = 2.0  # ratio of slopes that indicates a toe region or an offset
-# Difference in the information criterion that is strong evidence (Kass & Raftery, 1995).
+# Difference in the information criterion that counts as strong evidence (Kass & Raftery, 1995).
 _BETTER = 6.0
 
 
@@ -76,8 +76,8 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     """Read the known columns of a file in SI units.
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
-    semicolon. Units follow the column names in the header, or are in a separate row below. Other
-    columns, empty lines and lines that begin with # are ignored.
+    semicolon. Units follow the column names in the header, or are in a separate row below the
+    header. Other columns, empty lines and lines that begin with # are ignored.
 
     Raises
     ------
@@ -222,7 +222,7 @@ def _force_law(
         raise CalibrationError(f"law: {'; '.join(notes)}")
     best, deepest = ours[0], max(run.depth for run in runs)
     force = max(float(np.ptp(run.force)) for run in runs)
-    # Residuals beyond the noise are attributed to the material law.
+    # Residuals in excess of the noise are attributed to the material law.
     misfit = best.residual * math.sqrt(max(1.0 - 1.0 / best.chi2, 0.0)) / force
     count = 0 if _is_constant(best) else _POINTS
     strain = np.linspace(0.0, deepest / tip.radius, count + 1)[1:]
@@ -351,7 +351,7 @@ def _stress_strain(
 
 
 def _thinned(strain: FloatArray, stress: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average the points in `_BINS` strain ranges if there are at least twice as many."""
+    """Average the points in `_BINS` strain ranges if there are at least 2 `_BINS` points."""
     if len(strain) < 2 * _BINS:
         return strain, stress
     edges = np.linspace(strain.min(), strain.max(), _BINS + 1)

@@ -22,15 +22,17 @@ from softfinger.tools.calibration.joints import write_keys
 from softfinger.tools.calibration.live_hand import LiveHand
 from softfinger.tools.recordings.reader import read_recording
 
-# (rad/s, rad, number) for each sweep. Slow sweeps measure breakaway friction, fast ones the rest.
+# (rad/s, rad, number) for each sweep. Slow sweeps determine breakaway friction; fast sweeps
+# determine the other friction parameters.
 _SWEEPS = ((0.05, 0.06, 2), (0.3, 0.4, 2), (0.6, 0.4, 2))
 _WIDEST = max(wide for _, wide, _ in _SWEEPS)
 _FROM_ENDS = 0.05  # rad, margin to each end of the joint range
 # rad, tolerance for the start of a sweep, because friction may stop a joint before its goal.
 _ARRIVED = 0.05
-_REST = 0.3  # s, pause between two strokes, in addition to the setpoint smoothing time
+_REST = 0.3  # s, pause between two strokes, in addition to the setpoint's smoothing time
 _TOUCHED = 0.2  # s, discarded before and after each contact because detection takes time
-_SEEN = 2.0  # σ, minimum excess over sliding friction for reporting breakaway friction
+# Standard deviations; breakaway friction is reported if it exceeds sliding friction by more.
+_SEEN = 2.0
 
 
 def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str:
@@ -100,7 +102,7 @@ def _told(fit: FrictionFit) -> str:
 
 
 def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArray[Any]]:
-    """Sweep the joints one after the other and return all states."""
+    """Sweep one joint at a time, and return all states."""
     names = sorted(settings.scene.fingers)
     ways = {name: _way(settings, name) for name in names}
     told = ", ".join(
@@ -130,7 +132,7 @@ def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArr
 def _way(settings: Settings, name: str) -> tuple[float, float]:
     """Return the start and signed length [rad] of a joint's sweeps.
 
-    The sweeps open the joint if its range permits, otherwise they close it. Raises CalibrationError
+    The sweeps open the joint if its range permits, and close it otherwise. Raises CalibrationError
     if the range is too short.
     """
     hand, finger = settings.hand, FINGERS.index(name)

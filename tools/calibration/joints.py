@@ -37,7 +37,7 @@ _POSES = {
     "zero": "put it upright, straight away from the palm",
 }
 _LEAST = 0.2  # rad, minimum rotation between closed and open
-_ALONE = 0.25  # 1, fraction of this rotation by which the other finger may move
+_ALONE = 0.25  # 1, maximum motion of the other finger, as a fraction of this rotation
 _MARGIN = 0.03  # rad, margin between the stops and the commanded range
 _Counts = dict[int, int]  # keys: servo IDs
 
@@ -48,7 +48,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
     Raises
     ------
     ServoError, CalibrationError, SettingsError
-        If this fails; the profile is then unchanged.
+        If the procedure fails; the profile is then unchanged.
     """
     servos = settings.servos
     if servos.backend != "dynamixel":
@@ -92,7 +92,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _read(line: ServoLine, ids: list[int]) -> _Counts:
-    """Return all servo positions; raise ServoError if torque is on or one exceeds a turn."""
+    """Return all servo positions; raise ServoError if torque is on or a value exceeds one turn."""
     counts = {}
     for servo in ids:
         table = Registers(line.read(servo, 0, CHECKED) or b"")
@@ -101,7 +101,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
         if table[reg.TORQUE_ENABLE]:
             raise ServoError(f"servo {servo}: torque is on: end `softfinger run`, or disarm")
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # After power-up, the position equals the encoder count, which is less than one turn.
+        # After power-up, a servo's position is the encoder count, which is less than one turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder
@@ -163,7 +163,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write ``new`` to the file, or to a copy of the profile, and preserve all other text."""
+    """Write ``new`` to the file, or to a copy of the profile; all other text is preserved."""
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
     load(source, arguments.dir or own_runtime_folder(), [*arguments.set, *changes])

@@ -29,10 +29,11 @@ FloatArray = NDArray[np.float64]
 _STEPS = (1.0, 0.5, 1.25, 0.5)  # 1, successive forces relative to the first force
 _HELD = 0.5  # s, hold time per force
 _STD_MAX = 5e-3  # s, maximum standard deviation of the latency
-# Accepted ratio of d from frames to d from joints. Outside it, frames do not follow the joints.
+# Accepted ratio of d from frames to d from joints. Outside this range, the frames do not follow the
+# joints.
 _SCALE = 0.5, 2.0
 _MISFIT_MAX = 0.3e-3  # m RMS; larger values indicate sliding, tilting or a second contact
-# Relative errors of d from frames, if d is estimated from the frame shape or its amplitude.
+# Relative errors of d from frames, if d is estimated from the frame's shape or from its amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 
@@ -91,7 +92,7 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
-    """Grasp with several forces and open again; return the hand with its stored stream."""
+    """Grasp with several forces, then open the hand; return the hand with its stored stream."""
     first = arguments.force[0] if arguments.force else settings.control.force_default
     forces = [min(step * first, settings.safety.force_max) for step in _STEPS]
     bring(

@@ -64,9 +64,10 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-# Relative softening after the first loads that is reported. Plates and noise cause less.
+# Minimum relative softening after the first loads that is reported. Plates and noise cause less
+# softening.
 _SOFTENS = 0.03
-# New calibration, summary line, panels of the plot.
+# New calibration, summary line, and panels of the plot.
 Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 
@@ -84,7 +85,7 @@ def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
 
 @dataclass(frozen=True)
 class Step:
-    """Inputs for one step, and quantities used in several steps."""
+    """Inputs for one step, and quantities that several steps use."""
 
     arguments: argparse.Namespace
     settings: Settings
@@ -259,7 +260,7 @@ def _modulus(step: Step) -> Done:
     pressed = zip(step.pressures, step.readings, strict=True)
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
-    whole = ~full.any(axis=(1, 2))  # saturated cells hide part of the force
+    whole = ~full.any(axis=(1, 2))  # saturated cells mask part of the force
     tip = make_tip(step.settings)
     found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
@@ -380,7 +381,7 @@ def _measured_told(law: TipCurves, left: FloatArray) -> str:
 
 
 def _over_d(trend: Trend) -> str:
-    """Describe E at minimum, middle and maximum d, with a warning if E drifts."""
+    """Describe E at the minimum, middle and maximum d, with a warning if E drifts."""
     order = np.argsort(trend.d, kind="stable")[[0, len(trend.d) // 2, -1]]
     values = ", ".join(f"{each / 1e6:.3f}" for each in trend.modulus[order])
     depths = ", ".join(f"{each * 1e3:g}" for each in trend.d[order])

@@ -44,7 +44,7 @@ MILLI = 1e-3
 MPA = 1e-6
 _NODES = 64  # Gauss nodes per double integral
 _STEEP_TILT = 25  # degrees, tilt at which the slope is reported
-_FITTED = slice(10, None)  # rows from 1 to 8 mm, used to fit the exponents
+_FITTED = slice(10, None)  # rows from 1 to 8 mm, which are used to fit the exponents
 _STEP = 1e-4  # relative or rad, finite-difference step
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
@@ -62,7 +62,7 @@ def _tangent(material: Material, strain: FloatArray) -> FloatArray:
 
 
 def law() -> tuple[Sheet, ...]:
-    """Tabulate the law versus strain, and compare Table I with the law at the same strains."""
+    """Tabulate the law versus strain, and compare the law with Table I at the table's strains."""
     material = Material.table_i()
     strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
     curve = {
@@ -146,7 +146,7 @@ class Plotted:
     equation: int
     power: str  # power law in d at θ = 0
     prefactor: str
-    straight: float  # power-law factor divided by E
+    straight: float  # factor of the power law, divided by E
 
     def closed(self, d: Numbers, theta: Numbers) -> FloatArray:
         """Return the closed form in the figure's unit, with d in mm and θ in degrees."""

@@ -1,8 +1,8 @@
 """Run ``softfinger validate``: compare the model with published values.
 
-Each row shows a computed quantity, the published value with its source, and a verdict: agree,
-disagree or unknown. Quantities that are not modelled, or that require measurements on hardware, are
-unknown; the reason is given.
+Each row shows a computed quantity, the published value with its source, and the verdict ``agree``,
+``disagree`` or ``unknown``. The verdict is ``unknown``, with a reason, for quantities that are not
+modelled or that require measurements on hardware.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ from softfinger.tools.sweep import Progress, processors
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
-_MEMORY_MAX = 400e6  # bytes, upper bound per process
+_MEMORY_MAX = 400e6  # bytes, upper bound of the memory use per process
 _CHECK_INTERVAL = 0.2  # s
 
 
@@ -65,14 +65,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Built(NamedTuple):
-    """Result of a build: the number of missing parts, and a flag for failures."""
+    """Result of a build: number of missing parts, and whether a part has failed."""
 
     parts: int
     failed: bool
 
 
 def print_event(_level: str, _kind: str, text: str) -> None:
-    """Print an event to standard error, for tools without a log."""
+    """Print an event to standard error, for tools that do not have a log."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -83,7 +83,8 @@ def build_kernels(
 
     If all parts exist, the function returns quickly without a message. If standard error is a
     terminal and ``bar`` is set, a bar shows the progress. Otherwise ``tell(level, kind, text)`` is
-    called for each part. Failures are also passed to ``tell``. An interruption ends all processes.
+    called for each part. Failures are also passed to ``tell``. If the function is interrupted, all
+    processes end.
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
@@ -159,7 +160,8 @@ class _Build:
             for process in self._processes:
                 with process:
                     pass
-        # Report each reason only once, because wrong settings make all parts fail in the same way.
+        # Report each reason only once, because invalid settings make all parts fail in the same
+        # way.
         reasons: set[str] = set()
         for name, future in built.items():
             if (reason := future.result()) and reason not in reasons:
@@ -174,7 +176,7 @@ class _Build:
         )
 
     def _build(self, part: Part, after: Future[str] | None) -> str:
-        """Wait for ``after``, build a part in this thread's process; return the failure reason."""
+        """Wait for ``after``, build a part in this thread's process; return any failure reason."""
         if after is not None:
             wait([after])
         head, process = "", getattr(self._own, "process", None)
@@ -205,7 +207,7 @@ class _Build:
 
 def _start() -> subprocess.Popen[str]:
     """Start a process that runs `main`."""
-    # -P keeps a folder named tools in the working directory from being imported.
+    # With -P, a folder named tools in the working directory is not imported.
     command = [sys.executable, "-P", "-m", "softfinger.tools.processes.compile"]
     path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(
@@ -214,7 +216,7 @@ def _start() -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
         text=True,
-        process_group=0,  # Only the parent receives Ctrl-C, and it ends the children.
+        process_group=0,  # Only the parent process receives Ctrl-C; it then ends the children.
     )
 
 
@@ -225,10 +227,11 @@ def main() -> None:
     output has three kinds of lines: ``kernel NAME`` when a kernel is started, ``done`` when a part
     has been built, and ``failed REASON`` when a part could not be built.
     """
-    # The compiler allocates many long-lived objects, so frequent collections cost 10 % of the time.
+    # The compiler allocates many long-lived objects, so frequent garbage collections take 10 % of
+    # the time.
     gc.set_threshold(100_000)
     out = sys.stdout
-    sys.stdout = sys.stderr  # Other output must not disturb the protocol.
+    sys.stdout = sys.stderr  # Other output must not interfere with the protocol.
 
     def tell(line: str) -> None:
         print(line, file=out, flush=True)

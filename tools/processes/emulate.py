@@ -1,4 +1,4 @@
-"""Run ``softfinger emulate``, an emulated hand's process: arguments, signals, exit status."""
+"""Run ``softfinger emulate``, the process of an emulated hand: arguments, signals, exit status."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT, SIGTERM or SIGHUP. Return 1, with a message, if the set-up fails."""
+    """Emulate until SIGINT, SIGTERM or SIGHUP. Return 1 after a message if the set-up fails."""
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder with --dir")
@@ -150,7 +150,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
     # The following imports are slow (numpy, numba), so settings errors are reported earlier.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # Garbage collections during imports take a tenth of the start-up time.
+    gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
         EmulatedServos,
@@ -184,13 +184,14 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 
 @contextlib.contextmanager
 def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
-    """Run `softfinger emulate` with the arguments ``words`` in a process; yield it once it answers.
+    """Run `softfinger emulate` with the arguments ``words``; yield the process once it is ready.
 
-    Raises NoEmulator if it has ended instead. Its message is on standard error.
+    Raises NoEmulator if the process ends before it is ready. The process prints its error message
+    to standard error.
     """
     from softfinger.daemon.simulation.emulator.folder import NoEmulator
 
-    # -P keeps a folder named softfinger in the working directory from being imported.
+    # With -P, a folder named softfinger in the working directory is not imported.
     command = [sys.executable, "-P", "-m", "softfinger", "emulate", *map(str, words)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -203,12 +204,12 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def _ready(ports: dict[str, Path]) -> str:
-    """Return the lines for an emulator that answers, as one text, since readers may wait for it."""
+    """Return the output of a ready emulator as one text, since readers may wait for its end."""
     return "".join(["ready\n", *(f"{name}: {path}\n" for name, path in ports.items())])
 
 
 def _unhurried(settings: Settings, paced: bool) -> Settings:
-    """Return the settings with real-time measures that suit a pseudo-terminal.
+    """Return the settings with real-time options that are suitable for a pseudo-terminal.
 
     SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Idle
     states are disabled only if the servos reproduce the wire timing, which requires very short

@@ -93,7 +93,7 @@ def _serve(
     # The following imports are slow (numpy, numba, zmq), so settings errors are reported earlier.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # Garbage collections during imports take a tenth of the start-up time.
+    gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
     from softfinger.daemon.loop.build import Daemon
     from softfinger.tools.processes.compile import build_kernels
 
@@ -109,7 +109,7 @@ def _serve(
         daemon = Daemon(settings, on_event=on_event)
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
-        # systemd does not restart the service after status 2.
+        # After exit status 2, systemd does not restart the service.
         return 2 if isinstance(error, SettingsError) else 1
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
@@ -132,7 +132,7 @@ def _serve(
                 log.plain(f"softfinger: {error}")
                 return 1
         page: AbstractContextManager[Any] = nullcontext()
-        log.quiet = arguments.monitor  # The page now uses the terminal.
+        log.quiet = arguments.monitor  # From here on, the page uses the terminal.
         if arguments.monitor:
             addresses = settings.stream.address, settings.commands.address
             page = MonitorProcess(*addresses, loop.end, settings.access.keys)
@@ -162,7 +162,7 @@ def _serve(
 
 @contextmanager
 def _service(loop: Any) -> Iterator[None]:
-    """Notify systemd, if requested: ready on the first tick, alive on each tick, and stopping."""
+    """Notify systemd, if requested, when the daemon is ready, on each tick, and when it stops."""
     service = Service.of_environment()
     if service is None:
         yield
@@ -203,7 +203,7 @@ def _scene(settings: Settings) -> str:
 
 
 def _numbers(state: State) -> dict[str, Any]:
-    """Return the numbers to be logged with an event; ``seq`` locates the event in a recording."""
+    """Return the numbers to log with an event; ``seq`` identifies the event in a recording."""
     numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
     real = {
         name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON lacks NaN.

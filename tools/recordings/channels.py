@@ -37,7 +37,7 @@ _FOXGLOVE: dict[bytes, tuple[str, dict[str, Any]]] = {
     ),
 }
 _STORED_AS = {"timestamp": "unix", "level": "severity"}
-_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's levels, where 0 means unknown
+_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's log levels, where 0 means unknown
 
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 

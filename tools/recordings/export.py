@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export the topics. Return 1 if there is nothing to export.
+    """Export the topics; return 1 if there is nothing to export.
 
     Raises
     ------
@@ -82,7 +82,7 @@ _BLOCK = 2000  # rows per write
 
 
 class CsvTable:
-    """CSV file with full float precision and empty cells for NaN, without byte fields."""
+    """CSV file with full float precision and empty cells for NaN; byte fields are omitted."""
 
     suffix = ".csv"
 
@@ -153,20 +153,20 @@ def export(
 ) -> list[Path]:
     """Write one table per topic and one ``.npz`` file with frames per sensor into ``folder``.
 
-    The first column ``t`` is the time since the recording's first message [s] by the daemon's
-    clock, in all files alike. The others are those of the schema and any additional fields of the
-    first message of a topic.
+    In all files, the first column ``t`` is the time since the recording's first message [s],
+    according to the daemon's clock. The other columns are the fields of the schema and any
+    additional fields of the topic's first message.
 
     Returns
     -------
-    The files that were written.
+    Paths of the written files.
 
     Raises
     ------
     OSError, MissingExtra
     """
     tables: dict[bytes, Table] = {}
-    grids: dict[str, tuple[list[float], list[Any]]] = {}  # by finger, times and counts
+    grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts, by finger
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):
@@ -193,7 +193,7 @@ def export(
 
 
 def _file_name(topic: bytes) -> str:
-    """Return a safe file name for any topic: not hidden and without a folder."""
+    """Return a safe file name for any topic: not hidden, and without a folder part."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 

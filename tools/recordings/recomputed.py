@@ -28,7 +28,7 @@ from softfinger.tools.recordings.reader import MessageSource, Recording
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
-# Fields that depend on the machine's timing instead of the loop's inputs.
+# Fields that depend on the machine's timing and not on the loop's inputs.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of hand/settings
@@ -36,7 +36,7 @@ _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of h
 
 @dataclass(slots=True)
 class Difference:
-    """Differences in one ``hand/state`` field: their number, the first and the largest one."""
+    """Differences in one ``hand/state`` field: number, first difference and largest difference."""
 
     count: int = 0
     first_tick: int = 0
@@ -194,7 +194,8 @@ def _run(
         result.ticks += 1
         if state is not None:
             step = state.get("seq_step", 1)
-            # Pack and unpack the state like the recorded one, for identical types and rounding.
+            # Pack and unpack the state in the same way as the recorded state, for identical types
+            # and rounding.
             again = msgpack.unpackb(pack_state(now, scene, step))
             _compare(result, state, again)
 
@@ -208,7 +209,7 @@ _Tick = tuple[
 def _ticks(
     recording: Recording, used: Settings, progress: Callable[[int], None] | None
 ) -> Iterator[_Tick]:
-    """Yield all ticks. A tick's frames and commands precede its input, and its state follows it."""
+    """Yield all ticks. Frames and commands precede the tick's input, which precedes its state."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}

@@ -118,7 +118,7 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     from softfinger.tools.recordings.recomputed import recompute, recorded_settings
     from softfinger.tools.sweep import Progress
 
-    # Check for missing settings before the kernels are loaded.
+    # Check that the recording contains settings before the kernels are loaded.
     recorded, _ = recorded_settings(recording)
     from softfinger.tools.processes.compile import build_kernels, print_event
 
@@ -148,7 +148,8 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     return _EXIT_DIFFERENT
 
 
-_QUEUE_LENGTH = 10_000  # messages queued for a subscriber; excess messages are lost
+# Maximum number of messages queued for a subscriber; excess messages are lost.
+_QUEUE_LENGTH = 10_000
 _SEND_TIMEOUT = 1.0  # s, timeout for the gateway to accept a message
 
 
@@ -182,7 +183,7 @@ class Wire:
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
         """Publish one message as soon as the gateway can accept it."""
-        if topic not in schema.TOPICS:  # a topic from another version
+        if topic not in schema.TOPICS:  # the topic comes from another version
             return
         self._link.wait_for_room(_SEND_TIMEOUT)
         index = GATEWAY_TOPICS.index(topic.decode())

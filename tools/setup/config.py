@@ -1,4 +1,4 @@
-"""Run ``softfinger config``: check profiles, show those of the package, and every setting."""
+"""Run ``softfinger config``: check profiles, and show the package's profiles and all settings."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _text(profile: Path) -> str:
 
 
 def subject(profile: Path) -> str:
-    """Return the first sentence of a profile's opening comment."""
+    """Return the first sentence of the comment at the beginning of a profile."""
     comment = itertools.takewhile(lambda line: line.startswith("#"), _text(profile).splitlines())
     words = " ".join(line[1:].strip() for line in comment if not line.startswith("#:"))
     return min((words.partition(mark)[0] for mark in (": ", ". ")), key=len)

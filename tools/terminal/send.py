@@ -18,7 +18,7 @@ from softfinger.tools.arguments import add_daemon, client_keys, command_address,
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
-_UNITS = {  # allowed units per key; numbers without a unit are in SI units
+_UNITS = {  # accepted units for each key; numbers without a unit are in SI units
     "force": {"N": 1.0, "mN": 1e-3},
     **dict.fromkeys(("angle", "left", "right"), _ANGLES),
 }
