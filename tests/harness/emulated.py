@@ -46,7 +46,7 @@ def emulated(
 
 
 class EmulatorProcess:
-    """Process of ``softfinger emulate`` with these arguments."""
+    """A ``softfinger emulate`` process with these arguments."""
 
     def __init__(self, *arguments: str | Path) -> None:
         pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -64,7 +64,7 @@ class EmulatorProcess:
         return self
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Send a signal; return exit status and remaining output without kernel messages."""
+        """Send a signal; return the exit status and the output without compilation messages."""
         self.popen.send_signal(number)
         out, err = self.popen.communicate(timeout=300)
         return self.popen.returncode, out, _COMPILED.sub("", err)

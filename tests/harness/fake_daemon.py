@@ -83,8 +83,8 @@ class FakeDaemon:
 
     ``changes`` are merged into every state. ``requests`` contains the received commands and
     ``keys`` the client key of each. ``replies`` maps a command to its reply, or to a list of
-    successive replies. No states are sent while ``silent`` is set, no replies while ``deaf`` is
-    set, and no frames for the fingers in ``dead``.
+    successive replies. ``silent`` suppresses all states, ``deaf`` suppresses all replies, and
+    ``dead`` names the fingers whose frames are suppressed.
     """
 
     def __init__(self) -> None:

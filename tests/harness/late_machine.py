@@ -1,10 +1,10 @@
-"""Simulate the clock of a machine that wakes up late on request."""
+"""Simulate a machine whose wake-ups are late on request."""
 
 from softfinger.daemon.clock import VirtualClock
 
 
 class LateMachine(VirtualClock):
-    """Replacement for the real clock that advances only by work and sleep.
+    """Replacement for the real clock; only `work` and sleeping advance it.
 
     ``late_by`` holds the delays of the next wake-ups [s].
     """

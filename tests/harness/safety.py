@@ -21,7 +21,7 @@ BOUNDS = SETTINGS.safety
 
 
 class Sensor:
-    """The properties of a sensor that the limits use."""
+    """Sensor properties that the limits use."""
 
     def __init__(self, finger: int) -> None:
         self.finger = finger
@@ -79,7 +79,7 @@ class Deaf:
 
 
 def bounded(judge: Safety, state: State) -> None:
-    """Limit the state's goal as is done before sending it to the servos."""
+    """Limit the state's goal, as the daemon does before sending it to the servos."""
     judge.write(cast(Servos, Deaf()), state)
 
 

@@ -57,7 +57,7 @@ def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
 
 
 class BusClient:
-    """Bus client with its own time that uses the independent parser for replies."""
+    """Bus client with its own time; it parses replies with the independent parser."""
 
     def __init__(self, bus: ServoBus) -> None:
         self.bus = bus
@@ -129,7 +129,7 @@ class DirectPort(SerialPort):
 
 
 class RunningBus(EmulatedBus):
-    """Bus served by a thread: a given one, or the servos of the settings."""
+    """Bus served by a thread; the default bus has the servos of the settings."""
 
     def __init__(self, bus: ServoBus | None = None, baud: int = 0, **options: Any) -> None:
         super().__init__(baud=baud, bus=bus or hand_bus(baud=baud, **options))

@@ -29,7 +29,7 @@ RATE = 200.0  # Hz
 
 
 def image(number: int) -> NDArray[np.uint16]:
-    """Return a different image for each number; no cell equals its transpose."""
+    """Return a different, asymmetric image for each number."""
     cells = np.arange(ROWS * COLS, dtype=np.uint16).reshape(ROWS, COLS)
     return (cells * 7 + 3 * (cells // COLS) + number) % 160
 
@@ -58,7 +58,7 @@ def why_not_open(sensor: TactileSensor) -> str:
 
 
 class Rig:
-    """Context with one backend and its environment."""
+    """Test context with one backend and its environment."""
 
     def __init__(
         self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None

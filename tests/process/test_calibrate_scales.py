@@ -1,4 +1,4 @@
-"""`softfinger calibrate scales` stores factors from grips, which the next daemon starts with."""
+"""`softfinger calibrate scales` stores factors from grips; the next daemon starts with them."""
 
 from pathlib import Path
 from typing import Any

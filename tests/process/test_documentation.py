@@ -1,8 +1,8 @@
-"""Run every code block of README and docs unchanged: shell, Python, profiles.
+"""Run every code block of the README and the docs unchanged: shell, Python, profiles.
 
-Each page runs from its top in its own folder, with one simulated hand. `harness.documented` is its
-`softfinger` command and describes which commands are only parsed. A block with a title is saved as
-that file, for later blocks. A mark above a block makes an exception:
+Each page runs from its top in its own folder, with one simulated hand. `harness.documented`
+provides the `softfinger` command and describes which commands are only parsed. A block with a title
+is saved under that name for later blocks. A mark above a block makes an exception:
 
     <!-- not run: why -->                  the block cannot be run, with the reason
     <!-- not run without gymnasium -->     the block needs a package that is not installed here
@@ -52,7 +52,7 @@ PATIENCE = 300.0  # s for one block
 
 
 class Block(NamedTuple):
-    """A code block with its first line, the mark above it, and the file it is saved as."""
+    """A code block with its line number, the mark above it, and the file it is saved as."""
 
     line: int
     language: str

@@ -22,7 +22,7 @@ FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fas
 
 
 def placed(firmware: int, *counts: int) -> ServoBus:
-    """Return servos of a firmware at these counts, configured for the hand."""
+    """Return servos with this firmware at these counts, configured for the hand."""
     return make_bus("XM430-W350", firmware=firmware, for_daemon=True, counts=counts)
 
 
@@ -194,7 +194,7 @@ def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connec
         """Read the joints at ``count``, which differs from the positions in earlier replies."""
         bus.call(lambda: bus.bus.plant.q.__setitem__(slice(2), count * RADIAN))
         backend.read(reading)
-        if reading.valid:  # the reply was not late because this thread was suspended
+        if reading.valid:  # the reply was late, and not only because this thread was suspended
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")

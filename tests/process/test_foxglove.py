@@ -108,7 +108,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
             assert (log["level"], log["message"], log["name"]) == (3, early["text"], "start")
             assert log["timestamp"]["sec"] == int(early["timestamp"])
             client.unsubscribe("hand/state")
-            client.subscribe("hand/event")  # the reply comes after the subscription is active
+            client.subscribe("hand/event")  # the reply follows once the subscription is active
             client.next("hand/event")
             rest: set[str] = set()
             while not rest >= {"hand/scene", "hand/tactile/left", "hand/tactile/right"}:
@@ -165,7 +165,7 @@ def check_scene(client: Client) -> None:
     (outline,) = named["object"]["lines"]
     points = np.array([[each["x"], each["y"]] for each in outline["points"]])
     (expected,) = hand_parts(Settings(), read(schema.HandState, state(0.0, 0)))["object"].lines
-    assert points == pytest.approx(expected[2], abs=6e-3)  # the object turns by at most 5°
+    assert points == pytest.approx(expected[2], abs=6e-3)  # the object rotates by at most 5°
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +217,7 @@ def connections(address: str) -> int:
 @pytest.mark.extended
 def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
     fake, address = stranger
-    fake.changes = {"fault": "x" * 30_000}  # large states that soon fill a buffer
+    fake.changes = {"fault": "x" * 30_000}  # large states soon fill a buffer
     with ExitStack() as stack:
         lazy = []
         for _ in range(CLIENT_COUNT_MAX):
@@ -237,7 +237,7 @@ def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
                 client.sendall(masked({"subscriptions": [{"id": 1, "channelId": channel}]}))
         until(lambda: connections(address) < CLIENT_COUNT_MAX)
         with connected(address) as line:
-            Client(line)  # accepted
+            Client(line)  # the server accepts this client
 
 
 def test_incomplete_and_invalid_requests_are_closed(stranger):

@@ -134,7 +134,7 @@ def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
             with hand.stream(120.0) as states:
                 held = [next(states) for _ in range(60)]
             assert {(state.mode, state.fault) for state in held} == {("holding", "")}
-            # A late frame invalidates a contact for a moment.
+            # A late frame briefly invalidates a contact.
             sound = [state for state in held if state.left.valid and state.right.valid]
             forces = [(state.left.force, state.right.force) for state in sound]
             near = [each == pytest.approx((10.0, 10.0), rel=0.05) for each in forces]
@@ -179,7 +179,7 @@ def test_start_up_waits_for_servos_that_have_not_responded_yet(tmp_path, address
 
 
 def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
-    """Check that each servo at work stops when its watchdog times out."""
+    """Check that each active servo stops when its watchdog times out."""
     before = rig.at_work()
     lose()
     until(rig.stopped)

@@ -96,7 +96,7 @@ def test_model_page_has_points_near_the_model_curves(run):
     model = run.models[0].table(depths * 1e-3, np.radians(points[:, 0])).force
     firm = points[:, 1] > 1.0
     assert firm.sum() > 100
-    # The accuracy is limited by the modulus factor.
+    # The modulus factor limits the accuracy.
     assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.06
 
 

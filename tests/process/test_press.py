@@ -17,7 +17,7 @@ RUBBER = ["tip.physics=solid", "tip.poisson=0.48", "safety.d_max=0.008", *LINEAR
 
 
 class Stage:
-    """A user at the stage who applies the requested load and then presses Enter."""
+    """Simulated user of the test stand, who applies the requested load and presses Enter."""
 
     def __init__(self, folder, presses):
         self._folder, self._presses = folder, list(presses)

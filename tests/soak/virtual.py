@@ -7,7 +7,7 @@ against the daemon's own reports. The number of checks of each requirement is co
 that never checks one of them fails. The tests run a few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time, with its stream recorded and
-read. Violations are counted without ending the run, which fails if memory grows or a state is
+read. Violations are counted and do not end the run. The run fails if memory grows or a state is
 inconsistent.
 """
 
@@ -50,7 +50,7 @@ _GRIPPING = ("grasping", "holding", "rotating")
 _COMMAND_EVERY = 150  # average ticks between commands
 _DISTURBED_EVERY = 800  # average ticks between loads or faults
 _DISTURBED_FOR = 500
-_WILD = 0.1  # fraction of commands drawn regardless of the mode
+_WILD = 0.1  # fraction of commands that are drawn regardless of the mode
 _LOOKS = 96  # memory checks in a long sequence
 _WARM = 2  # memory checks excluded as warm-up: ten minutes of eight hours
 _FLAT = 2.0  # MB, maximum memory growth after the warm-up
@@ -67,7 +67,7 @@ _UNHEARD = ("silent", "gone", "deaf")  # the servo does not receive torque off
 _WATCHDOG = 100  # ticks (0.2 s) until the servo watchdogs stop the motors
 _LOST = 20  # consecutive lost goals that are detected
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
-# Faults of a sensor or current measurement: range of values, channel that may be named.
+# Faults of a sensor or of a current measurement: range of values, and channel that may be named.
 LIES = {
     "gain": ((0.5, 1.6), "sensor"),
     "shift-x": ((-4.0, 4.0), "sensor"),
@@ -78,12 +78,12 @@ LIES = {
     "current": ((0.4, 2.5), "current"),
 }
 LOADS = ("push", "twist")
-_TOO_LONG = 0.05  # s, maximum time for which a tip's force may exceed its bound
-_TOO_MUCH = 1.3  # maximum ratio to the requested force if there is no reason for more
-_UNSURE = 1.2  # ratio to the maximum raised force, because tips that carry a load differ
-_REMEMBERED = 5.0  # s after a load or a measurement fault during which a grip may still be raised
-_RETARGETED = 0.5  # s for which the force of the previous request may persist
-_UNCOVERED = 1.0  # s after which a tip near the object's edge is no longer considered
+_TOO_LONG = 0.05  # s, maximum time for which a tip force may exceed its bound
+_TOO_MUCH = 1.3  # maximum ratio to the requested force without a reason for more
+_UNSURE = 1.2  # ratio to the maximum raised force, because tip forces differ under load
+_REMEMBERED = 5.0  # s, maximum time for which a grip stays raised after a load or measurement fault
+_RETARGETED = 0.5  # s, maximum time for which the previously requested force may persist
+_UNCOVERED = 1.0  # s, time after which a tip near the object's edge is ignored
 
 # Requirements, each of which is counted.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
@@ -170,7 +170,7 @@ class FaultyServos:
         self.finger = 0
         self.last_good = -math.inf
         self.torque = False
-        self.armed = False  # armed, and this state has not been ended by an event
+        self.armed = False  # armed since the last event that disarms
         self._last = 0.0  # angle reported by a numb joint [rad]
         self._unheard = 0
 
@@ -319,7 +319,7 @@ class Account:
     modes: Counter[str] = field(default_factory=Counter)  # ticks in each mode
     faults: Counter[str] = field(default_factory=Counter)  # latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
-    # Named channels, together with the actual fault.
+    # Named channels with the actual fault.
     named: Counter[str] = field(default_factory=Counter)
     commands: Counter[str] = field(default_factory=Counter)  # accepted commands
     refused: int = 0
@@ -412,7 +412,7 @@ class Soak:
         self._loaded = 0.0  # N along the faces
         # s, most recent times of these conditions
         self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
-        self._asked: list[tuple[float, float]] = []  # (time [s], force [N]); empty without a grip
+        self._asked: list[tuple[float, float]] = []  # (time [s], force [N]); empty outside grips
         # Start of the current interval above the bound [s].
         self._above = {MOST: math.inf, CALM: math.inf}
 
@@ -631,7 +631,7 @@ class Soak:
             self.must(FRAME, age <= most + 1e-9, f"{mode} on one {age:.3f} s old")
 
     def _judge_forces(self, t: float) -> None:
-        """Check that each force of the plant exceeds its bound only briefly."""
+        """Check that each force in the plant exceeds its bound only briefly."""
         control, most = self.settings.control, self.settings.safety.force_max
         if self._loaded:
             self._loaded_t = t
@@ -652,7 +652,7 @@ class Soak:
         bound = _TOO_MUCH * asked
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
-        bound += 2.0 * friction  # once for the compensation, once for static friction
+        bound += 2.0 * friction  # for the compensation and for static friction
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)

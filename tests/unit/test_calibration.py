@@ -47,7 +47,7 @@ def test_tare_is_the_mean_of_each_cell():
 
 def test_a_tare_under_load_is_refused():
     frames = 10.0 + RNG.standard_normal((20, 8, 8))
-    frames[:, 2:4, 3] *= 20.0  # two faulty cells are ignored
+    frames[:, 2:4, 3] *= 20.0  # the tare ignores two faulty cells
     tare(frames)
     frames[10:, 4:6, 4:7] += 100.0
     with pytest.raises(CalibrationError, match="the readings of 8 cells change"):
@@ -112,7 +112,7 @@ def test_centre_and_rotation_are_recovered_from_tilted_loads(rotation):
     assert found.centre == pytest.approx(true.centre, abs=2e-5)
     assert found.rotation == pytest.approx(rotation, abs=5e-3)
     assert found.residual < 3e-5
-    assert 2e-5 < found.std < 2e-4  # loads are upright to within half a degree
+    assert 2e-5 < found.std < 2e-4  # the loads are upright to within half a degree
 
 
 def test_upright_loads_determine_the_centre_but_not_the_rotation():

@@ -1,4 +1,4 @@
-"""The table of commands, from which the page is generated, against a running hand."""
+"""The command table, the source of the generated page, against a running hand."""
 
 import math
 from collections.abc import Callable

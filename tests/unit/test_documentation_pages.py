@@ -1,4 +1,4 @@
-"""The pages of the site: they are built, links are valid, and quoted messages match the program."""
+"""The documentation site: pages build, links are valid, and quoted messages match the program."""
 
 import ast
 import html

@@ -79,7 +79,7 @@ def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
         decoded = decoder.feed(frame(images[k]), 0.01 * k)
         assert decoded.data[0, 0] == k
         assert decoded.t == 0.01 * k
-    # Two pieces within the frame time, then two pieces with a gap in between.
+    # Two pieces arrive within the frame time, then two pieces with a gap in between.
     assert decoder.feed(frame(images[5])[:7], 0.05) is None
     assert decoder.feed(frame(images[5])[7:], 0.052) is not None
     assert decoder.feed(frame(images[6])[:7], 0.06) is None
@@ -162,7 +162,7 @@ def test_a_constant_image_that_contains_the_marker_is_ambiguous():
     assert decode(decoder, [stream[5:]]) == []
     assert decoder.counters()["ambiguous"] > 0
     assert "several places" in decoder.diagnosis()
-    # Once the image changes, only one position remains.
+    # Once the image changes, only one position remains possible.
     found = decode(decoder, [frame(image) for image in numbered(3)])
     assert found[-1] == numbered(3)[1]
 

@@ -122,7 +122,7 @@ def test_frames_are_repeated_with_new_numbers():
     assert len({each.tobytes() for each in kept}) == 20
     press.faults.begin("replay", 0.06, press.clock.now())
     again = press.frames(18)
-    # The sensor's delay is one frame, so the first frame was sampled before the fault.
+    # The sensor delays frames by one, so the first frame was sampled before the fault.
     last = [*kept, again[0]][-6:]
     assert [each.tobytes() for each in again[1:]] == [
         last[k % 6].tobytes() for k in range(len(again) - 1)
@@ -160,7 +160,7 @@ def test_a_servo_reports_a_current_other_than_the_actual_one():
         for servo, sign in zip((1, 2), signs, strict=True)
     ]
     assert counts == [round(hand.current[0] / unit), round(0.5 * hand.current[1] / unit)]
-    # The goal is reached as without the fault.
+    # The goal is reached despite the fault.
     np.testing.assert_allclose(hand.current, flows, rtol=0.02)
 
 

@@ -178,7 +178,7 @@ TEXTS = ["first", "second", "third"]
 
 def test_repeated_events_are_shown_once_and_in_order():
     feed = StreamState()
-    # This event arrives between the subscription and the repetition.
+    # This event arrives after the subscription and before the repeated events.
     give(feed, b"hand/event", told(3, 103.0, "third"))
     for seq in (1, 2, 3):
         give(
@@ -204,7 +204,7 @@ def test_the_commander_is_shown_during_its_lease():
     give(feed, b"hand/command", carried_out | {"command": "stop"}, 6.0)
     assert "commands the hand" not in shown(feed, 6.1)
     give(feed, b"hand/command", carried_out | {"client": ""}, 7.0)
-    assert "commands the hand" not in shown(feed, 7.1)  # an unnamed client may be this page
+    assert "commands the hand" not in shown(feed, 7.1)  # the unnamed client may be this page
     refused = carried_out | {"ok": False, "error": "grasp: arm first", "timestamp": 5.0}
     give(feed, b"hand/command", refused, 8.0)
     assert "refused   grasp: arm first (to note book)" in shown(feed, 8.0)

@@ -1,4 +1,4 @@
-"""The plant's kernel: energy that no step increases, robustness, and relaxation of shear."""
+"""The plant's kernel: energy never increases; robustness; shear relaxation."""
 
 import math
 
@@ -116,8 +116,8 @@ def test_bristles_carry_shear_at_any_tilt_with_the_normal_force_of_the_springs(t
 
 @pytest.mark.parametrize("trial", range(24))
 def test_energy_never_increases_without_input(trial):
-    # Random scenes, masses, moduli and friction, with fingers thrown at the object, also beyond the
-    # rim; one trial in three uses a step ten times too long.
+    # The test uses random scenes, masses, moduli and friction, with fingers thrown at the object,
+    # also beyond the rim. One trial in three uses a step ten times too long.
     generator = np.random.default_rng(trial)
     hand = random_hand(generator, trial % 3 == 0)
     held = hand.plant.parameters.object_held
@@ -145,7 +145,7 @@ def test_energy_never_increases_without_input(trial):
 
 @pytest.mark.extended
 def test_the_state_stays_finite_for_random_commands_and_extreme_parameters():
-    # Uses the plant's own steps and, one time in three, steps ten times too long.
+    # Two times in three the steps are the plant's own, otherwise ten times too long.
     assert [wrong for wrong in map(abuse, range(12)) if wrong] == []
 
 

@@ -23,7 +23,7 @@ class Listener:
 
     def __init__(self) -> None:
         self.ticks: dict[str, list[int]] = {"state": [], "stats": []}
-        self.frames: tuple[list[int], list[int]] = ([], [])  # frame numbers per finger
+        self.frames: tuple[list[int], list[int]] = ([], [])  # frame numbers of each finger
         self.rates: list[Rates] = []
         self.seq = 0
 
@@ -100,7 +100,7 @@ def test_quantiles_match_the_samples_within_one_bin(count):
     for j, name in enumerate(TIMES):
         for share, told in zip(QUANTILES, spreads[name], strict=False):
             true = np.quantile(rows[:, j], share, method="inverted_cdf")
-            if true < 2.0**-30:  # one bin for all times below a nanosecond
+            if true < 2.0**-30:  # all times below a nanosecond share one bin
                 assert told <= 2.0**-29, (name, share)
             else:
                 assert true * (1 - 1e-12) <= told <= true * (1 + 1 / 31), (name, share)

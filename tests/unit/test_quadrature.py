@@ -91,7 +91,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
         usual, finer = np.empty((2, 5, 1))
         ratios_at(gauss_rule(), circle_rule(material.degree), parts, *place, usual)
         ratios_at(gauss_rule(40), circle_rule(40), parts, *place, finer)
-        # Scaled by F tan θ because ∂F/∂θ may pass through zero.
+        # Scaled by F tan θ, because ∂F/∂θ may pass through zero.
         scale = np.abs(finer)
         scale[3] = max(scale[3], scale[0])
         assert np.all(np.abs(np.subtract(usual, finer)) <= tolerance * scale)

@@ -28,8 +28,8 @@ def counts(model, contact, t=0.0):
 def test_without_defects_the_forward_model_is_rounded():
     model = sensor()
     for contact in CONTACTS:
-        # Cells between two counts may be rounded either way. The model has fewer points, which
-        # gives 1e-4 of the modulus at the outline.
+        # A cell between two counts may be rounded either way. The model has fewer points, which
+        # gives an error of 1e-4 of the modulus at the outline.
         signal = 0.2 * model.grid.pressure(TIP, LINEAR, *contact)
         np.testing.assert_allclose(counts(model, contact), signal, rtol=0, atol=0.5 + 6.0)
     assert not counts(model, (0.0, 0.2, -0.1)).any()
@@ -64,7 +64,7 @@ def test_each_cell_has_its_own_gain_and_dead_cells_read_zero():
 
 @pytest.mark.parametrize("width", [1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
 def test_blur_is_the_continuous_convolution(width):
-    # A grid smaller than the footprint: pressure beyond its edge also spreads onto it.
+    # The grid is smaller than the footprint: pressure beyond the grid's edge also spreads onto it.
     blurred = SensorGrid(16, 20, PITCH, (3e-4, 5.3e-3), blur=width)
     model = sensor(replace(blurred, blur=0.0), blur=width)
     for contact in CONTACTS:
@@ -89,7 +89,7 @@ def test_hysteresis_affects_only_unloading_and_loops_close():
     assert force(0.0038) > 1.03
     assert force(0.002) == pytest.approx(1.1, abs=0.005)
     assert 1.0 < force(0.0021) < 1.07  # reloading within the loop
-    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # the loop is closed
+    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # the hysteresis loop is closed
     assert force(0.006) == pytest.approx(1.0, abs=1e-9)
     assert not counts(model, (0.0, 0.0, 0.0)).any()
 
@@ -217,7 +217,7 @@ def test_crosstalk_is_a_fraction_of_both_line_means():
     signal = counts(sensor(), CONTACTS[1])
     expected = signal + 0.3 * (signal.mean(axis=0) + signal.mean(axis=1)[:, None])
     np.testing.assert_allclose(counts(model, CONTACTS[1]), expected, atol=1.01)
-    assert expected[0].max() > 100.0  # a ghost away from the contact
+    assert expected[0].max() > 100.0  # the ghost image away from the contact
 
 
 @pytest.mark.parametrize("least", [0, 3])

@@ -141,7 +141,7 @@ def test_servo_constants_are_identified_from_a_hold(tmp_path, monkeypatch, capsy
     assert told == pytest.approx(t, rel=0.05)
     follow(law(state).array, 1.0, 0.5, 25.0)
     state.x[:3] = 25.0
-    # This prediction uses the constants of the model.
+    # This prediction uses the model's constants.
     assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2
 
 
@@ -193,7 +193,7 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
     ],
 )
 def test_if_the_load_needs_the_force_the_configured_action_is_reported_and_taken(action, mode):
-    # Friction at 24 N just carries this load, so a smaller force would drop it.
+    # At 24 N, friction can just carry this load, so a smaller force would drop the object.
     control = {"object_load": 23.5}
     with hot(24.0, 0.0, control=control, safety={"heat_action": action}) as hand:
         for _ in range(90):

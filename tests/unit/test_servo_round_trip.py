@@ -33,15 +33,15 @@ STEPS = st.one_of(
 
 
 def placed(angles: tuple[float, float]) -> ServoBus:
-    # The status and ID registers are protected by the check below, so the servos stay reachable.
+    # The check below protects the status and ID registers, so the servos stay reachable.
     return make_bus("XM430-W210", for_daemon=True, counts=[angle / RADIAN for angle in angles])
 
 
 def out_of_reach(address: int, data: bytes) -> bool:
-    """Return True if a write would change which servo replies to which ID, unlike direct access."""
+    """Return True if a write could change which servos reply, which direct table access ignores."""
     span = range(address, address + len(data))
     kept = (reg.ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
-    # indirect addresses could refer to them
+    # Indirect addresses could refer to these registers.
     return any(a in span for a in kept) or address >= 168
 
 

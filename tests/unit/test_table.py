@@ -74,7 +74,7 @@ def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndar
 def hard_points(
     radius: float, points: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return random d [m] and θ [rad], dense at edges and corners; the domain's end comes first."""
+    """Return random d [m] and θ [rad], dense at edges and corners, starting at the domain's end."""
     which = rng.integers(0, 9, points)
     small = 10.0 ** rng.uniform(-9.0, -0.3, points)
     least = 10.0 ** rng.uniform(-16.0, -0.3, points)
@@ -179,7 +179,7 @@ def test_lookups_outside_the_domain_cause_a_warning(table):
         table(d, theta)
     assert [each.filename for each in caught] == [__file__]
     assert table(d, theta, edge=True).inside.sum() == 3
-    table(d[:3], theta[:3])  # a warning would be an error
+    table(d[:3], theta[:3])  # a warning would raise an error
     table(0.008, -float(TIP.theta_limit(0.008)) * (1.0 + 1e-15))
 
 

@@ -199,7 +199,7 @@ def chunks_of_holes(path: Path) -> None:
     with path.open("wb") as file:
         file.write(head())
         for _ in range(256):
-            empty = record(7, bytes(9 << 20))  # skipped by readers
+            empty = record(7, bytes(9 << 20))  # readers skip this record
             packed = chunk("", empty, len(empty))
             file.write(packed[:100])
             file.seek(len(packed) - 100, os.SEEK_CUR)

@@ -24,7 +24,7 @@ JOINTS = {
 
 
 class Miswired:
-    """A simulated hand whose servos move the other finger or in the wrong direction."""
+    """A simulated hand whose servos drive the other finger or the wrong direction."""
 
     def __init__(self, hand: Any, wiring: str) -> None:
         self._hand, self._swapped = hand, wiring == "swapped"
@@ -104,7 +104,7 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
 
 
 def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
-    daemon = make("swapped")  # with a centred object, the approach is the same for both wirings
+    daemon = make("swapped")  # the approach of a centred object is the same for both
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 2.0)
     assert daemon.loop.state.mode == "holding"
@@ -172,7 +172,7 @@ def test_fingers_that_stand_in_the_approach_are_reported(make):
     daemon = make("reversed")
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q[0] > -0.54:  # until it reaches its stop
+    while daemon.hand.q[0] > -0.54:  # until the joint reaches its stop
         daemon.loop.advance(0.02)
     daemon.loop.advance(1.0)
     (told,) = [text for level, kind, text in events if kind == "joint.blocked"]
