@@ -70,7 +70,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip extended tests, unless ``-m`` selects tests or the command line names their file.
+    """Skip extended tests unless ``-m`` selects tests or the command line names their file.
 
     Tests that mostly wait run first, in parallel with tests that compute.
     """
@@ -228,7 +228,7 @@ def make() -> Iterator[Make]:
 
 @pytest.fixture
 def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set the solid tip's data errors to zero, for frames that are generated from the same data."""
+    """Set the solid tip's data errors to zero, for frames generated from the same data."""
     from softfinger.kinematics.estimation import error_budget, estimator
 
     data = estimator.solid_data

@@ -13,7 +13,7 @@ class Report(NamedTuple):
 
 
 def mutated(rng: random.Random, data: bytes) -> bytes:
-    """Return ``data`` with bytes changed, removed, duplicated or inserted, sometimes very many."""
+    """Return ``data`` with some or many bytes changed, removed, duplicated or inserted."""
     made = bytearray(data)
     for _ in range(rng.choice((0, 1, 1, 2, 5, 20))):
         kind = rng.randrange(8)

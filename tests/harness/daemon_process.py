@@ -67,7 +67,7 @@ def until_it_says(words: Sequence[str | Path], text: str) -> None:
 
 
 class Running:
-    """A ``softfinger run`` process that is ready once the object exists."""
+    """A ``softfinger run`` process; the constructor returns once the process is ready."""
 
     def __init__(self, *words: str) -> None:
         self.lines: list[str] = []

@@ -1,6 +1,6 @@
 """Publisher and command server on real sockets, with a hand computed from formulas.
 
-They are used to test clients; the test controls all messages.
+Client tests use these sockets and control all messages.
 """
 
 from __future__ import annotations

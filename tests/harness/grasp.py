@@ -151,10 +151,10 @@ class Grasp:
         return GraspState(x[:2].copy(), x[2:].copy(), shear)
 
     def steer(self, state: GraspState, delta: float) -> GraspState:
-        """Rotate both fingers by ``delta`` [rad] to the right (q1 + δ, q2 − δ), at equilibrium.
+        """Return the equilibrium after both fingers rotate by ``delta`` [rad] to the right.
 
-        The object turns in the opposite direction, by about 2(a − d + L sin q + e cos q)/W per
-        radian.
+        The joints are then at q1 + δ and q2 − δ. The object turns in the opposite direction, by about
+        2(a − d + L sin q + e cos q)/W per radian.
         """
         ways = state.q + np.outer(np.arange(1, 17) / 16, [delta, -delta])
         for q in ways:

@@ -103,7 +103,7 @@ class Browser:
                 self.requests.append(answer["params"]["request"]["url"])
 
     def close(self) -> None:
-        """End the browser and its child processes."""
+        """Stop the browser and its child processes."""
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
         self._socket.close()

@@ -1,4 +1,4 @@
-"""Simulate a machine whose wake-ups are late on request."""
+"""Simulate a machine that wakes up late on request."""
 
 from softfinger.daemon.clock import VirtualClock
 
@@ -16,7 +16,7 @@ class LateMachine(VirtualClock):
         self.late_by: list[float] = []
 
     def work(self, seconds: float) -> None:
-        """Advance the clock by a working time."""
+        """Advance the clock by the duration of some work."""
         self._now += seconds
 
     def sleep_until(self, t: float) -> float:

@@ -47,7 +47,7 @@ def tilts(theta: float, azimuth: float) -> tuple[float, float]:
 def dense(
     grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
 ) -> np.ndarray[Any, Any]:
-    """Return the blurred pressure averaged over cells, from ``pieces`` samples per cell side."""
+    """Return the blurred pressure averaged over cells, with ``pieces`` samples per cell side."""
     from scipy.ndimage import gaussian_filter  # this import is slow and few tests need it
 
     d, tilt_x, tilt_y = contact

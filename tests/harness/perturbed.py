@@ -57,7 +57,7 @@ Function = Callable[..., Any]
 
 
 class Perturbation:
-    """Reproducible changes for one seed."""
+    """Reproducible perturbations for one seed."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
@@ -85,7 +85,7 @@ class Perturbation:
                 names.update({key: own[key] for key in own if names.get(key) in (np, math)})
 
     def moved(self, value: Any) -> Any:
-        """Return ``value`` with its floats changed; arrays are changed in place."""
+        """Return ``value`` with its floats perturbed; arrays are changed in place."""
         if isinstance(value, tuple):
             parts = [self.moved(each) for each in value]
             return value._make(parts) if hasattr(value, "_make") else tuple(parts)

@@ -48,7 +48,7 @@ class _Images:
 
 
 def why_not_open(sensor: TactileSensor) -> str:
-    """Return the error message of opening the sensor, or "" on success."""
+    """Open the sensor; return its error message, or "" on success."""
     try:
         sensor.open()
     except TactileError as error:

@@ -89,7 +89,7 @@ class TerminalProcess:
             self.wait(lambda later=later: text in self.text() or time.monotonic() > later)
 
     def ended(self) -> int:
-        """Wait for the process to end; return its exit status."""
+        """Wait for the process to exit; return its exit status."""
         self.wait(lambda: self.process.poll() is not None)
         self.pump()
         return self.process.returncode

@@ -14,7 +14,7 @@ WAIT = 60.0  # s, time-out for one picture
 
 
 class Viewed:
-    """A ``softfinger view`` process that is serving once the object exists.
+    """A ``softfinger view`` process; the constructor returns once the process is serving.
 
     ``address`` is the page's address, and ``commanding`` is the address with the token. ``folder``
     is the working directory, where recordings are also stored.
@@ -37,7 +37,7 @@ class Viewed:
         self.host = urlsplit(self.address).netloc
 
     def end(self) -> str:
-        """End the process with a signal and return its output."""
+        """Stop the process with a signal and return its output."""
         self.process.terminate()
         said = self.process.communicate(timeout=300)[1]
         assert self.process.returncode == 0, said

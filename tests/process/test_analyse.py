@@ -1,4 +1,4 @@
-"""``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
+"""Test that ``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
 
 import csv
 from pathlib import Path

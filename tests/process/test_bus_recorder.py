@@ -1,4 +1,4 @@
-"""The bus's traffic record, read directly and through the control socket."""
+"""Test the bus's traffic record, read directly and through the control socket."""
 
 import json
 import struct

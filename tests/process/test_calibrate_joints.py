@@ -1,4 +1,4 @@
-"""`softfinger calibrate joints` on an emulated hand whose joints are turned by hand."""
+"""Test `softfinger calibrate joints` on an emulated hand whose joints are turned by hand."""
 
 import shlex
 import sys

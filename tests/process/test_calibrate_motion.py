@@ -1,4 +1,4 @@
-"""`calibrate friction` and `calibrate latency` move a hand on ptys through its running daemon."""
+"""Test that `calibrate friction` and `calibrate latency` move a hand through its daemon."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The Python client, with a real daemon and with streams that a real daemon never sends."""
+"""Test the Python client with a real daemon and with streams that a real daemon never sends."""
 
 import asyncio
 import inspect

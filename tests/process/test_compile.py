@@ -1,4 +1,4 @@
-"""Ahead-of-time compilation with `softfinger compile`, and a loop that never compiles."""
+"""Test ahead-of-time compilation with `softfinger compile`, and a loop that never compiles."""
 
 import contextlib
 import json
@@ -33,7 +33,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def compiled(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run `softfinger compile` with the arguments of a complete command."""
+    """Run `softfinger compile` with a separate cache."""
     return softfinger("compile", *BARE, *words, env=environment(folder))
 
 

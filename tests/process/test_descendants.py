@@ -1,4 +1,4 @@
-"""All processes started by a test end with it, including orphaned descendants."""
+"""Test that all processes started by a test end with it, including orphaned descendants."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""`softfinger doctor` and `softfinger scan` with emulated hands, and single checks."""
+"""Test `softfinger doctor` and `softfinger scan` on emulated hands, and single checks."""
 
 import contextlib
 import os

@@ -1,6 +1,6 @@
 """Run every code block of the README and the docs unchanged: shell, Python, profiles.
 
-Each page runs from its top in its own folder, with one simulated hand. `harness.documented`
+Each page runs from top to bottom in its own folder, with one simulated hand. `harness.documented`
 provides the `softfinger` command and describes which commands are only parsed. A block with a title
 is saved under that name for later blocks. A mark above a block makes an exception:
 
@@ -149,7 +149,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
 
 
 def run_python(text: str, addresses: tuple[str, str]) -> None:
-    """Run in this process; a program without an end is ended after PRINTS lines."""
+    """Run in this process; an endless program is stopped after PRINTS lines."""
     for usual, own in zip(USUAL, addresses, strict=True):
         text = text.replace(usual, own)
 

@@ -1,4 +1,4 @@
-"""The Dynamixel backend with the real SDK and pyserial, against emulated servos on a pty."""
+"""Test the Dynamixel backend with the real SDK and pyserial, on emulated servos on a pty."""
 
 import math
 import struct

@@ -1,4 +1,4 @@
-"""Sensor faults, and a hand that differs from its settings, over serial lines.
+"""Test sensor faults, and a hand that differs from its settings, over serial lines.
 
 The emulated hand's true force is the reference.
 """

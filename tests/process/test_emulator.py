@@ -1,4 +1,4 @@
-"""`softfinger emulate`: process, ports, boards, scenes, faults and invalid input."""
+"""Test `softfinger emulate`: process, ports, boards, scenes, faults and invalid input."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""The bus exchange of one tick: timed by `doctor`, tested on connecting, checked while disarmed."""
+"""Test the bus exchange of one tick: `doctor` timing, checks on connecting and while disarmed."""
 
 import contextlib
 import grp

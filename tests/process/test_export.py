@@ -1,4 +1,4 @@
-"""``softfinger export`` writes a recording's values to CSV and Parquet."""
+"""Test that ``softfinger export`` writes a recording's values to CSV and Parquet."""
 
 import csv
 import math

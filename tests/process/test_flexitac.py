@@ -1,4 +1,4 @@
-"""The FlexiTac backend on real ptys through pyserial."""
+"""Test the FlexiTac backend on real ptys through pyserial."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""``softfinger view --foxglove``: messages for clients, and access control."""
+"""Test ``softfinger view --foxglove``: messages for clients, and access control."""
 
 import base64
 import json
@@ -60,7 +60,7 @@ class Client:
         self.socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": ended}))
 
     def next(self, topic: str = "") -> tuple[str, float, dict[str, Any]]:
-        """Return the next message, optionally of one topic: topic, log time [s] and content."""
+        """Return topic, log time [s] and content of the next message, optionally of one topic."""
         while True:
             message = self.socket.recv(timeout=WAIT)
             assert isinstance(message, bytes)

@@ -1,4 +1,4 @@
-"""A hung, crashed or killed gateway process never stops the loop; local stops still work."""
+"""Test that a hung, crashed or killed gateway never stops the loop, and test local stops."""
 
 import asyncio
 import json

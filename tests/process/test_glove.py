@@ -1,4 +1,4 @@
-"""The glove-style framing, tested on bytes, and its polling on a real pty."""
+"""Test the glove-style framing on bytes, and its polling on a real pty."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Hardware in the loop: daemon and emulated hand in separate processes, over serial bytes.
+"""Test a daemon and an emulated hand as separate processes, over serial lines.
 
 The emulated hand's control socket reports the traffic on the servo wire and the watchdog trips
 after the daemon dies, stalls or loses its port.

@@ -1,7 +1,7 @@
-"""The compiled-kernel folder: kernels from other sources or other users are never run.
+"""Test that kernels compiled from other sources or by other users are never run.
 
-A small package with the real decorators and the same structure is changed and run in separate
-processes.
+The tests change a small package, which has the real decorators and the same structure, and run it
+in separate processes.
 """
 
 import os

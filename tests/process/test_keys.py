@@ -1,4 +1,4 @@
-"""Key files, and access control of the daemon's sockets with keys."""
+"""Test key files, and access control of the daemon's sockets with keys."""
 
 import errno
 import os

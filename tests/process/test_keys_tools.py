@@ -1,4 +1,4 @@
-"""Every client tool supports keys and reports missing keys."""
+"""Test that every client tool supports keys and reports missing keys."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""The demo as a process that is suspended for a second while it works."""
+"""Test the demo as a process that is suspended for a second while it works."""
 
 import select
 import signal

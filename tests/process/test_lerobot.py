@@ -1,4 +1,4 @@
-"""The hand as a LeRobot robot and environment, discovered and used by the real LeRobot package."""
+"""Test the hand as a LeRobot robot and environment, found and used by the real package."""
 
 import math
 import runpy

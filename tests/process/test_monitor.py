@@ -1,4 +1,4 @@
-"""The monitor as a real process on a pseudo-terminal, with real sockets."""
+"""Test the monitor as a real process on a pseudo-terminal, with real sockets."""
 
 import json
 import math

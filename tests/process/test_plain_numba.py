@@ -1,4 +1,4 @@
-"""With an untested Numba version, Numba's own compiler builds the same kernels."""
+"""Test that Numba's own compiler builds the same kernels with an untested Numba version."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``softfinger plot``: the pages of a recording and their contents, and incomplete recordings."""
+"""Test ``softfinger plot``: a recording's pages and their contents; incomplete recordings."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Backends of an installed package: discovered, checked, and run by a real daemon."""
+"""Test backends of an installed package: found, checked, and run by a real daemon."""
 
 import os
 import threading

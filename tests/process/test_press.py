@@ -1,4 +1,4 @@
-"""Calibration without hardware: `emulate --send press` and `calibrate` on a solid rubber tip."""
+"""Test calibration without hardware: `emulate --send press` and `calibrate` on a rubber tip."""
 
 import math
 import re

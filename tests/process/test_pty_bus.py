@@ -1,4 +1,4 @@
-"""The servo bus on a pseudo-terminal: timing, baud rates, links, connecting and disconnecting."""
+"""Test the servo bus on a pty: timing, baud rates, links, connecting and disconnecting."""
 
 import os
 import select

@@ -1,4 +1,4 @@
-"""Measures for punctual ticks: applied and reverted where permitted, otherwise reported."""
+"""Test measures for punctual ticks: applied and reverted where permitted, otherwise reported."""
 
 import ctypes
 import json

@@ -1,4 +1,4 @@
-"""A servo port that disappears is reopened only on command, with torque off."""
+"""Test that a servo port that disappears is reopened only on command, with torque off."""
 
 import contextlib
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Recordings contain everything that was published, even if the recorder is interrupted."""
+"""Test that recordings contain all published messages, even if the recorder is interrupted."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""Registers changed by another program: reported, written by `arm`, repaired and restored."""
+"""Test registers changed by another program: reported, written by `arm`, repaired, restored."""
 
 import json
 from typing import Any

@@ -1,4 +1,4 @@
-"""Replayed recordings: published unchanged, and recomputed to equal states by the current code."""
+"""Test replayed recordings: published unchanged, and recomputed to equal states."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The daemon as a systemd service: watchdog messages, service unit, udev rules and logs."""
+"""Test the daemon as a systemd service: watchdog messages, service unit, udev rules, logs."""
 
 import configparser
 import grp

@@ -1,4 +1,4 @@
-"""Checks on connecting, which suggest fixes but change nothing; temperature, supply, errors."""
+"""Test the checks on connecting and their suggested fixes; temperature, supply and errors."""
 
 import math
 import os

@@ -1,4 +1,4 @@
-"""The manufacturer's SDK on emulated servos on a pty, with its packet handler and with ours."""
+"""Test the manufacturer's SDK on emulated servos, with its packet handler and with ours."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Short real-time soak run: checks of the bus, memory and lost messages."""
+"""Test a short real-time soak: its checks of the bus, memory and lost messages."""
 
 import copy
 import math

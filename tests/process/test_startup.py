@@ -1,6 +1,6 @@
-"""Behaviour of subcommands before their work starts.
+"""Test the behaviour of subcommands before their work starts.
 
-Covers missing packages, Ctrl-C during an import, and shell completion.
+This covers missing packages, Ctrl-C during an import, and shell completion.
 """
 
 import signal

@@ -1,4 +1,4 @@
-"""The emulated tactile board: the bytes on its pty, their timing, and its faults."""
+"""Test the emulated tactile board: the bytes on its pty, their timing, and its faults."""
 
 import os
 import select

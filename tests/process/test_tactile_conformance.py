@@ -1,4 +1,4 @@
-"""Requirements for every tactile backend."""
+"""Test the requirements for every tactile backend."""
 
 import threading
 

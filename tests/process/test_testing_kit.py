@@ -1,4 +1,4 @@
-"""The test kit, used by separate test files in another pytest process."""
+"""Test the test kit with separate test files in another pytest process."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Clients without the current ZeroMQ protocol can neither send commands nor receive messages.
+"""Test that clients with an old ZeroMQ protocol can neither send commands nor receive messages.
 
 A web page can make a browser POST arbitrary bytes to any port of this machine. Such bytes can form
 ZMTP/1.0 frames. This protocol version has no handshake that would distinguish a browser from a

@@ -1,4 +1,4 @@
-"""``softfinger view``: pictures of the stream, access control, and errors."""
+"""Test ``softfinger view``: pictures of the stream, access control, and errors."""
 
 import argparse
 import base64

@@ -1,4 +1,4 @@
-"""The page of ``softfinger view`` in a real browser: its contents and controls."""
+"""Test the ``softfinger view`` page in a real browser: its contents and controls."""
 
 import math
 import os

@@ -1,4 +1,4 @@
-"""The wheel contains one complete package, independent of the environment and current folder."""
+"""Test that the wheel is one complete package, independent of environment and current folder."""
 
 import contextlib
 import os

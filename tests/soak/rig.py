@@ -138,7 +138,7 @@ class Rig:
             raise RigError(str(error)) from None
 
     def report(self, more: str = "") -> dict[str, Any]:
-        """Return the record of the servo bus; ``forget`` in ``more`` starts a new record."""
+        """Return the servo bus record; ``forget`` in ``more`` starts a new record."""
         report: dict[str, Any] = json.loads(self.send(f"report {more}"))
         return report
 

@@ -3,8 +3,8 @@
 ``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most of them grip; the grips are
 then loaded, turned, disturbed by faulty measurements and stopped. The daemon is complete except for
 its sockets. Requirements are checked against the plant and the data sent to the servos, never
-against the daemon's own reports. The number of checks of each requirement is counted, and a soak
-that never checks one of them fails. The tests run a few sequences.
+against the daemon's own reports. The soak counts how often each requirement is checked, and fails
+if a requirement is never checked. The tests run a few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time, with its stream recorded and
 read. Violations are counted and do not end the run. The run fails if memory grows or a state is
@@ -109,7 +109,7 @@ ASSERTIONS = (
 class Judge:
     """Check requirements and count how often each was checked.
 
-    If ``broken`` is given, violations are counted there instead of raised.
+    If ``broken`` is given, violations are counted there and do not raise an exception.
     """
 
     def __init__(self, judged: Counter[str], broken: Counter[str] | None = None) -> None:
@@ -722,7 +722,7 @@ def resident() -> float:
 
 
 def sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run the sequence with ``seed`` and add violations to the account."""
+    """Run the sequence with ``seed`` and add its violations to ``account``."""
     soak = Soak(seed, account)
     try:
         soak.run(ticks)

@@ -1,4 +1,4 @@
-"""Short benchmark runs: their errors, bounds and verdicts."""
+"""Test short benchmark runs: their errors, bounds and verdicts."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Frame files from test benches: read correctly, or rejected with the correct reason."""
+"""Test that frame files from test benches are read correctly or rejected with the right reason."""
 
 import itertools
 import re

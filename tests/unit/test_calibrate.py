@@ -1,4 +1,4 @@
-"""`softfinger calibrate` on a simulated sensor, step by step; the daemon then uses the file."""
+"""Test `softfinger calibrate` on a simulated sensor, step by step, and its file in the daemon."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Calibration files in the hand: each finger uses its own tip and zero offsets."""
+"""Test calibration files in the hand: each finger uses its own tip and zero offsets."""
 
 import math
 from pathlib import Path

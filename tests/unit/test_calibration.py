@@ -1,4 +1,4 @@
-"""Calibration mathematics: each step recovers the properties of a simulated sensor."""
+"""Test the calibration mathematics: each step recovers a simulated sensor's properties."""
 
 import math
 import sys

@@ -1,4 +1,4 @@
-"""The COBS framing: documented bytes, the decoder against a simple reference, and timestamps."""
+"""Test the COBS framing: documented bytes, decoder against a simple reference, timestamps."""
 
 import re
 import struct

@@ -1,4 +1,4 @@
-"""The command line's first steps, profile listing, and numbers with units."""
+"""Test the command line's first steps, profile listing, and numbers with units."""
 
 import json
 import math

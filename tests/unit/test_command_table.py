@@ -1,4 +1,4 @@
-"""The command table, the source of the generated page, against a running hand."""
+"""Test the command table, the source of the generated page, against a running hand."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Command server and client on real sockets; the order and form of requests."""
+"""Test the command server and client on real sockets: order and form of requests."""
 
 import os
 import select

@@ -1,4 +1,4 @@
-"""`calibrate law --compression`: tip laws from testing machines, against independent formulas."""
+"""Test `calibrate law --compression`: laws from testing machines, against independent formulas."""
 
 import json
 import math

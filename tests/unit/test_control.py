@@ -1,4 +1,4 @@
-"""Control performance on the simulated hand, measured on the plant, and parts of the controller."""
+"""Test the controller: its parts, and its performance measured on the simulated plant."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Documented values that take too long to compute while the site is built."""
+"""Test documented values that take too long to compute while the site is built."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Registers of an emulated servo: access, units, motion, watchdog, errors, resets."""
+"""Test the registers of an emulated servo: access, units, motion, watchdog, errors, resets."""
 
 import math
 import struct

@@ -1,4 +1,4 @@
-"""Envelope of the hand's grips: computed in virtual time, stored as a map, queried by `grasp`."""
+"""Test the envelope of the hand's grips: virtual-time runs, the stored map, use by `grasp`."""
 
 from typing import Any
 

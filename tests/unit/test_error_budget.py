@@ -1,4 +1,4 @@
-"""The covariance includes errors that are not visible in frames, and matches the actual errors."""
+"""Test that the covariance includes errors invisible in frames and matches the actual errors."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""The contact estimator reaches the Cramér-Rao bound, and its covariance is consistent."""
+"""Test that the contact estimator reaches the Cramér-Rao bound with a consistent covariance."""
 
 import math
 import re

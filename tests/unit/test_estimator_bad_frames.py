@@ -1,4 +1,4 @@
-"""Invalid frames and arguments give a flagged estimate or a clear error."""
+"""Test that invalid frames and arguments give a flagged estimate or a clear error."""
 
 import math
 

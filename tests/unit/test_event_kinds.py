@@ -1,4 +1,4 @@
-"""Every kind of event that the sources emit is documented, and no others."""
+"""Test that the documentation lists exactly the kinds of event that the sources emit."""
 
 import ast
 from collections.abc import Iterator

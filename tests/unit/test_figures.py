@@ -1,4 +1,4 @@
-"""Figure values against published and derived values; the figures' files and plots."""
+"""Test figure values against published and derived values, and the figures' files and plots."""
 
 import argparse
 import csv

@@ -1,4 +1,4 @@
-"""FlexiTac framing, tested on bytes."""
+"""Test the FlexiTac framing on bytes."""
 
 import itertools
 
@@ -23,7 +23,8 @@ nasty = st.lists(
 def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
     """Return the frames decoded when the data are fed byte by byte.
 
-    A late lock may complete several frames at once; only the newest is returned.
+    If the decoder synchronises late, several frames may be completed at once. Only the newest is
+    returned.
     """
     found = []
     for piece in pieces:
@@ -41,7 +42,7 @@ def frame(payload: bytes) -> bytes:
 
 
 def numbered(count: int, cells: int = CELLS, first: int = 0) -> list[bytes]:
-    """Return different images without marker bytes."""
+    """Return different images that contain no marker bytes."""
     return [bytes([(first + k) % 100]) * cells for k in range(count)]
 
 

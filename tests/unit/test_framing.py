@@ -1,4 +1,4 @@
-"""Protocol 2.0 framing: published packets byte for byte, and parser properties."""
+"""Test Protocol 2.0 framing: published packets byte for byte, and parser properties."""
 
 import pytest
 from dynamixel_sdk import PacketHandler as sdk_handler

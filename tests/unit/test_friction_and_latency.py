@@ -1,4 +1,4 @@
-"""`calibrate friction` and `calibrate latency` on hands that differ from their profile."""
+"""Test `calibrate friction` and `calibrate latency` on hands that differ from their profile."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Planar geometry against NumPy, and the held object's motion against `Grasp`."""
+"""Test planar geometry against NumPy, and the held object's motion against `Grasp`."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The Gymnasium environments: API checker, reproducible seeds, observations and rewards."""
+"""Test the Gymnasium environments: API checker, reproducible seeds, observations, rewards."""
 
 import os
 import shutil

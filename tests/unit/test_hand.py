@@ -1,4 +1,4 @@
-"""The simulated hand: equilibrium, servos, scenes and time."""
+"""Test the simulated hand: equilibrium, servos, scenes and time."""
 
 import math
 

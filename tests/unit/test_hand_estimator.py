@@ -1,4 +1,4 @@
-"""The hand's estimator: against NumPy, at start-up, and with slow cells."""
+"""Test the hand's estimator against NumPy, at start-up, and with slow cells."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Import directions and cycles, class names, and the base class of exceptions."""
+"""Test import directions and cycles, class names, and the base class of exceptions."""
 
 import ast
 import re
@@ -32,7 +32,7 @@ def parsed(file: Path) -> ast.Module:
 
 
 def imported(file: Path) -> Iterator[str]:
-    """Return our modules that ``file`` imports, except for types."""
+    """Return the softfinger modules that ``file`` imports, except for type annotations."""
     waiting: list[ast.AST] = [parsed(file)]
     while waiting:
         node = waiting.pop()

@@ -1,4 +1,4 @@
-"""Presliding friction of the joints: sticking, break-away and reversal, against a reference."""
+"""Test presliding joint friction against a reference: sticking, break-away and reversal."""
 
 import math
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Consistency checks of a joint's angle, velocity and current: detected faults, no false alarms."""
+"""Test consistency checks of joint angle, velocity and current: detections and false alarms."""
 
 import math
 import random

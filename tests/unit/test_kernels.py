@@ -1,4 +1,4 @@
-"""Kernel decorators and their records, and the sources that a compiled kernel depends on."""
+"""Test kernel decorators, their records, and the sources that a compiled kernel depends on."""
 
 import importlib
 import math

@@ -1,4 +1,4 @@
-"""Machine delays: their effect on clocks, on simulated and real hands, and on messages."""
+"""Test machine delays: their effect on clocks, simulated and real hands, and messages."""
 
 import itertools
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Each limit, and the conditions under which it is reported or latched."""
+"""Test each limit, and the conditions under which it is reported or latched."""
 
 import math
 from copy import copy

@@ -1,4 +1,4 @@
-"""The complete pipeline on the virtual clock: commands and limits."""
+"""Test the complete pipeline on the virtual clock: commands and limits."""
 
 import math
 import re

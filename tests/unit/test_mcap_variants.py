@@ -1,4 +1,4 @@
-"""MCAP recordings written by other programs: merged, filtered, without an index."""
+"""Test MCAP recordings written by other programs: merged, filtered, without an index."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A tip that no model fits: interpolated measurements of contacts, the table and the estimator."""
+"""Test a tip that no model fits: interpolated measurements, the table and the estimator."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Measurement faults: their text form, and their effect on sensors of an unchanged hand."""
+"""Test measurement faults: their text form, and their effect on an unchanged hand's sensors."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The monitor page as text, without a terminal: sizes, malformed streams, states, keys, maps."""
+"""Test the monitor page as text: sizes, malformed streams, states, keys, maps."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Soft tips in MuJoCo against the contact table, and a grip compared with our own plant."""
+"""Test soft tips in MuJoCo against the contact table, and a grip against our own plant."""
 
 import math
 import re

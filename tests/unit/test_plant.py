@@ -1,4 +1,4 @@
-"""The plant's kernel: energy never increases; robustness; shear relaxation."""
+"""Test the plant's kernel: energy that never increases, robustness, and shear relaxation."""
 
 import math
 

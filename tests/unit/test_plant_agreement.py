@@ -1,4 +1,4 @@
-"""The plant and its order of convergence, against SciPy's adaptive solver, for all contacts.
+"""Test the plant and its order of convergence against SciPy's adaptive solver.
 
 The smooth equations of motion are implemented independently in plain NumPy: for a constant modulus,
 sticking tips, and no damping except that of the tips and the palm. Contacts are geometric functions
@@ -102,7 +102,7 @@ def on_face(finger, point, angle):
 
 
 def wedge(width, taper=0.0, height=0.060):
-    """Return a wedge's contacts; its width is at half the height, off the centre of mass."""
+    """Return a wedge's contacts; the width refers to half the height, not the centre of mass."""
     lean = 0.5 * taper
     slope = height * math.tan(lean)  # half the difference in length between the parallel faces
     middle = height * slope / (6.0 * width)

@@ -1,4 +1,4 @@
-"""Shapes of the simulated object, contact between tips, and the palm."""
+"""Test shapes of the simulated object, contact between tips, and the palm."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The plate that presses an emulated tip: its text form, its motion, and invalid input."""
+"""Test the plate that presses an emulated tip: text form, motion, and invalid input."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Fitting contacts at known depths and tilts: tip model, modulus, ν and position."""
+"""Test fits of contacts at known depths and tilts: tip model, modulus, ν and position."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The forward model: cell averages against plain integration, sums against closed forms."""
+"""Test the forward model: cell averages against plain integration, sums against closed forms."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Finding, identifying and configuring servos, on an emulated line without a port."""
+"""Test finding, identifying and configuring servos, on an emulated line without a port."""
 
 import contextlib
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""The public names of the package: exported, documented with all fields, and in the site."""
+"""Test that the public names are exported, documented with all fields, and in the site."""
 
 import ast
 import dataclasses

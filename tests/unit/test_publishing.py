@@ -1,4 +1,4 @@
-"""Publication rates, and histograms of the loop's times, against NumPy and without allocation."""
+"""Test publication rates and loop-time histograms, against NumPy and without allocation."""
 
 import math
 import tracemalloc

@@ -1,4 +1,4 @@
-"""One tip's closed forms and reference integrals, against NumPy in other coordinates."""
+"""Test a tip's closed forms and reference integrals against NumPy in other coordinates."""
 
 import math
 from fractions import Fraction
@@ -104,7 +104,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
 )
 @settings(max_examples=60)
 def test_every_admissible_material_has_its_minimum_energy_upright(slopes, depth, share):
-    """Tangent moduli are arbitrary positive Bernstein polynomials, for laws of all curvatures."""
+    """The tangent moduli are random positive Bernstein polynomials, for laws of all curvatures."""
     n = len(slopes) - 1
     modulus = np.polynomial.Polynomial([0.0])
     for k, slope in enumerate(slopes):

@@ -1,4 +1,4 @@
-"""Text and picture forms of stream records, at a prompt and in a notebook."""
+"""Test the text and pictures of stream records, at a prompt and in a notebook."""
 
 import re
 from typing import Any

@@ -1,4 +1,4 @@
-"""Recording files, and their replay on virtual time."""
+"""Test recording files and their replay in virtual time."""
 
 import numpy as np
 import pytest

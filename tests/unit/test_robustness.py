@@ -1,4 +1,4 @@
-"""Hands that differ from their settings, evaluated with the plant's true values."""
+"""Test hands that differ from their settings, evaluated with the plant's true values."""
 
 import math
 

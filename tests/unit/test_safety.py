@@ -1,4 +1,4 @@
-"""Limits on goals from any source, and the rule that only Safety writes goals."""
+"""Test limits on goals from any source, and the rule that only Safety writes goals."""
 
 import ast
 import math

@@ -1,4 +1,4 @@
-"""The complete pipeline for each kind of scene, with its servos and sensors."""
+"""Test the complete pipeline for each kind of scene, with its servos and sensors."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ state_message = message_maker(STATE)
 
 
 def holding_demo(daemon: Daemon) -> list[Event]:
-    """Run the demo until it holds; return it with its further events."""
+    """Run the demo until the hand holds the object; return the list of later events."""
     advance_to(daemon, "holding", 5.0)
     return heard(daemon)
 

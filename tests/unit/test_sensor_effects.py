@@ -1,4 +1,4 @@
-"""Effects of the simulated sensor on the pressure: each operator against plain NumPy."""
+"""Test the simulated sensor's effects on the pressure, each against plain NumPy."""
 
 import math
 from dataclasses import replace
@@ -279,7 +279,7 @@ def frame(grid: SensorGrid, d: float, tilt: float, curvature: float) -> np.ndarr
 
 
 def literal(d: float, tilt: float, radius: float, rotation: float, parts: int = 24) -> np.ndarray:
-    """Return mean pressure on 44 × 44 cells of ``parts``² points, with a rotated sensor."""
+    """Return the mean pressure on 44 × 44 rotated cells, each sampled at ``parts``² points."""
     at = (np.arange(44 * parts) + 0.5) * PITCH / parts - 0.029
     sensor_x, sensor_y = np.meshgrid(at, at)
     x = math.cos(rotation) * sensor_x - math.sin(rotation) * sensor_y

@@ -1,4 +1,4 @@
-"""Measurement faults during a grip are named and rejected, and have no effect on the true force."""
+"""Test that measurement faults during a grip are named and rejected, and spare the true force."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Requirements for every servo backend in each operating mode, simulated and Dynamixel.
+"""Test requirements for every servo backend in each operating mode, simulated and Dynamixel.
 
 The same tests run for both backends; to test another one, add it to ``RIGS``.
 """

@@ -1,4 +1,4 @@
-"""Servo temperature: prediction against an ODE solver, and reactions with unknown constants."""
+"""Test servo temperature: prediction against an ODE solver, reactions with unknown constants."""
 
 from typing import Any
 

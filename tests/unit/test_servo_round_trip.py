@@ -1,4 +1,4 @@
-"""Any instruction through our packet handler and the emulated bus equals direct table access."""
+"""Test instructions through our packet handler and the bus against direct table access."""
 
 import dynamixel_sdk as sdk
 import numpy as np

@@ -1,4 +1,4 @@
-"""Settings: profiles are loaded, and all their errors are in one report."""
+"""Test settings: profiles are loaded, and all their errors are in one report."""
 
 import json
 import tomllib

@@ -1,4 +1,4 @@
-"""Servos and sensors of the simulated hand on a virtual clock, and arrival times of frames."""
+"""Test the simulated hand's servos and sensors on a virtual clock, and frame arrival times."""
 
 import math
 from itertools import pairwise

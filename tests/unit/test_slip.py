@@ -1,4 +1,4 @@
-"""The grip: reactions to external loads, missing frames, and a single finger."""
+"""Test the grip's reactions to external loads, missing frames, and a single finger."""
 
 import math
 
@@ -195,7 +195,7 @@ def test_shear_of_solid_tips_reveals_a_load(kind):
 
 
 def test_a_load_on_one_joint_alone_is_not_a_sudden_load():
-    """It is caused by a current measurement fault or a failed joint."""
+    """Only a current measurement fault or a failed joint causes a load on one joint alone."""
     watched = at_rest()
     for torque in (0.3, -0.3, 0.3):
         watched.held.torque_residual = [0.0, torque]
@@ -216,7 +216,7 @@ def test_a_turn_seen_by_one_tip_alone_is_ignored(shown, raised):
 
 @pytest.mark.parametrize("force", [5.0, 10.0])
 def test_current_noise_is_not_a_load_but_does_not_hide_one(force):
-    """30 mA on each joint for a minute; a load towards the palm is the hardest to detect."""
+    """The noise is 30 mA on each joint, and a load towards the palm is the hardest to detect."""
     rng = np.random.default_rng(1)
     watched = at_rest(force)
     watched.held.load_arm, watched.held.load_curvature = 0.025, 0.02 / force

@@ -1,4 +1,4 @@
-"""Short soak sequences: the requirements hold, and the soak detects violations."""
+"""Run short soak sequences; test that requirements hold and violations are detected."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The solid tip's data file and finite elements, against another finite element method."""
+"""Test the solid tip's data file and finite elements against another finite element method."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A stop cancels all requests that arrived before it, in any order of events and clients.
+"""Test that a stop cancels all earlier requests, in any order of events and clients.
 
 Clients, gateway and loop act one at a time in an order that hypothesis chooses. Requests that
 libzmq has received are kept in a list, from which the gateway reads only a few at a time. When a

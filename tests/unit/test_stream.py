@@ -1,4 +1,4 @@
-"""The publisher on a real socket: wire format, and all kinds of subscribers."""
+"""Test the publisher on a real socket: wire format, and all kinds of subscribers."""
 
 import json
 from collections.abc import Iterator

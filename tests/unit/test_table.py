@@ -1,4 +1,4 @@
-"""Contact tables: accuracy over the entire domain, error bound, forms, files, special input."""
+"""Test contact tables: accuracy over the domain, error bound, forms, files, special input."""
 
 import functools
 import math
@@ -150,7 +150,7 @@ def test_symmetry_sign_and_monotonicity(table, depth, share):
 @pytest.mark.parametrize("modulus", [1.0, 1e9])
 @pytest.mark.parametrize("radius", [1e-4, 1.0])
 def test_scaling_with_radius_and_modulus(table, radius, modulus):
-    """From 0.1 mm to 1 m, and from 1 Pa to 1 GPa at zero strain."""
+    """The scales range from 0.1 mm to 1 m, and from 1 Pa to 1 GPa at zero strain."""
     scale, share = radius / TIP.radius, Fraction(modulus) / TABLE_I.coefficients[0]
     other = Material(tuple(value * share for value in TABLE_I.coefficients))
     large = ContactTable.build(Fingertip(radius), other, 1e-9)

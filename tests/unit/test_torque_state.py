@@ -1,4 +1,4 @@
-"""Torque switching under arbitrary servo replies, and the commands that may change torque."""
+"""Test torque switching under arbitrary servo replies, and commands that may change torque."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Untrusted files are rejected in one line, quickly and with limited memory."""
+"""Test that untrusted files are rejected in one line, quickly and with limited memory."""
 
 import base64
 import json

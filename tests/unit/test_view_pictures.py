@@ -1,4 +1,4 @@
-"""Viewer drawings against the model: footprints on frames, the planar hand, the landscape."""
+"""Test viewer drawings against the model: footprints on frames, planar hand, landscape."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Servos on the wrong finger or with the wrong direction are detected before they do harm."""
+"""Test that miswired servos (wrong finger or direction) are detected before they do harm."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
