@@ -32,7 +32,7 @@ from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
 from tests.harness.perturbed import Perturbation
 
-# All machines test the same examples, without a deadline. --hypothesis-profile=search tries others.
+# All machines test the same examples, without a deadline; --hypothesis-profile=search tries others.
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("same")
@@ -105,7 +105,7 @@ def ended_with_the_test() -> Iterator[None]:
     yield
     for each, handler in handlers.items():
         signal.signal(each, handler)
-    gc.enable()  # disabled by daemons that run in this process
+    gc.enable()  # daemons in this process disable it
     descendants.end(descendants.running() - before)
 
 

@@ -67,7 +67,7 @@ def end(processes: set[int]) -> None:
             os.kill(process, signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             os.waitpid(process, 0)
-        end(below)  # they are now children of this process
+        end(below)  # this process has adopted them
 
 
 def _sweep(word: bytes) -> bool:

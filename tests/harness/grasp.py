@@ -153,8 +153,8 @@ class Grasp:
     def steer(self, state: GraspState, delta: float) -> GraspState:
         """Return the equilibrium after both fingers rotate by ``delta`` [rad] to the right.
 
-        The joints are then at q1 + δ and q2 − δ. The object turns in the opposite direction, by about
-        2(a − d + L sin q + e cos q)/W per radian.
+        The joints are then at q1 + δ and q2 − δ. The object turns in the opposite direction, by
+        about 2(a − d + L sin q + e cos q)/W per radian.
         """
         ways = state.q + np.outer(np.arange(1, 17) / 16, [delta, -delta])
         for q in ways:

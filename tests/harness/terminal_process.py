@@ -99,7 +99,7 @@ class TerminalProcess:
         self.pump()
         pairs = ((b"\x1b[?1049h", b"\x1b[?1049l"), (b"\x1b[?25l", b"\x1b[?25h"))
         pairs += ((b"\x1b[?2004h", b"\x1b[?2004l"),)
-        # Both sequences of each pair must have been sent, the restoring one last.
+        # Both sequences of each pair must have been sent, and the restoring one last.
         given = all(0 <= self.written.rfind(a) < self.written.rfind(b) for a, b in pairs)
         return given and termios.tcgetattr(self.slave) == self.attributes
 

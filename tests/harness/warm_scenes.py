@@ -91,7 +91,7 @@ def run(settings: Settings) -> dict[str, Any]:
     with event.install_listener("numba:compiler_lock", watch), hand:
         for wait, request in SCRIPT:
             hand.loop.advance(wait)
-            for _ in range(300):  # in real time, a busy machine may take long
+            for _ in range(300):  # a busy machine may need long in real time
                 if hand.loop.state.mode not in ("grasping", "rotating"):
                     break
                 hand.loop.advance(0.1)

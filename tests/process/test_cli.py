@@ -59,7 +59,7 @@ def test_duration_and_settings_on_the_command_line(profile, inline):
 def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
     second = softfinger("run", "--config", str(daemon.profile))
     assert second.returncode == 1
-    # Both addresses are in use; which is found first depends on the order of start-up.
+    # Both addresses are in use; the order of start-up determines which one is found first.
     taken = (f"stream.address: {daemon.addresses[0]}", f"commands.address: {daemon.commands}")
     assert any(f"{each} is in use; is another softfinger" in second.stderr for each in taken)
 
@@ -136,7 +136,7 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     daemon.running.process.send_signal(signal.SIGSTOP)
     for request in requests:
         socket.send_multipart([b"", msgpack.packb(request)])
-    # Exceeds the size limit, so the gateway refuses it itself.
+    # This message exceeds the size limit, so the gateway refuses it itself.
     socket.send_multipart([b"", b"x" * 5000])
     assert socket.poll(60_000)  # the gateway has also read all earlier requests
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"

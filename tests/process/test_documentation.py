@@ -47,7 +47,7 @@ FENCE = re.compile(
     r"(?P<text>.*?)^(?P=indent)```$"
 )
 STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")  # with the expected status
-PRINTS = 20  # lines printed by a program without an end
+PRINTS = 20  # lines printed by a program that never ends
 PATIENCE = 300.0  # s for one block
 
 

@@ -132,7 +132,7 @@ def test_joints_follow_their_goals(running, model, level):
     until(there)
     assert reading.valid
     counters = backend.counters()
-    counters.pop("timeouts")  # may happen on a busy machine
+    counters.pop("timeouts")  # this may happen on a busy machine
     assert counters == dict.fromkeys(counters, 0)
     backend.close()
 
@@ -198,7 +198,7 @@ def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connec
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")
-    # A busy machine receives few late replies.
+    # On a busy machine, few late replies are received, so this may take many readings.
     while backend.counters()["late"] <= 20 and reading.seq < 1000:
         at_another_place(reading.seq)
     bus.fault("late=0")

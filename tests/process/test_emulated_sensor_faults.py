@@ -16,7 +16,7 @@ from tests.soak.rig import Rig
 
 pytestmark = pytest.mark.extended
 FORCE = 6.0  # N
-# Times of the emulated hand in s: in total, and the final interval used for means.
+# Times of the emulated hand in s: total duration, and final interval used for means.
 LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"

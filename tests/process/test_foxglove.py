@@ -37,7 +37,7 @@ TOPICS = {
     "hand/tactile/left": "foxglove.RawImage",
     "hand/tactile/right": "foxglove.RawImage",
 }
-WAIT = 60.0  # s to wait for one message
+WAIT = 60.0  # s, time-out for one message
 
 
 class Client:
@@ -172,7 +172,7 @@ def check_scene(client: Client) -> None:
 def stranger() -> Iterator[tuple[FakeDaemon, str]]:
     """Yield a fake daemon and the address of its Foxglove server."""
     with FakeDaemon() as fake, served(fake) as (address, _):
-        # This avoids the server's warning at exit that no state arrived.
+        # This avoids a warning at exit that no state has arrived.
         with connected(address) as line:
             client = Client(line)
             client.subscribe("hand/state")

@@ -230,7 +230,7 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
             os.kill(ticking.gateway.process, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
-        hand.arm()  # commands after this reply are received
+        hand.arm()  # commands sent after this reply are received
         hand.stop()
 
 

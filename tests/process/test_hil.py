@@ -191,7 +191,7 @@ def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
 
 
 def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
-    # The daemon refuses to start if the boards have another size than the profile.
+    # The daemon refuses to start if the size of the boards differs from the profile.
     where = ("--config", str(rig.config), "--dir", str(rig.folder))
     done = softfinger("run", *where, "--set", "tactile.rows=16")
     assert done.returncode == 1

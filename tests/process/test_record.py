@@ -367,7 +367,7 @@ def test_a_damaged_chunk_is_reported_and_skipped_and_the_file_can_be_recovered(
     sent = written(path, 2000)
     assert Recording(path).check()
     bent = bytearray(path.read_bytes())
-    # zstd's magic number starts a chunk.
+    # A chunk starts with zstd's magic number.
     place = bent.index(b"\x28\xb5\x2f\xfd", len(bent) // 2) + 100
     bent[place : place + 4] = bytes(each ^ 0x55 for each in bent[place : place + 4])
     path.write_bytes(bent)

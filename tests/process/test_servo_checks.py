@@ -191,7 +191,7 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     place = tmp_path / name / "device" / "latency_timer"
     place.write_text("16\n")
     monkeypatch.setattr(checks, "latency_file", lambda path: latency_file(path, tmp_path))
-    # The low-latency mode is not available, as on this pseudo-terminal.
+    # The low-latency mode is unavailable, as on this pseudo-terminal.
     text = "16 ms, so every read takes that long"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     assert refusal(bus.port, reply_timeout=0.004)[0] == f"{bus.port} latency timer: {text}: {fix}"
@@ -297,8 +297,8 @@ def test_simulated_servos_heat_up_with_their_current_and_shut_down():
     while not read(servos, reading).alert:
         clock.sleep_until(clock.now() + 0.05)
         assert clock.now() < 400.0
-    # 55 K times 73 J/K, heated by 22.5 W at first and 32 W with hot copper, minus losses to the
-    # air.
+    # The heat is 55 K times 73 J/K. The power is 22.5 W at first and 32 W with hot copper, minus
+    # the losses to the air.
     assert 55.0 * 73.0 / 32.0 < clock.now() < 1.2 * 55.0 * 73.0 / 22.5
     assert (reading.alert, reading.hardware) == (0b01, [1 << 2, 0])
     assert reading.temperature == [80.0, 25.0]

@@ -38,7 +38,7 @@ def test_a_frame_object_is_kept_until_a_newer_one_and_never_modified(rig):
     assert later.t_arrival > first.t_arrival
     assert later.t_sample > first.t_sample
     assert np.array_equal(first.data, kept)
-    if rig.backend in ("simulated", "replay"):  # time does not advance by itself here
+    if rig.backend in ("simulated", "replay"):  # only the test advances the time
         assert rig.sensor.latest() is later
 
 

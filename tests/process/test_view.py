@@ -220,7 +220,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
-        assert levels.max() > 20  # of 31 levels: 45 kPa of 50
+        assert levels.max() > 20  # of 31 levels; the peak is 45 kPa of 50 kPa
         assert levels[20:24, 20:24].min() > 10
         assert levels[:8].max() < 6  # this area contains only noise
         assert len(picture["panels"][name]["lines"]) == 2  # rim and footprint

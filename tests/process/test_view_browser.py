@@ -288,7 +288,7 @@ def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
         page.mouse("mouseMoved", page.place(plot, 0.9), button="left", buttons=1)
         page.mouse("mouseReleased", page.place(plot, 0.9), button="left", clickCount=1)
         until(lambda: page("view.end") is not None)
-        assert 5.0 < page("view.span") < 8.0  # 0.3 of 20 s, including margins
+        assert 5.0 < page("view.span") < 8.0  # 0.3 of the 20 s, including margins
         assert page.text("#hold") == "Resume"
         assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")  # labels are times of day
         page.click("#follow")

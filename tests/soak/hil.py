@@ -37,7 +37,7 @@ from tests.soak.rig import CASES, End, Rig, judge_wire
 SECONDS = 3600.0
 SUBSCRIBERS = 3
 _LOOK = 5.0  # s between checks of the bus and memory
-# Length of the compared windows at both ends, in s; at most a third of the run.
+# Length in s of the compared windows at both ends; at most a third of the run.
 _WINDOW = 600.0
 _FLAT = 2.0  # MB, maximum memory growth of a process
 _FAULT_EVERY = 40.0  # s, average
@@ -47,7 +47,7 @@ _STREAM = 3.0  # s, duration of a setpoint stream
 _SPLIT = 300  # s per recorder file; the recorder keeps an index until the file is closed
 # These faults leave the object tilted after a stop; the soak then puts it upright.
 _ASKEW = ("hand.angle", "tip.tilt")
-_DROPPED = 20.0  # s without a grip after which an object that slipped away is put back
+_DROPPED = 20.0  # s without a grip, after which an object that slipped away is put back
 _HELD = 0.3  # minimum fraction of grasps that must reach a hold
 _MANY = 50  # number of grasps above which this is required
 _BEGUN = 1500  # maximum difference between the numbers of states received by any two listeners
@@ -68,11 +68,11 @@ class Account:
     placed: int = 0  # number of times the object was put upright
     # (received, lost) per subscriber
     received: list[tuple[int, int]] = field(default_factory=list)
-    recorded: tuple[int, int] = 0, 0  # states in the recorder's files, lost states
+    recorded: tuple[int, int] = 0, 0  # states in the recorder's files, and lost states
     wrong: list[str] = field(default_factory=list)
     # MB of private memory per process, at each check.
     memory: dict[str, list[float]] = field(default_factory=dict)
-    # s by which the tick of each state was late.
+    # Delay of each state's tick, in s.
     late: array[float] = field(default_factory=lambda: array("f"))
     # (time [s], number of `late` values so far)
     looked: list[tuple[float, int]] = field(default_factory=list)

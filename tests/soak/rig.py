@@ -163,7 +163,7 @@ class Rig:
         return found
 
 
-# Starts a fault and returns a function that ends it.
+# Function that starts a fault and returns a function that ends it.
 End = Callable[[], object]
 Inject = Callable[[Rig, random.Random], End]
 

@@ -55,7 +55,7 @@ _LOOKS = 96  # memory checks in a long sequence
 _WARM = 2  # memory checks excluded as warm-up: ten minutes of eight hours
 _FLAT = 2.0  # MB, maximum memory growth after the warm-up
 _STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # Hz, in a long sequence
-_SPLIT = 16e6  # bytes per file of its recording
+_SPLIT = 16e6  # bytes per file of the long sequence's recording
 # With "deaf", written data are lost but readings arrive. With "jumped", the angle is off by 0.2
 # rad. With "numb", angle, velocity and current stay constant.
 SERVO_FAULTS = (
@@ -65,7 +65,7 @@ SERVO_FAULTS = (
 _ENCODER = ("fast", "strayed", "jumped", "numb")  # the joint angle also contradicts the frames
 _UNHEARD = ("silent", "gone", "deaf")  # the servo does not receive torque off
 _WATCHDOG = 100  # ticks (0.2 s) until the servo watchdogs stop the motors
-_LOST = 20  # consecutive lost goals that are detected
+_LOST = 20  # consecutive lost goals that suffice for detection
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
 # Faults of a sensor or of a current measurement: range of values, and channel that may be named.
 LIES = {
@@ -85,7 +85,7 @@ _REMEMBERED = 5.0  # s, maximum time for which a grip stays raised after a load 
 _RETARGETED = 0.5  # s, maximum time for which the previously requested force may persist
 _UNCOVERED = 1.0  # s, time after which a tip near the object's edge is ignored
 
-# Requirements, each of which is counted.
+# Requirements; the checks of each one are counted.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
 OFF = "no torque after disarm or fault"
 WATCHDOG = "no torque 0.2 s after a stop that no servo hears"
@@ -319,7 +319,7 @@ class Account:
     modes: Counter[str] = field(default_factory=Counter)  # ticks in each mode
     faults: Counter[str] = field(default_factory=Counter)  # latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
-    # Named channels with the actual fault.
+    # Channels named as faulty, with the actual fault.
     named: Counter[str] = field(default_factory=Counter)
     commands: Counter[str] = field(default_factory=Counter)  # accepted commands
     refused: int = 0
@@ -763,7 +763,7 @@ def main() -> int:
     else:
         for seed in range(arguments.seed, arguments.seed + arguments.sequences):
             sequence(seed, arguments.ticks, account)
-            gc.collect()  # a daemon has reference cycles that hold megabytes of frames
+            gc.collect()  # a daemon's reference cycles hold megabytes of frames
     account.seconds = time.monotonic() - begin
     print("\n".join(account.lines()))
     few = account.held < HELD * account.sequences

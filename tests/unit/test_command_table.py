@@ -61,7 +61,7 @@ def faulted(daemon: Daemon) -> Daemon:
     return daemon
 
 
-# command, reason → settings, state of the hand, numbers
+# Settings, state of the hand, and numbers for each command and reason.
 REFUSED: dict[tuple[str, Reason], tuple[Any, Callable[[Daemon], Daemon], dict[str, float]]] = {
     ("arm", Reason.SCENE): ({"servos": {"backend": "none"}}, lambda it: it, {}),
     ("arm", Reason.STATE): ({}, hot, {}),

@@ -27,7 +27,7 @@ from softfinger.tools.cli import main
 
 ROOT = Path(__file__).parents[2]
 E, A = 0.25e6, 0.020
-LATE, LOAD = 1.35e-3, 0.21  # m, N: zeros of the machine
+LATE, LOAD = 1.35e-3, 0.21  # m, N: zero offsets of the machine
 UNIT = Material.constant(1.0)
 Force = Callable[[float, float], float]  # N of d [m] and θ [rad]
 WORDS = ["--config", "hil", "--no-plot"]

@@ -329,7 +329,7 @@ def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> 
 
 
 def test_an_error_outside_the_shutdown_mask_only_sets_the_alert() -> None:
-    c = client()  # XM430: mask 52 does not include the voltage bit
+    c = client()  # XM430: mask 52 excludes the voltage bit
     c.write(reg.TORQUE_ENABLE, 1, 1)
     put_fault(c.bus, "undervoltage=1", c.t)
     c.later(0.02)

@@ -28,8 +28,8 @@ from tests.harness.paper_tip import (
 @pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
 @pytest.mark.parametrize("free_gain", [True, False])
 def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain):
-    # Random azimuths and tip positions relative to the cells; the noise level is that of 0.2 %
-    # noise.
+    # Azimuths and tip positions relative to the cells are random. The bias is compared with noise
+    # of 0.2 %.
     rng = np.random.default_rng(7)
     noise = 0.002 * material.reference_modulus
     for _ in range(60):

@@ -244,7 +244,7 @@ def test_every_plot_is_complete_and_lists_its_errata(drawn: tuple[Path, list[Fig
         page, picture = figures.pages()[name], imread(folder / f"{name}.png")
         height, width = picture.shape[:2]
         assert (width / style.DPI, height / style.DPI) == pytest.approx(page.size, abs=0.01)
-        # Each quarter of the picture contains something.
+        # Every quarter of the picture contains dark pixels.
         dark = picture[..., :3].min(axis=-1) < 0.8
         for rows in (slice(None, height // 2), slice(height // 2, None)):
             for columns in (slice(None, width // 2), slice(width // 2, None)):

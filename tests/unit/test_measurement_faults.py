@@ -92,7 +92,7 @@ def test_faults_develop_linearly_over_their_duration_and_end():
     assert [faults("gain", t) for t in (0.0, 3.0, 4.0, 4.5, 5.0, 9.0)] == [
         *(1.0, 1.0, 0.75, 0.625, 0.5, 0.5)
     ]
-    faults.begin("gain", 2.625, 4.5, 4.0)  # starts from the current value
+    faults.begin("gain", 2.625, 4.5, 4.0)  # the ramp starts from the current value
     assert [faults("gain", t) for t in (4.5, 6.5, 8.5)] == [0.625, 1.625, 2.625]
     faults.begin("drift", 0.1, 7.0)
     assert [faults("drift", t) for t in (6.999, 7.0)] == [0.0, 0.1]

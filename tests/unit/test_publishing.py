@@ -61,7 +61,7 @@ def test_each_topic_is_published_on_every_nth_tick_or_frame():
     assert ticks["state"] == list(range(5, 2001, 5))
     assert ticks["stats"] == [3, 503, 1003, 1503]
     assert not set(ticks["state"]) & set(ticks["stats"])
-    for frames in listener.frames:  # every fourth of 100 Hz, i.e. 25 Hz
+    for frames in listener.frames:  # every fourth frame of 100 Hz, i.e. 25 Hz
         assert [seq // 4 for seq in frames] == list(range(len(frames)))
         assert len(frames) == pytest.approx(100, abs=1)
 

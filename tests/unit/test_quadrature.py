@@ -152,7 +152,8 @@ def test_tilt_limit():
     assert TIP.theta_limit(0.02) == TIP.theta_limit(1.0) == 0.0
     assert math.isnan(TIP.theta_limit(math.nan))
     assert all(isinstance(TIP.theta_limit(d), float) for d in (0, 0.004, np.array(0.03)))
-    # Its cosine is √(2ad − d²)/a, accurate in all digits even if asin((a − d)/a) is not.
+    # The cosine of the limit is √(2ad − d²)/a, accurate in all digits even if asin((a − d)/a) is
+    # not.
     d = 10.0 ** np.arange(-17.0, -2.0)
     np.testing.assert_allclose(
         np.pi / 2 - Fingertip(1.0).theta_limit(d),

@@ -201,7 +201,7 @@ def test_offset_drift_has_the_configured_deviation_and_time_constant():
     offset = np.zeros((60, 60))
     rng = np.random.default_rng(2)
     sensor_model.drift(offset, 50.0, 60.0, 0.01, rng.standard_normal(offset.shape))
-    # Initially a random walk: deviation · √(2 t / time).
+    # The drift is initially a random walk with deviation · √(2 t / time).
     assert offset.std() == pytest.approx(50.0 * math.sqrt(2 * 0.01 / 60.0), rel=0.05)
     for _ in range(40):
         sensor_model.drift(offset, 50.0, 60.0, 20.0, rng.standard_normal(offset.shape))

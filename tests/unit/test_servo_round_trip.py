@@ -15,7 +15,7 @@ ADDRESSES = st.one_of(
     st.integers(0, 663),
     st.integers(640, 663),  # reads extend beyond the end here
 )
-# FF and FD are frequent, to require stuffing; small numbers are frequent, to be valid.
+# FF and FD are frequent so that stuffing is needed, and small numbers because they are valid.
 DATA = st.one_of(
     st.lists(st.sampled_from([0xFF, 0xFD, 0, 1, 5, 100]), min_size=1, max_size=20).map(bytes),
     st.binary(min_size=1, max_size=20),

@@ -159,7 +159,7 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
     assert state.grip_force > 1.15 * (FORCE + 10.0), "must take effect on the same tick"
-    # At most the sum of torque constant error, friction and load.
+    # The limit is the sum of torque constant error, friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9
     # The measured force rises, so the controller now holds the force set by the reflex.

@@ -238,7 +238,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
             assert contact.d == pytest.approx(hand.d[finger], abs=5.0 * contact.d_std)
             assert contact.theta == pytest.approx(hand.theta[finger], abs=math.radians(0.3))
             assert contact.force == pytest.approx(hand.force[finger], rel=0.06)
-            # Shear on the face; the base measures its moment over the height a.
+            # The face is sheared; the base measures the moment of this shear over the height a.
             shear = hand.tangential[finger] * (1.0 - hand.d[finger] / 0.020)
             assert abs(shear) > 0.2
             assert contact.shear_x == pytest.approx(shear, abs=0.15)

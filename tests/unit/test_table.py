@@ -43,7 +43,7 @@ def table() -> ContactTable:
     return ContactTable.build(TIP, TABLE_I, 1e-9)
 
 
-# A law and a tolerance for each number of pieces.
+# Each number of pieces has a law and a tolerance.
 SPLITS = {
     1: (TABLE_I, 1e-6),
     2: (TABLE_I, 1e-9),
