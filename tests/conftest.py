@@ -181,7 +181,7 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Inline:
-    """Return a function that runs a subcommand in this process."""
+    """Return a function that runs a subcommand in the test process."""
     monkeypatch.setattr(os, "nice", lambda _: 0)  # keep the test process's priority
     # Suppress messages about kernel compilation, which only the first test on a machine prints.
     monkeypatch.setattr(kernels, "print_event", lambda *_: None)

@@ -51,7 +51,7 @@ def fuzz(count: int, seed: int) -> Report:
 def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
     """Return True if the servo replies to a ping while the others are silent.
 
-    The others are silenced because all servos may have the same ID.
+    All other servos are silenced, because several servos may have the same ID.
     """
     for each in bus.servos:
         each.silent = each is not servo

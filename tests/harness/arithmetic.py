@@ -70,7 +70,7 @@ def other() -> dict[str, str]:
 
 
 def main() -> None:
-    """Replace this process with the command, run in the other environment."""
+    """Execute the command in the other environment, in place of the current process."""
     variables = other()
     named = " ".join(f"{name}='{value}'" for name, value in variables.items())
     print(f"usual arithmetic: {described()}", f"now with {named}", sep="\n", flush=True)

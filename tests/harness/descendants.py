@@ -1,7 +1,7 @@
 """Find and kill processes that tests started, directly or indirectly.
 
 When run as a program with a word as its argument, this module waits until its standard input
-closes. It then kills every process whose environment contains that word.
+closes. At that point, the module kills every process whose environment contains the word.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ def adopt_orphans() -> None:
 
 
 def end_with_this_process() -> None:
-    """Kill all processes started from now on when this process ends, even after SIGKILL."""
+    """When this process ends, even by SIGKILL, kill all processes that it starts from now on."""
     word = f"TESTS_OF_PROCESS={os.getpid()}"
     _watching.append(
         subprocess.Popen(

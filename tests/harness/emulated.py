@@ -31,7 +31,7 @@ READY_WITHIN = 200.0  # s, includes kernel compilation
 def emulated(
     folder: Path, *faults: str, settings: Settings | None = None, **options: Any
 ) -> Iterator[Emulator]:
-    """Run an emulator in a thread; it is ready when the context is entered."""
+    """Run an emulator in a thread; the context is entered once the emulator is ready."""
     made = Emulator(settings or Settings(), folder, faults=faults, **options)
     ready = threading.Event()
     runner = threading.Thread(target=made.run, args=(ready.set,), daemon=True)
@@ -46,7 +46,7 @@ def emulated(
 
 
 class EmulatorProcess:
-    """A ``softfinger emulate`` process with these arguments."""
+    """A ``softfinger emulate`` process with the given arguments."""
 
     def __init__(self, *arguments: str | Path) -> None:
         pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

@@ -91,11 +91,11 @@ def errors(estimate: Any, truth: Any) -> np.ndarray[Any, Any]:
 
 
 def board(pascal_per_count: float = 1.0, **range_: int) -> TactileSettings:
-    """Return board settings for this sensor, with 16 bits by default."""
+    """Return board settings for the paper's sensor, with 16 bits by default."""
     return TactileSettings(pascal_per_count=pascal_per_count, **range_)
 
 
 def flawed(**flaws: float) -> SimulationSettings:
-    """Return settings for a simulated sensor that has only these defects."""
+    """Return settings for a simulated sensor that has only the given defects."""
     named = {"noise": 0.0, **flaws}
     return SimulationSettings(**{f"tactile_{name}": value for name, value in named.items()})

@@ -104,7 +104,7 @@ def levers(lever: float) -> GraspState:
 
 
 def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
-    """Return the fault after ``seconds`` in this state, with every limit checked at least once."""
+    """Hold the state for ``seconds`` and return the fault; check every limit at least once."""
     found = None
     for _ in range(max(round(seconds / 0.002), len(LIMITS)) + len(LIMITS)):
         found = judge.judge(state)

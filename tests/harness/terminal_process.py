@@ -50,7 +50,7 @@ class TerminalProcess:
     def pump(self, seconds: float = 0.02) -> None:
         """Read the available output; if there is none, wait up to ``seconds`` for it.
 
-        At most one terminal buffer is read, because the process may write faster than this one
+        At most one terminal buffer is read, because the process may write faster than the test
         reads.
         """
         end = len(self.written) + _CAPACITY

@@ -149,7 +149,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
 
 
 def run_python(text: str, addresses: tuple[str, str]) -> None:
-    """Run in this process; an endless program is stopped after PRINTS lines."""
+    """Run the block in this process; stop an endless program after PRINTS lines."""
     for usual, own in zip(USUAL, addresses, strict=True):
         text = text.replace(usual, own)
 

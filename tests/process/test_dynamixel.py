@@ -22,7 +22,7 @@ FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fas
 
 
 def placed(firmware: int, *counts: int) -> ServoBus:
-    """Return servos with this firmware at these counts, configured for the hand."""
+    """Return servos with the given firmware and positions [counts], configured for the hand."""
     return make_bus("XM430-W350", firmware=firmware, for_daemon=True, counts=counts)
 
 

@@ -1,7 +1,7 @@
 """Test a daemon and an emulated hand as separate processes, over serial lines.
 
-The emulated hand's control socket reports the traffic on the servo wire and the watchdog trips
-after the daemon dies, stalls or loses its port.
+The emulated hand's control socket reports the servo bus traffic, and every watchdog trip after the
+daemon dies, stalls or loses its port.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Test the demo as a process that is suspended for a second while it works."""
+"""Test the demo with a one-second suspension of its process."""
 
 import select
 import signal

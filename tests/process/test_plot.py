@@ -64,7 +64,7 @@ Call = Callable[..., tuple[int, str]]
 
 @pytest.fixture
 def call(inline: Inline) -> Call:
-    """Run ``softfinger plot`` in this process; return exit status and standard error."""
+    """Run ``softfinger plot`` in the test process; return exit status and standard error."""
 
     def plotted(*words: object) -> tuple[int, str]:
         status, _, said = inline("plot", *words)

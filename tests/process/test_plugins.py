@@ -30,7 +30,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put the example on the import path of this process."""
+    """Put the example on the test process's import path."""
     monkeypatch.syspath_prepend(installed)
 
 

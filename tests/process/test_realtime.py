@@ -155,7 +155,7 @@ def test_a_short_time_slice_is_set_if_supported_and_reverted():
 
 
 def _slice(get_call: int) -> int:
-    """Return this thread's time slice as reported by the kernel [ns]."""
+    """Return the calling thread's time slice as reported by the kernel [ns]."""
     told = ctypes.create_string_buffer(48)
     assert ctypes.CDLL(None).syscall(get_call, 0, told, 48, 0) == 0
     return int(struct.unpack("=IIQiIQQQ", told.raw)[5])

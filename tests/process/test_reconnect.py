@@ -16,7 +16,7 @@ from tests.harness.emulated import emulated
 
 
 class Rig:
-    """A daemon and the emulated servos that it drives, both in this process."""
+    """A daemon and the emulated servos that it drives, both in the test process."""
 
     def __init__(self, folder: Path, **sections: Any) -> None:
         servos = {

@@ -1,6 +1,6 @@
 """Test the behaviour of subcommands before their work starts.
 
-This covers missing packages, Ctrl-C during an import, and shell completion.
+The tests cover missing packages, Ctrl-C during an import, and shell completion.
 """
 
 import signal

@@ -54,7 +54,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Kept:
-    """Pictures that this process computes and stores."""
+    """Pictures that the test process computes and stores."""
 
     def __init__(self, *, live: bool = False) -> None:
         self.newest: dict[str, Any] = {}

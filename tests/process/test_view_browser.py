@@ -119,7 +119,7 @@ class Page:
         self.browser.ask("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], **named)
 
     def place(self, selector: str, across: float) -> tuple[float, float]:
-        """Return a point on an element, at this fraction of its width."""
+        """Return a point on an element, at the given fraction of its width."""
         left, width, top, height = self(
             "(({left, width, top, height}) => [left, width, top, height])"
             f"(document.querySelector('{selector}').getBoundingClientRect())"

@@ -63,7 +63,7 @@ class Bench:
         return low
 
     def step(self, current: float) -> float:
-        """Advance by _DT at this current [A]; return the predicted time until the limit [s]."""
+        """Advance by _DT at a current [A]; return the predicted time until the limit [s]."""
         self.t += _DT
         noisy = current * (1.0 + 0.03 * self.chance.gauss(0.0, 1.0))
         self.plant.step(current, _DT)

@@ -1,4 +1,4 @@
-"""Real-time hardware-in-the-loop soak: ``python -m tests.soak.hil``, one hour.
+"""Run a real-time hardware-in-the-loop soak of one hour: ``python -m tests.soak.hil``.
 
 The daemon's process runs on an emulated hand, with a recorder, three subscribers and a client that
 grasps, turns, moves, releases and streams setpoints at 50 Hz. Meanwhile, faults disturb servos,

@@ -1,10 +1,10 @@
-"""Virtual-time soak: random sequences of commands, loads and faults, each from a seed.
+"""Run a virtual-time soak: random sequences of commands, loads and faults, one per seed.
 
-``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most of them grip; the grips are
-then loaded, turned, disturbed by faulty measurements and stopped. The daemon is complete except for
-its sockets. Requirements are checked against the plant and the data sent to the servos, never
-against the daemon's own reports. The soak counts how often each requirement is checked, and fails
-if a requirement is never checked. The tests run a few sequences.
+``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most sequences grip the object;
+the grips are then loaded, turned, disturbed by faulty measurements and stopped. The daemon is
+complete except for its sockets. Requirements are checked against the plant and the data sent to the
+servos, never against the daemon's own reports. The soak counts how often each requirement is
+checked, and fails if a requirement is never checked. The tests run a few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time, with its stream recorded and
 read. Violations are counted and do not end the run. The run fails if memory grows or a state is
@@ -690,7 +690,7 @@ class Soak:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:
-        """Check that a channel reported as faulty is faulty, unless the object has slipped away."""
+        """Check that a channel reported as faulty really is, unless the object has slipped away."""
         t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1

@@ -134,7 +134,7 @@ def test_protocol_1_if_configured() -> None:
 
 
 def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
-    """Return the distance [counts] moved in this time towards a goal of 300 counts."""
+    """Return the distance [counts] moved in ``time`` [s] towards a goal of 300 counts."""
     c = client(for_daemon=True)
     for address, value, size in writes:
         assert c.write(address, value, size) == 0

@@ -12,7 +12,7 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 
 def settings(width: float = 0.040, **control: Any) -> Settings:
-    """Return the built-in hand with an object of this width [m]."""
+    """Return the settings of the built-in hand, with an object of the given width [m]."""
     return Settings.model_validate({"object": {"width": width}, "control": control})
 
 

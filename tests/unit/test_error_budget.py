@@ -108,7 +108,7 @@ def pressed(tip, d, x, y, grid=FLAT):
 
 
 def unloading(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
-    """Return pressures with errors of up to 10 % of the reading that each cell has at 1.3 d."""
+    """Return pressures with errors of up to 10 % of each cell's reading at the depth 1.3 d."""
     loaded = np.maximum(pressed(tip, 1.3 * d, x, y), 1e-9)
     strain = np.clip(pressed(tip, d, x, y) / loaded, 0.0, 1.0)
     return pressed(tip, d, x, y) + sign * 0.4 * loaded * strain * (1.0 - strain)

@@ -25,7 +25,7 @@ TICK = 2e-3  # s
 
 
 def sweeps(*strokes: tuple[float, float]) -> tuple[Due, float]:
-    """Return sweeps to each angle [rad] at a velocity [rad/s] and back to 0, and their end [s]."""
+    """Return the commands for sweeps (angle [rad], velocity [rad/s]) and the end time [s]."""
     due: Due = {100: {"command": "arm"}}
     tick = 150
     for wide, speed in strokes:

@@ -45,7 +45,7 @@ def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
 
 
 def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
-    """Return the state after these ticks, without values that depend on the machine."""
+    """Return the state after ``count`` ticks, without values that depend on the machine."""
     loop = daemon.loop
 
     def end_in_time(_: float) -> None:

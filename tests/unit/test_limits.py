@@ -118,7 +118,7 @@ def test_a_short_spike_of_a_condition_that_must_last_is_not_a_fault():
     [THINNER, *(FAULTS[each][0] for each in ("current", "stalled", "dead", "brown-out"))],
 )
 def test_checking_for_a_cause_does_not_change_the_result(changes):
-    """A condition that must last is detected on the same tick, regardless of refused commands."""
+    """A persistent condition is detected on the same tick, regardless of refused commands."""
     asked, alone, state = safety(), safety(), sound()
     for k in range(1500):
         if k == 100:

@@ -50,7 +50,7 @@ class Press:
         return found
 
     def pressed(self, count: int) -> list[np.ndarray]:
-        """Return this number of frames after 1.4 s of compression."""
+        """Return the given number of frames, after 1.4 s of compression."""
         self.clock.sleep_until(1.4)
         self.sensor.latest()
         return self.frames(count)

@@ -34,7 +34,7 @@ FREE = '<joint axis="0 1 0"/><joint axis="0 0 1"/>'
 def scene(
     tilt: float = 0.0, joints: str = "", integrator: str = "implicitfast", radius: float = RADIUS
 ) -> tuple[Any, Any]:
-    """Return a model and data with the tip just touching a face tilted by this angle [rad]."""
+    """Return a model and data with the tip just touching a face tilted by ``tilt`` [rad]."""
     away = RADIUS + 0.05
     place = {"x": away * math.cos(tilt), "y": away * math.sin(tilt), "degrees": math.degrees(tilt)}
     text = SCENE.format(joints=joints, integrator=integrator, radius=radius, **place)

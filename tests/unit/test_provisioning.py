@@ -131,7 +131,7 @@ class Bus:
 
 @pytest.fixture
 def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Bus]:
-    """Return a function that creates buses for this test's lines."""
+    """Return a function that creates buses for the test's lines."""
 
     def make(**options: Any) -> Bus:
         bus = Bus(**options)

@@ -38,7 +38,7 @@ def placed(angles: tuple[float, float]) -> ServoBus:
 
 
 def out_of_reach(address: int, data: bytes) -> bool:
-    """Return True if a write could change which servos reply, which direct table access ignores."""
+    """Return True if a write could change which servos reply; such writes are not compared."""
     span = range(address, address + len(data))
     kept = (reg.ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
     # Indirect addresses could refer to these registers.

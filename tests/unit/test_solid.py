@@ -252,7 +252,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
 
 @pytest.mark.extended
 def test_turning_back_and_forth_does_not_change_the_force_of_a_solid_tip(make):
-    """Rolling changes d almost invisibly for the joints; the gain must not absorb this change."""
+    """Rolling changes d with hardly any joint motion; the gain must not absorb this change."""
     daemon = make(**load(Path("solid")).model_dump(exclude={"loop"}))
     grasped(daemon, 10.0)
     daemon.loop.advance(1.0)

@@ -152,7 +152,7 @@ def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
 
 
 def test_a_flood_does_not_count_as_old_forever():
-    """Connections limit how many requests can have waited, even if the socket is never empty."""
+    """The number of connections limits the backlog, even if the socket is never empty."""
     with (
         patch.object(bounds, "CLIENT_COUNT_MAX", 1),
         patch.object(bounds, "SOCKET_QUEUE_LENGTH", 20),

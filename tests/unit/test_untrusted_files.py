@@ -97,7 +97,7 @@ def test_a_malformed_profile_is_reported_quickly_and_briefly(tmp_path, text):
 
 
 def begin(file: IO[bytes], frames: int) -> None:
-    """Write the header of an array with this number of frames."""
+    """Write the header of an array with the given number of frames."""
     shape = {"descr": "<u2", "fortran_order": False, "shape": (frames, 44, 44)}
     np.lib.format.write_array_header_1_0(file, shape)
 

@@ -24,7 +24,7 @@ JOINTS = {
 
 
 class Miswired:
-    """A simulated hand whose servos drive the other finger or the wrong direction."""
+    """A simulated hand whose servos drive the wrong finger or turn in the wrong direction."""
 
     def __init__(self, hand: Any, wiring: str) -> None:
         self._hand, self._swapped = hand, wiring == "swapped"
@@ -78,7 +78,7 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
 
 def greatest_force(daemon: Daemon, seconds: float) -> float:
-    """Return the maximum true tip force during this time, or until a fault."""
+    """Return the maximum true tip force within ``seconds``, or until a fault."""
     greatest = 0.0
     for _ in range(round(seconds / 0.02)):
         daemon.loop.advance(0.02)
