@@ -41,7 +41,7 @@ def springs(d: float, theta: float = 0.0) -> float:
 def pressed(force, rng, noise, theta=0.0, deep=6e-3, above=0.6e-3, toe=0.0):
     """Return d and F of a machine that loads and unloads, with zero offsets, hysteresis and noise.
 
-    The tip carries no load for d up to ``toe``.
+    The tip does not carry any load up to the depth ``toe``.
     """
     up = np.linspace(-above, deep, 140)
     depth = np.concatenate([up, up[::-2]])
@@ -118,7 +118,7 @@ def test_a_strain_dependent_modulus_is_found_from_the_force():
 
 
 def rubber(base: str) -> Force:
-    """Return the force on solid rubber by independent finite elements, interpolated over depth."""
+    """Return the force on solid rubber, interpolated between independent finite element results."""
     with np.load(ROOT / "tests" / "golden" / "solid_frames.npz") as file:
         used = (file["base"] == base) & (file["theta"] == 0.0)
         d, push = file["d"][used], file["push"][used]

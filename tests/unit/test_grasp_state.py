@@ -244,7 +244,7 @@ def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, tap
     )
     found, _ = load_of(0.5 * (left1 + left2), lever, bow)
     assert found == pytest.approx(load, abs=2e-3)
-    # Both joints must show the load; otherwise it is not a load.
+    # A load must appear in the torques of both joints.
     assert left1 == pytest.approx(left2, abs=1e-9)
 
 

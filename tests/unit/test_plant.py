@@ -1,4 +1,4 @@
-"""Test the plant's kernel: energy that never increases, robustness, and shear relaxation."""
+"""Test the plant's kernel: monotonic energy decay, robustness, and shear relaxation."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Test that the public names are exported, documented with all fields, and in the site."""
+"""Test that the public names are exported, fully documented, and found by the site."""
 
 import ast
 import dataclasses

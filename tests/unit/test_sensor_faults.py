@@ -1,4 +1,4 @@
-"""Test that measurement faults during a grip are named and rejected, and spare the true force."""
+"""Test that measurement faults during a grip are rejected and do not affect the true force."""
 
 import math
 from collections.abc import Callable

@@ -153,7 +153,7 @@ def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
-    """Grip with servos that soon overheat, at half the usual frame rate."""
+    """Grip with servos that quickly overheat, at half the usual frame rate."""
     sections |= {"simulation": {"servo_heat": FAST, "ambient": 35.0}, "tactile": {"rate": 50.0}}
     hand = SimulatedDaemon(sections)
     hand.grasp(force)

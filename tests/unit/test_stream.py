@@ -154,7 +154,7 @@ def test_late_subscribers_receive_settings_and_events_again(context, addresses, 
     publisher.settings(98.0, 0.5, HandInfo("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
-    served.settle()  # the first subscription could otherwise be faster
+    served.settle()  # otherwise the first subscription could arrive earlier
     early = subscribe(context, addresses[0])
     told: list[tuple[bytes, dict[str, Any]]] = []
 

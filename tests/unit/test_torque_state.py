@@ -40,7 +40,7 @@ def test_joints_are_held_at_their_positions_once_torque_is_on(make):
 
 
 def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
-    """Writes are lost but readings arrive, which keep resetting the servos' watchdogs."""
+    """The writes are lost, but readings still arrive and keep resetting the servos' watchdogs."""
     daemon = make()
     events = heard(daemon)
     command(daemon, "arm")

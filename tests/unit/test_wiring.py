@@ -143,7 +143,7 @@ def test_fingers_that_open_are_reported_before_they_reach_their_stop(make, wirin
     daemon = make(wiring, **simulation)
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q.min() > -0.54:  # the stop is at -0.55
+    while daemon.hand.q.min() > -0.54:  # the joint's stop is at -0.55
         daemon.loop.advance(0.02)
     (text,) = texts(events, "joint.opens")
     assert "neither tip has contact: if a finger opens" in text
