@@ -1,4 +1,4 @@
-"""Test a daemon and an emulated hand as separate processes, over serial lines.
+"""Test a daemon and an emulated hand as separate processes, connected by serial lines.
 
 The emulated hand's control socket reports the servo bus traffic, and every watchdog trip after the
 daemon dies, stalls or loses its port.

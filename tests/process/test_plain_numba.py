@@ -1,4 +1,4 @@
-"""Test that Numba's own compiler builds the same kernels with an untested Numba version."""
+"""Test that Numba's own compiler, used for untested Numba versions, builds the same kernels."""
 
 import os
 from pathlib import Path

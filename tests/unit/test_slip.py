@@ -22,7 +22,7 @@ FRICTION = 0.05 / 0.03  # N, load that joint friction can hide at a moment arm o
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
 def test_a_push_beyond_the_margin_is_held_with_more_force(sections):
-    """The push is away from the palm; towards it, the object would wedge with little torque."""
+    """The push is away from the palm; a push towards it would hardly change the torques."""
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
         with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
