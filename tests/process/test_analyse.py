@@ -1,4 +1,4 @@
-"""``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
+"""Test that ``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
 
 import csv
 from pathlib import Path
@@ -21,7 +21,7 @@ TILT = 0.1
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
-    """Return the counts of an indentation up to 5 mm at 0.1 rad; rounding is the only noise."""
+    """Return the counts for an indentation of up to 5 mm at 0.1 rad; rounding is the only noise."""
     grid = SensorGrid(rows=44, cols=44, pitch=PITCH)
     material = Material.table_i()
     frames = [grid.pressure(TIP, material, d, TILT, 0.0) for d in DEPTHS[1:]]

@@ -1,4 +1,4 @@
-"""`softfinger calibrate` with a live board on a pty, load by load."""
+"""Test `softfinger calibrate` with a live board on a pty, one load at a time."""
 
 import contextlib
 import io
@@ -22,7 +22,7 @@ FRAMES = 12
 
 
 class Bench:
-    """Frames of the simulated sensor's board; each Enter key applies the next load."""
+    """Frames of the simulated sensor's board; each press of Enter applies the next load."""
 
     def __init__(self) -> None:
         self.sensor = MadeUp()

@@ -1,4 +1,4 @@
-"""`calibrate friction` and `calibrate latency` move a hand on ptys through its running daemon."""
+"""Test that `calibrate friction` and `calibrate latency` move a hand through its daemon."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,7 +28,7 @@ Calibrate = Callable[..., int]
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Hand]]:
-    """Yield a profile of the hand, and a client of its daemon."""
+    """Yield the hand's profile and a client connected to its daemon."""
     folder = tmp_path_factory.mktemp("hand")
     addresses = own_addresses()
     profile = folder / "my.toml"

@@ -1,4 +1,4 @@
-"""`softfinger calibrate scales` stores factors from grips, which the next daemon starts with."""
+"""Test that `calibrate scales` stores factors from grips, and the next daemon uses them."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""`softfinger doctor` and `softfinger scan` with emulated hands, and single checks."""
+"""Test `softfinger doctor` and `softfinger scan` on emulated hands, and single checks."""
 
 import contextlib
 import os
@@ -37,7 +37,7 @@ from tests.harness.gateway import Served
 
 
 class Hand:
-    """Emulated hand in a thread, with access for the doctor."""
+    """Emulated hand in a thread that the doctor can examine."""
 
     def __init__(self, folder: Path, **options: Any) -> None:
         self.folder = folder
@@ -48,14 +48,14 @@ class Hand:
         self.emulator = self._stack.enter_context(running)
 
     def registers(self) -> list[bytes]:
-        """Return the servos' registers without those that change by themselves."""
+        """Return the servos' registers, except those that change by themselves."""
         live = slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
         bus = self.emulator._servos.bus
         memories = [bytes(servo.table.memory) for servo in bus.servos]
         return [memory[: live.start] + memory[live.stop :] for memory in memories]
 
     def doctor(self, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, list[str]]:
-        """Return the doctor's status and lines; in the emulator's process, replies may be late."""
+        """Return the doctor's status and lines, with settings that tolerate late replies."""
         late = ("servos.reply_timeout=1", "servos.open_timeout=0.1", "loop.rate=20")
         words += ("--set", "servos.watchdog=0.5", "--set", "servos.fault_after=0.5")
         words += tuple(word for each in late for word in ("--set", each))
@@ -75,7 +75,7 @@ def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the measurements of this machine and skip its sockets."""
+    """Shorten the doctor's measurements of this machine and skip its address check."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UP_COUNT", 5)
 
@@ -144,7 +144,7 @@ def test_boards_are_checked(hands, capsys):
     assert status == 1
     assert "256 cells" in next(line for line in lines if line.startswith("FAIL   tactile left"))
     assert "       → set tactile.rows and tactile.cols" in lines
-    assert scanned(capsys, hand.folder, "--wait", "1") == [  # servos that reply, at any rate
+    assert scanned(capsys, hand.folder, "--wait", "1") == [  # the servos reply at any rate
         f"ID {servo} at 2000000, 1000000 baud: XM430-W350, firmware 48" for servo in (1, 2)
     ]
     assert main(["doctor"]) == 0
@@ -264,7 +264,7 @@ def test_unusable_ports_fail(tmp_path, terminal, monkeypatch):
 @pytest.mark.parametrize("locked", [True, False])
 def test_the_process_using_a_port_is_named(terminal, locked):
     path = terminal
-    # This process owns the pty's master and does not count as a user of the port.
+    # This process owns the pty's master, so it does not count as a user of the port.
     script = (
         "import fcntl, os, sys; d = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)\n"
         f"if {locked}: fcntl.flock(d, fcntl.LOCK_EX)\n"

@@ -1,4 +1,4 @@
-"""The exchange of one tick: timed by `doctor`, tested at connect, monitored while disarmed."""
+"""Test the bus exchange of one tick: `doctor` timing, checks on connecting and while disarmed."""
 
 import contextlib
 import grp
@@ -29,7 +29,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 
 def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
-    """Return the doctor's result for the exchange of one tick."""
+    """Return the doctor's timing of one tick's bus exchange."""
     settings = backend_settings(bus.port, **servos)
     loop = settings.loop.model_copy(update={"rate": rate})
     settings = settings.model_copy(update={"loop": loop})
@@ -37,7 +37,7 @@ def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
     return found
 
 
-# Timing by the doctor.
+# Timing by the doctor
 
 
 def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running):
@@ -51,7 +51,7 @@ def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running)
     assert found.text.startswith("50 read and write cycles: p50 ")
     until(lambda: len(re.findall(rb"\xff\xff\xfd\x00\xfe..\x83", heard, re.DOTALL)) == 50)
     reads = re.findall(rb"\xff\xff\xfd\x00\xfe..\x8a", heard, re.DOTALL)
-    assert len(reads) == 54  # each of the four spans is tested first
+    assert len(reads) == 54  # the doctor first tests each of the four spans
     assert [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)] == before
 
 
@@ -73,7 +73,7 @@ def test_assessment_of_exchange_times():
 
     assert judged(0.0004, 0.0009).status == "pass"
     assert judged(0.0004, 0.0009).text == "50: p50 0.4 ms, p99 0.9 ms, 0% failed"
-    near = judged(0.0017, 0.0018)  # `run` warns of the same
+    near = judged(0.0017, 0.0018)  # `run` issues the same warning
     assert (near.status, near.fix.split(";")[0]) == ("warn", "set loop.rate = 440")
     assert near.text.endswith("a tick takes 2 ms (loop.rate = 500): ticks will be late")
     both = judged(0.0028, 0.003)  # shorter than reply_timeout and longer than a tick
@@ -91,12 +91,12 @@ def test_assessment_of_exchange_times():
     assert judge_exchanges(ExchangeTimes(1.0, 1.0, 1.0, 1.0), Settings(), "50").status == "FAIL"
 
 
-# Tests at connect.
+# Tests on connecting
 
 
 def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bus):
     for i in (0, 1):
-        bus.servo(i).fast_reads = False  # contrary to its firmware version
+        bus.servo(i).fast_reads = False  # contradicts the firmware version
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
     assert notice.fix == "the slower sync read is used"
@@ -131,7 +131,7 @@ def test_slow_replies_are_reported_at_start_up(bus):
 
 
 def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
-    """An adapter may restart when its port is opened, so reopening it would never end."""
+    """An adapter may restart the board at every opening, so reopening would never succeed."""
     bus, opened = running(), []
     for i in (0, 1):
         bus.servo(i).silent = True
@@ -151,7 +151,7 @@ def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
     until(connects)
     assert len(opened) == 1
     backend.close()
-    connected(bus).close()  # the port is available again
+    connected(bus).close()  # the port has been released
 
 
 def test_doctor_waits_as_long_as_run(running):

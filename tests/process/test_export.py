@@ -1,4 +1,4 @@
-"""``softfinger export`` writes a recording's values to CSV and Parquet."""
+"""Test that ``softfinger export`` writes a recording's values to CSV and Parquet."""
 
 import csv
 import math
@@ -78,7 +78,7 @@ def test_times_of_all_files_count_from_one_zero(tmp_path, first):
     messages.insert(first != schema.TACTILE, (schema.TACTILE, frame(0.0, 1) | scan))
     for topic, message in messages:
         writer.add(topic, message)
-    late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}  # Unix time was set meanwhile
+    late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}  # Unix time was set in between
     writer.add(schema.STATE, sample(schema.STATE) | late)
     writer.close()
     recording = Recording(tmp_path / "a.mcap")

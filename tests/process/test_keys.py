@@ -1,4 +1,4 @@
-"""Key files, and access control of the daemon's sockets with keys."""
+"""Test key files, and access control of the daemon's sockets with keys."""
 
 import errno
 import os
@@ -100,7 +100,7 @@ def test_keys_that_others_own_or_may_write_are_refused(folder, which, monkeypatc
         load_server(folder)
     path.chmod(mode)
     load_server(folder)
-    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # any user other than the owner
+    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # pretend to be a user other than the owner
     if os.getuid() == 0:
         for each in [path, *path.parents]:
             if each.is_relative_to(folder):
@@ -177,7 +177,7 @@ def ask(
         if socket is subscriber:
             socket.subscribe(b"")
         socket.connect(address)
-    commander.send(msgpack.packb({"command": "arm", "client": "local"}))  # the name is ignored
+    commander.send(msgpack.packb({"command": "arm", "client": "local"}))  # the daemon ignores it
     return subscriber, commander
 
 
@@ -198,7 +198,7 @@ def test_the_key_identifies_a_client_and_clients_without_a_key_get_nothing(
     theirs = ask(others, addresses, stranger(folder, kind))
     ours = ask(others, addresses, load_client(folder / "alice"))
     seen = 0
-    while seen < 200:  # the client with a key receives 200 messages, the one without receives none
+    while seen < 200:  # only the client with a key receives messages
         guarded.step()
         if ours[0].poll(2):
             ours[0].recv_multipart()
@@ -217,7 +217,7 @@ def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addr
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.server.raise_fence()  # as every stop does
+        guarded.served.server.raise_fence()  # every stop raises a fence
         guarded.step()
         return stopper.poll(0)
 

@@ -1,4 +1,4 @@
-"""Every client tool supports keys and reports when they are missing."""
+"""Test that every client tool supports keys and reports missing keys."""
 
 import asyncio
 import json
@@ -32,7 +32,7 @@ class Guarded(NamedTuple):
 
     folder: Path
     addresses: Addresses
-    recording: Path  # made by the daemon itself
+    recording: Path  # recorded by the daemon itself
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The demo as a process that is suspended for a second while it works."""
+"""Test the demo with a one-second suspension of its process."""
 
 import select
 import signal
@@ -13,7 +13,7 @@ from tests.conftest import Addresses
 from tests.harness.daemon_process import Running
 
 STILL = 1.0  # s, ten times the watchdog time and the maximum frame age
-PATIENCE = 60.0  # s to wait for an event on a busy machine
+PATIENCE = 60.0  # s, time-out for an event on a busy machine
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""``softfinger plot``: the pages of a recording and their contents, and incomplete recordings."""
+"""Test ``softfinger plot``: a recording's pages and their contents; incomplete recordings."""
 
 import math
 from collections.abc import Callable
@@ -64,7 +64,7 @@ Call = Callable[..., tuple[int, str]]
 
 @pytest.fixture
 def call(inline: Inline) -> Call:
-    """Run ``softfinger plot`` in this process; return exit status and standard error."""
+    """Run ``softfinger plot`` in the test process; return exit status and standard error."""
 
     def plotted(*words: object) -> tuple[int, str]:
         status, _, said = inline("plot", *words)
@@ -96,7 +96,7 @@ def test_model_page_has_points_near_the_model_curves(run):
     model = run.models[0].table(depths * 1e-3, np.radians(points[:, 0])).force
     firm = points[:, 1] > 1.0
     assert firm.sum() > 100
-    # The accuracy is limited by the modulus factor.
+    # The modulus factor limits the accuracy.
     assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.06
 
 

@@ -1,4 +1,4 @@
-"""Calibration without hardware: `emulate --send press` and `calibrate` on a solid rubber tip."""
+"""Test calibration without hardware: `emulate --send press` and `calibrate` on a rubber tip."""
 
 import math
 import re
@@ -17,7 +17,7 @@ RUBBER = ["tip.physics=solid", "tip.poisson=0.48", "safety.d_max=0.008", *LINEAR
 
 
 class Stage:
-    """A user at the stage who applies the requested load and then presses Enter."""
+    """Simulated user of the test stand, who applies the requested load and presses Enter."""
 
     def __init__(self, folder, presses):
         self._folder, self._presses = folder, list(presses)

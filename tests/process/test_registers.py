@@ -1,4 +1,4 @@
-"""Registers changed by another program: reported, written by `arm`, repaired and restored."""
+"""Test registers changed by another program: reported, written by `arm`, repaired, restored."""
 
 import json
 from typing import Any
@@ -116,7 +116,7 @@ def test_arm_overwrites_changed_ram_registers(bus, connect, reboots):
         backend.torque_on()
         bus.call(lambda: bus.servo(0).reboot(bus.now()))
         until(lambda: bus.call(lambda: bus.servo(0).awake(bus.now())))
-        for address, value in RAM:  # another program immediately writes to it
+        for address, value in RAM:  # another program immediately writes to the servo
             put(bus, address, value)
     backend.torque_on()
     model = MODELS["XM430-W350"]
@@ -144,7 +144,7 @@ def test_factory_settings_of_every_model_pass_the_checks():
 
 
 def test_stall_torques_fit_current_speed_and_gears():
-    """A torque constant is inversely proportional to the speed of servos with one motor."""
+    """For servos with the same motor, the torque constant is inversely proportional to speed."""
     for name, model in MODELS.items():
         torque, current, voltage = model.stall
         assert 0.5 < torque * model.no_load_speed / (voltage * current) < 1.2, name

@@ -1,4 +1,4 @@
-"""Replayed recordings: published unchanged, and recomputed to equal states by current code."""
+"""Test replayed recordings: published unchanged, and recomputed to equal states."""
 
 import json
 import re
@@ -72,7 +72,7 @@ def test_other_settings_report_the_first_difference(taken, tmp_path):
     assert "left.goal_current" in result.differences
     assert "left.q" not in result.differences  # inputs are unchanged
     different = result.differences["left.goal_current"]
-    assert different.first_tick > 50  # no difference before arming
+    assert different.first_tick > 50  # the first difference appears after arming
     assert different.worst > 1e-3
     assert different.recorded != different.recomputed
 

@@ -1,4 +1,4 @@
-"""Checks at connect with suggested fixes and without changes; temperature, supply, errors."""
+"""Test the checks on connecting and their suggested fixes; temperature, supply and errors."""
 
 import math
 import os
@@ -29,7 +29,7 @@ from tests.process.conftest import Connect
 
 
 def refusal(path: str, **servos: Any) -> list[str]:
-    """Return the lines of the error raised at connect."""
+    """Return the lines of the error raised on connecting."""
     backend = DynamixelServos(backend_settings(path, **servos), RealClock())
     with pytest.raises(ServoError) as caught:
         backend.connect()
@@ -148,7 +148,7 @@ def test_unusable_ports_are_reported(bus):
     first.read(reading)
     assert reading.valid
     first.close()
-    connected(bus).close()  # available again
+    connected(bus).close()  # the port is available again
 
 
 def test_minor_findings_are_notices(bus):
@@ -169,7 +169,7 @@ def test_minor_findings_are_notices(bus):
     goal = bus.memory(0)[span]
     backend.write(Goal(q=[0.5, 0.5], current=[1.0, 1.0]))
     backend.close()
-    assert bus.memory(0)[span] == goal  # torque that was on is not changed
+    assert bus.memory(0)[span] == goal  # a servo with torque on is not changed
     assert servo.torque_on
 
 
@@ -180,7 +180,7 @@ def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     gears = "its gears lose 0.25 of their torque to friction, so a grip may never settle"
     assert [each.text for each in backend.notices] == 2 * [constant, gears]
     backend.close()
-    for name in ("hil", "small"):  # profiles whose forces match their servos
+    for name in ("hil", "small"):  # these profiles have forces that match their servos
         settings = load(find(Path(name)), Path("/tmp"))
         assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 
@@ -191,14 +191,14 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     place = tmp_path / name / "device" / "latency_timer"
     place.write_text("16\n")
     monkeypatch.setattr(checks, "latency_file", lambda path: latency_file(path, tmp_path))
-    # The low-latency mode is not available, as on this pseudo-terminal.
+    # The low-latency mode is unavailable, as on this pseudo-terminal.
     text = "16 ms, so every read takes that long"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     assert refusal(bus.port, reply_timeout=0.004)[0] == f"{bus.port} latency timer: {text}: {fix}"
     backend = connected(bus)  # the time-out is longer than the latency timer
     assert (backend.notices[0].text, backend.notices[0].fix) == (text, fix)
     backend.close()
-    # The mode is available, so a driver sets the timer to 1 ms by itself.
+    # The port has a low-latency mode, so a driver sets the timer to 1 ms by itself.
     asked = []
 
     def low(_: serial.Serial, on: bool) -> None:
@@ -244,7 +244,7 @@ def test_temperature_and_supply_are_read_with_the_joints(bus, servos):
 
 
 def test_both_kinds_of_read_give_the_same_readings(bus, servos, monkeypatch):
-    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)  # only one wide read
+    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)  # only the first read is wide
     wide = read(servos, Reading())
     narrow = read(servos, Reading())
     assert wide.temperature[0] > 0.0
@@ -266,7 +266,7 @@ def test_an_alert_names_the_hardware_error_and_arming_is_refused(bus, servos):
 
 
 class Loaded:
-    """A stationary hand with 2 A through its left joint."""
+    """A stationary hand whose left joint carries 2 A."""
 
     q = dq = np.zeros(2)
     current = np.array([2.0, 0.0])
@@ -297,8 +297,8 @@ def test_simulated_servos_heat_up_with_their_current_and_shut_down():
     while not read(servos, reading).alert:
         clock.sleep_until(clock.now() + 0.05)
         assert clock.now() < 400.0
-    # 55 K times 73 J/K, heated by 22.5 W at first and 32 W with hot copper, minus losses to the
-    # air.
+    # The heat is 55 K times 73 J/K. The power is 22.5 W at first and 32 W with hot copper, minus
+    # the losses to the air.
     assert 55.0 * 73.0 / 32.0 < clock.now() < 1.2 * 55.0 * 73.0 / 22.5
     assert (reading.alert, reading.hardware) == (0b01, [1 << 2, 0])
     assert reading.temperature == [80.0, 25.0]

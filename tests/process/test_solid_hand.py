@@ -1,4 +1,4 @@
-"""A hand with solid tips, recorded on the virtual clock and processed by the tools."""
+"""Test a hand with solid tips: recorded on the virtual clock, processed by the tools."""
 
 from pathlib import Path
 

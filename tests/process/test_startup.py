@@ -1,6 +1,6 @@
-"""Behaviour of subcommands before their work starts.
+"""Test the behaviour of subcommands before their work starts.
 
-Missing packages, Ctrl-C during an import, shell completion.
+The tests cover missing packages, Ctrl-C during an import, and shell completion.
 """
 
 import signal

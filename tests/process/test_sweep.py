@@ -1,4 +1,4 @@
-"""Sweeps give the same bits in one process, in a pool, and in a cluster whose worker is killed."""
+"""Test that sweeps give the same bits in one process, a pool, and a cluster that loses a worker."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The test kit, used by test files of their own in a separate pytest process."""
+"""Test the test kit with separate test files in another pytest process."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Short benchmark runs: their errors, bounds and verdicts."""
+"""Test short benchmark runs: their errors, bounds and verdicts."""
 
 import json
 import math
@@ -149,7 +149,7 @@ ASKEW = {"object_angle": math.radians(5.0)}
     ],
 )
 def test_residual_angle_error_of_a_control_law(way, low, high):
-    # A delay is tolerated as long as its product with the integral's bandwidth is below π/2.
+    # The controller tolerates a delay while its product with the integral's bandwidth is below π/2.
     assert low <= control.left(way, ASKEW) <= high
 
 
@@ -184,7 +184,7 @@ def test_a_held_load_slides_and_a_lost_load_is_reported():
     assert 0.0 < held.answer < 0.022
     assert 0.0 < held.slid < 0.02
     assert not held.lost
-    # A joint that still sticks moves a quarter as much as the other.
+    # A joint that still sticks moves a quarter as far as the other.
     sticking = reflex.overloaded({"simulation": {"object_mass": 0.5}}, 6.0, 15.0, 1)
     assert (sticking.answer < 0.022, sticking.slid < 0.012, sticking.lost) == (True, True, False)
     weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}

@@ -1,4 +1,4 @@
-"""The command line's first steps, profile display, and numbers with units."""
+"""Test the command line's first steps, profile listing, and numbers with units."""
 
 import json
 import math
@@ -42,7 +42,7 @@ def test_the_closest_subcommand_is_suggested(inline):
         assert f"unknown word {word!r}; nearest: {near}" in wrong.stderr
     assert max(map(len, inline("limits").stdout.splitlines())) <= 120
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
-    # Names the missing command only, not missing options.
+    # The message names only the missing command, not missing options.
     assert inline("send").stderr.endswith("required: COMMAND\n")
 
 

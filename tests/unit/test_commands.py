@@ -1,4 +1,4 @@
-"""Command server and client on real sockets; the order and form of requests."""
+"""Test the command server and client on real sockets: order and form of requests."""
 
 import os
 import select
@@ -99,7 +99,7 @@ def test_malformed_multipart_messages_and_disconnecting_clients_have_no_effect(
 ):
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
-    socket.send_multipart([b"", b"a", b"b", b"c"])  # not a client's form
+    socket.send_multipart([b"", b"a", b"b", b"c"])  # clients never send this form
     socket.send(msgpack.packb({"command": "arm"}))
     socket.close(linger=1000)
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
@@ -127,7 +127,7 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
 
 
 def test_a_request_passes_few_functions(context, addresses):
-    """Count from the socket to the handler, followed by `Loop.command` and `Requests.carry_out`."""
+    """Count the functions between the socket and the handler; the loop adds only two more."""
     passed: set[str] = set()
     heard = []
 
@@ -254,7 +254,7 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
         if stalled == "loop":
             on_the_link(served)
         elif stalled == "gateway":
-            # libzmq has received it or is about to, so the start of its waiting time is unknown.
+            # libzmq has received the request or is about to, so its waiting time is unknown.
             until(lambda: served.service.commands.socket.poll(0))
         pass_time(clock, 0.5)
         # After the stall, libzmq's own thread may run later than the gateway's check.
@@ -292,7 +292,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         pass_time(clock, 0.5)
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
-        for _ in range(4):  # the gap is over
+        for _ in range(4):  # wait until the gap is over
             pass_time(clock, bounds.REFUSAL_TIME / 2)
             served.serve(aged)
         if meanwhile == "signal":
@@ -300,7 +300,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         elif meanwhile:
             other = Asking(context, served, addresses[1], meanwhile)
             until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
-        until(lambda: served._is_open())  # long enough after a stop to distinguish requests
+        until(lambda: served._is_open())  # long enough after a stop to tell requests apart
         count = len(aged.ages)
         asking.send(keyed())
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
@@ -438,7 +438,7 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(con
 
 
 class Flood:
-    """Clients that send without waiting for replies; nothing is served yet."""
+    """Clients that send without waiting for replies; at first no request is served."""
 
     def __init__(self, context: zmq.Context[Any], address: str, clients: int, each: int) -> None:
         self.sockets = [context.socket(zmq.DEALER) for _ in range(clients)]
@@ -449,7 +449,7 @@ class Flood:
                 socket.send(msgpack.packb({"command": "move"}))
 
     def collect(self, replies: list[dict[str, Any]]) -> int:
-        """Collect replies; return their number so far."""
+        """Collect replies; return the number collected so far."""
         for socket in self.sockets:
             while socket.poll(0):
                 replies.append(msgpack.unpackb(socket.recv()))
@@ -468,7 +468,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             return {}
 
         until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
-        served.serve(note)  # the flood is being processed
+        served.serve(note)  # the gateway is processing the flood
         carried_out = len(order)
         assert carried_out > 0
         stopper = context.socket(zmq.DEALER)
@@ -482,7 +482,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             served.serve(note)
 
         until(lambda: [serve(), stopper.poll(0)][1])
-        # All requests before the stop are answered, and none is executed.
+        # All requests before the stop receive a reply, and none of them is executed.
         replies: list[dict[str, Any]] = []
         until(lambda: [serve(), flood.collect(replies) == 160][1])
         assert order[carried_out:] == ["stop"]
@@ -509,11 +509,11 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
             "too many commands: expected at most 20 per second"
         }
         assert all(reply["ok"] for reply in kind)
-        # It may send again a second later.
+        # The client may send again after a second.
         clock.sleep_until(clock.now() + 1.0)
         flood.sockets[0].send(msgpack.packb({"command": "move"}))
         last: list[dict[str, Any]] = []
-        answer = {"ok": True, "heard": "move"}  # after the remaining requests of the flood
+        answer = {"ok": True, "heard": "move"}  # follows the remaining requests of the flood
         until(lambda: [served.serve(echo), flood.collect(last), answer in last][2])
 
 
@@ -526,7 +526,7 @@ def test_flooding_clients_leave_room_for_others(context, addresses):
 
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
-        # No room is left.
+        # The gateway's buffers are full.
         until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
         other = Asking(context, served, addresses[1], "grasp").socket
         until(lambda: [served.serve(note), other.poll(0)][1])

@@ -1,4 +1,4 @@
-"""Kernel decorators and their records, and the sources that a compiled kernel depends on."""
+"""Test kernel decorators, their records, and the sources that a compiled kernel depends on."""
 
 import importlib
 import math
@@ -106,6 +106,6 @@ def test_an_unknown_field_is_an_error():
 
 
 def test_array_aliases_of_every_numpy_version_are_recognised():
-    of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] in that version
+    of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] in NumPy 2.5
     for alias in (NDArray[np.float64], of_2_5):
         assert _kind(Annotated[alias, 3]) == (None, np.float64, (3,))

@@ -1,4 +1,4 @@
-"""Each limit, and when limits are reported or latched."""
+"""Test each limit, and the conditions under which it is reported or latched."""
 
 import math
 from copy import copy
@@ -118,7 +118,7 @@ def test_a_short_spike_of_a_condition_that_must_last_is_not_a_fault():
     [THINNER, *(FAULTS[each][0] for each in ("current", "stalled", "dead", "brown-out"))],
 )
 def test_checking_for_a_cause_does_not_change_the_result(changes):
-    """A condition that must last is detected on the same tick, regardless of refused commands."""
+    """A persistent condition is detected on the same tick, regardless of refused commands."""
     asked, alone, state = safety(), safety(), sound()
     for k in range(1500):
         if k == 100:
@@ -176,7 +176,7 @@ def test_a_change_of_width_of_a_held_object_is_a_fault():
     name, text = judged(judge, state, 0.5)
     assert name == "hand.width"
     assert "changed by -4.5 mm" in text
-    state.mode = Mode.ARMED  # the object was released; the next one may have any width
+    state.mode = Mode.ARMED  # the object is released; the next object may have any width
     assert judged(judge, state) == ("", "")
     state.mode = Mode.HOLDING
     assert judged(judge, state, 0.5) == ("", "")
@@ -215,7 +215,7 @@ def test_a_warning_is_reported_once_until_it_has_ended(name):
 
 @pytest.mark.parametrize(("good", "told"), [(1000, True), (20, True), (3, False)])
 def test_readings_that_fail_for_a_second_are_reported_even_while_disarmed(good, told):
-    """One in ``good`` readings is valid."""
+    """Every reading is invalid except one in ``good``."""
     watch, state = safety(), sound(Mode.DISARMED)
     state.torque = False
     first = math.inf
@@ -309,7 +309,7 @@ def test_a_frozen_sensor_is_a_fault_during_contact():
         assert (found is not None) is fault
     assert found.name == "tactile.frozen"
     assert "right sensor is frozen" in found.text
-    state.contacts[1].contact = False  # without contact, repeated readings are normal
+    state.contacts[1].contact = False  # without contact, repeated frames are normal
     assert judged(judge, state) == ("", "")
 
 
@@ -323,7 +323,7 @@ def test_saturated_cells_are_reported():
     ]
 
 
-# Values that may reach a fraction of their limit; ages are relative to now.
+# Values that may reach a fraction of their limit; ages are relative to the current time.
 PUSHES: dict[str, tuple[str, float]] = {
     "joint.angle": ("reading.q.{}", SETTINGS.hand.q_max[0] + 0.1),
     "joint.velocity": ("reading.dq.{}", BOUNDS.velocity_max),

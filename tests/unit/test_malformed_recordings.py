@@ -1,4 +1,4 @@
-"""Recordings with malformed messages, which are reported and omitted without a traceback."""
+"""Test that malformed messages in recordings are reported and omitted without a traceback."""
 
 import copy
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Stress-strain laws: Table I, measured points, refusals, and tables for the kernels."""
+"""Test stress-strain laws: Table I, measured points, rejected laws, and tables for the kernels."""
 
 import math
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""MCAP recordings written by other programs: merged, filtered, without an index."""
+"""Test MCAP recordings written by other programs: merged, filtered, without an index."""
 
 import json
 from collections.abc import Iterator
@@ -96,7 +96,7 @@ def test_all_variants_of_the_format_give_the_same_recording(tmp_path, options):
     assert recording.total == SHORT
     assert recording.count(schema.STATE) == sum(topic == schema.STATE for topic, _ in wanted)
     times = [message.log_time * 1e-9 for _, _, message in golden()]
-    assert recording.start == pytest.approx(min(times) + 1e4)  # not the time of another channel
+    assert recording.start == pytest.approx(min(times) + 1e4)  # the camera's start does not count
     assert recording.duration == pytest.approx(max(times) - min(times))
     late = list(recording.messages([schema.STATE], start=0.1))
     assert 0 < len(late) < recording.count(schema.STATE)

@@ -1,4 +1,4 @@
-"""Files of other users in place of this user's files are neither followed nor overwritten."""
+"""Test that another user's files in place of this user's are neither followed nor overwritten."""
 
 import os
 from collections.abc import Callable

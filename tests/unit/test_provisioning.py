@@ -1,4 +1,4 @@
-"""Finding, identifying and configuring servos, on a line without a port."""
+"""Test finding, identifying and configuring servos, on an emulated line without a port."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -47,21 +47,21 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
 @pytest.mark.parametrize(
     ("settings", "found", "told"),
     [
-        # All as configured.
+        # Both servos are configured.
         (BOTH, [servo(1), servo(2)], []),
         (BOTH, [servo(1), servo(2), servo(9)], ["stranger 9@2000000"]),
-        # The correct ID at another rate is the expected servo.
+        # A correct ID at another rate identifies the expected servo.
         (
             BOTH,
             [servo(1, 57600), servo(2, 57600)],
             ["0: 57600 → 2000000 baud", "1: 57600 → 2000000 baud"],
         ),
-        # A single unexpected servo is the single missing one.
+        # If one servo is missing and one is unexpected, they are the same servo.
         (BOTH, [servo(1), servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
         (BOTH, [servo(1), servo(7)], ["1: ID 7 → 2"]),
         (OTHER_IDS, [servo(1, 57600)], ["0: ID 1 → 11, 57600 → 2000000 baud"]),
-        # The servo of a finger outside the scene is not the missing one; with factory settings at
-        # another rate it cannot be assigned.
+        # The servo of a finger outside the scene is not the missing one. With factory settings at
+        # another rate, it cannot be assigned.
         (ONLY_LEFT, [servo(2)], ["missing 0", "stranger 2@2000000"]),
         (ONLY_RIGHT, [servo(1)], ["missing 1", "stranger 1@2000000"]),
         (ONLY_RIGHT, [servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
@@ -80,7 +80,7 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         ),
         # An unpaced emulator replies at every rate.
         (BOTH, [servo(servo_id, rate) for servo_id in (1, 2) for rate in RATES], []),
-        # Garbled replies are left alone, and no servo gets an ID with garbled replies.
+        # Servos with garbled replies are not configured, and their IDs are not assigned.
         (BOTH, [servo(1, 57600), Garbled(1, 57600)], ["missing 0", "missing 1"]),
         (
             BOTH,
@@ -131,7 +131,7 @@ class Bus:
 
 @pytest.fixture
 def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Bus]:
-    """Return a function that creates buses for this test's lines."""
+    """Return a function that creates buses for the test's lines."""
 
     def make(**options: Any) -> Bus:
         bus = Bus(**options)

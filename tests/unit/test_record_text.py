@@ -1,4 +1,4 @@
-"""The texts and pictures of the stream's records at a prompt and in a notebook."""
+"""Test the text and pictures of stream records, at a prompt and in a notebook."""
 
 import re
 from typing import Any
@@ -77,7 +77,7 @@ def test_a_state_is_a_table_in_a_notebook():
 
 
 def drawn(found: TactileFrame) -> tuple[ElementTree.Element, np.ndarray]:
-    """The picture, and the opacity of each cell that its paths fill; row 0 is its lowest."""
+    """Return the picture and the opacity of each cell that its paths fill; row 0 is the lowest."""
     picture, _ = ElementTree.fromstring(f"<p>{found._repr_html_()}</p>")
     cells = np.zeros((found.rows, found.cols))
     for path in picture:

@@ -1,4 +1,4 @@
-"""The complete pipeline for each kind of scene, with its servos and sensors."""
+"""Test the complete pipeline for each kind of scene, with its servos and sensors."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ state_message = message_maker(STATE)
 
 
 def holding_demo(daemon: Daemon) -> list[Event]:
-    """Run the demo until it holds; return it with its further events."""
+    """Run the demo until the hand holds the object; return the list of later events."""
     advance_to(daemon, "holding", 5.0)
     return heard(daemon)
 
@@ -64,7 +64,7 @@ def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
 def test_a_demo_with_an_endless_step_restarts(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
-    daemon.loop._task._end_mode = "moving"  # a mode that is never reached
+    daemon.loop._task._end_mode = "moving"  # the task never reaches this mode
     advance_to(daemon, "disarmed", 13.0)
     assert events[0][2].startswith("still holding after 10 s; on a simulated hand the task stops")
     advance_to(daemon, "holding", 6.0)

@@ -1,4 +1,4 @@
-"""Settings: profiles are loaded, and all their errors are in one report."""
+"""Test settings: profiles are loaded, and all their errors are in one report."""
 
 import json
 import tomllib
@@ -159,7 +159,7 @@ def test_wrong_values_do_not_hide_contradictions_between_other_keys(tmp_path):
         "hand.open_angle.1",
         "tip.radius",
         "hand.q_max",
-        "servos.ids",  # and not safety.d_max, which was compared with another radius
+        "servos.ids",  # without safety.d_max, which was compared with another radius
     ]
 
 
