@@ -78,7 +78,7 @@ def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -
 
 
 def longest_frame(rows: int, cols: int) -> int:
-    "Return the maximum size of a uint16 frame on the wire in bytes, including the delimiter."
+    """Return the maximum size of a uint16 frame on the wire in bytes, including the delimiter."""
     message = _HEADER.size + 2 * rows * cols + _CRC.size
     return message + 1 + message // _BLOCK + 1
 

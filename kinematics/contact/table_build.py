@@ -88,7 +88,7 @@ class LawTerms:
 def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
     """Build the smallest table that meets ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
-        raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
+        raise TableError(f"the tolerance must be between 0 and 1, not {tolerance!r}")
     law, splits = LawTerms.of(material), 1
     while True:
         last = material.is_linear or splits == SPLITS_MAX

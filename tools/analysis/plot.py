@@ -132,10 +132,10 @@ class RecordedRun:
     def contacts(self) -> dict[str, ContactTable]:
         """Return the contact table of each finger that touched; raise Missing if none did."""
         if not self.t.size:
-            raise Missing("contains no hand/state")
+            raise Missing("the recording does not contain hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
         if not touched:
-            raise Missing("contains no contact")
+            raise Missing("the recording does not contain a contact")
         if self.models is None:
             raise Missing(self.why_no_model)
         return {name: self.models[FINGERS.index(name)].table for name in touched}
@@ -160,7 +160,7 @@ def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None
     except RecordingError as error:
         return None, str(error).removeprefix(f"{recording.path}: ")
     except (SettingsError, TactileError, ValueError) as error:
-        return None, f"can't build its model: {error}"
+        return None, f"can't build the contact model of its settings: {error}"
 
 
 def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
@@ -198,7 +198,7 @@ def draw_angle(run: RecordedRun) -> Figure:
     reach = max(1.6 * float(np.quantile(np.abs(np.concatenate(gains) - 1.0), 0.98)), 0.01)
     gain.set_ylim(1.0 - reach, 1.0 + reach)
     gain.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.1)
-    _titled(figure, run, "force and energy against θ")
+    _titled(figure, run, "force and energy versus θ")
     return figure
 
 
