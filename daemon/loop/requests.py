@@ -220,7 +220,7 @@ class Requests:
         return reply
 
     def watch_silence(self) -> None:
-        """""Apply ``commands.on_silence`` when the lease of the client in control expires.""" ""
+        """Apply ``commands.on_silence`` when the lease of the client in control expires."""
         action = self._settings.commands.on_silence
         if action == "hold" or not (silent := self._lease.lapses(self._state.t)):
             return

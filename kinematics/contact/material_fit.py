@@ -70,7 +70,7 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
             f"strain {x[0]:.6g}"
         )
     if not wrong and x[-1] > 2.0:
-        wrong.append(f"strain reaches {x[-1]:.6g}; it is a ratio, not per cent")
+        wrong.append(f"strain reaches {x[-1]:.6g}; strain must be a ratio, not a percentage")
     if wrong:
         raise MaterialError("the stress-strain points can't be used: " + "; ".join(wrong))
     used = (x > 1e-9) & (x <= 1.0)

@@ -99,7 +99,7 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
             break
         splits *= 2
     raise TableError(
-        f"no contact table of this material reaches {tolerance:.3g}; the best reached "
+        f"no contact table of this material meets {tolerance:.3g}; the lowest error is "
         f"{table.max_error:.4g}"
     )
 

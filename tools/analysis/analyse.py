@@ -46,8 +46,8 @@ or a Tekscan-style ASCII export. A recording contains its settings. For the othe
 profile with --config, or set the missing values, for example
   --set tip.radius=0.02 --set tactile.pitch=0.0013 --set tactile.pascal_per_count=4
   --set tactile.noise=500 --set material.law=constant --set material.modulus=3e5
-The results are written to FILE.contacts.csv in the same folder, which PlotJuggler can draw. Several
-files are analysed in parallel, one on each processor."""
+The results are written to FILE.contacts.csv in the same folder, which PlotJuggler can plot. Several
+files are analysed in parallel, one per processor."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 pages:
-  angle      force and energy against θ, with the model's curves
-  landscape  the path over U(d, θ), with its local minimum
+  angle      force and energy versus θ, with the model's curves
+  landscape  the path on the energy landscape U(d, θ), with its local minimum
 
-Needs the extra 'plot'. To draw any field over time, open the file in Foxglove or PlotJuggler."""
+Requires the extra 'plot'. To plot a field over time, open the file in Foxglove or PlotJuggler."""
 
 
 FloatArray = NDArray[np.float64]
@@ -262,7 +262,7 @@ def draw_landscape(run: RecordedRun) -> Figure:
         above.plot(run.t, over, label=name, **LINES[name])
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
     above.axhline(0.0, color=style.GREY, linewidth=0.6)
-    above.set_ylabel("U less that at θ = 0\nand the same d [mJ]")
+    above.set_ylabel("U minus its value at θ = 0\nand the same d [mJ]")
     above.set_xlabel("time [s]")
     _titled(figure, run, "path on the energy landscape")
     return figure

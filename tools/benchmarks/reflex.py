@@ -98,7 +98,7 @@ def _table(
         rows.append(told | {"trials": trials, "no grip": trials - len(found)})
     said = [each["reported ms"] for each in rows if each["held %"] < 100.0]
     slowest = max(said, default=0.0)
-    note = f"  loss reported within {slowest:.0f} ms, aim ≤ {_REPORT_AIM:g}"
+    note = f"  loss reported within {slowest:.0f} ms, target ≤ {_REPORT_AIM:g}"
     return Report(f"{name}, answer", rows, notes=(note,) if said else ())
 
 

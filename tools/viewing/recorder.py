@@ -32,7 +32,7 @@ class PageRecorder:
         try:
             from softfinger.tools.processes.child_processes import RecorderError, RecorderProcess
         except ImportError:  # The system has no termios.
-            return "✗ record: only on Linux and macOS; use softfinger record"
+            return "✗ record: available only on Linux and macOS; use softfinger record instead"
         with self._lock:
             if self._process is not None:
                 return f"✓ {self._end()}"

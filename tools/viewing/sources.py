@@ -64,7 +64,7 @@ def follow(
             if silent != (began - last > _SILENCE_TIME):
                 silent = not silent
                 where = waiting(arguments.address, arguments.keys)
-                say(where if silent else "the stream has begun")
+                say(where if silent else "the stream has started")
             pictures.draw()
             # Use at most half of the CPU time, even on a slow machine.
             worked = time.thread_time() - worked
