@@ -168,11 +168,8 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
     lines = [Finding("FAIL", "servos", str(each), ONE_SERVO_ONLY) for each in found.garbled]
     for change in what.changes:
         same = change.servo.id == change.id
-        other = f"servos.baud = {change.servo.baud}" if same else "servos.ids to the IDs found"
-        fix = (
-            f"run `softfinger doctor --fix` to use it as the {change.name}: {change}; or set "
-            f"{other}"
-        )
+        other = f"servos.baud = {change.servo.baud}" if same else "servos.ids"
+        fix = f"run `softfinger doctor --fix` to use it as {change.name}: {change}; or set {other}"
         lines.append(Finding("note", "found", str(change.servo), fix))
     for each in what.strangers:
         fix = ONE_SERVO_ONLY if what.missing and each.number == model.number else ""

@@ -105,7 +105,7 @@ def _strong_grip(settings: Settings) -> Iterator[str]:
     if force > stall:
         yield (
             f"safety.force_max: found {settings.safety.force_max:g} N, which allows grips of "
-            f"{force:.3g} N, expected at most the {stall:.2g} N (stall force of {servos.model} on "
+            f"{force:.3g} N, expected at most {stall:.2g} N (stall force of {servos.model} on "
             "this finger); lower safety.force_max and safety.current_max"
         )
     bound = settings.control.torque_constant * settings.safety.current_max / lever

@@ -429,7 +429,7 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
             Hand()
 
 
-UNKNOWN = "found the unknown host 'no..host' (not a host name), expected a name that"
+UNKNOWN = "found unknown host 'no..host' (not a host name), expected an IP address or a"
 
 
 @pytest.mark.parametrize("cls", [Hand, AsyncHand])
@@ -490,7 +490,9 @@ def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     ):
         error = in_a_thread(use)
         assert isinstance(error, WrongThread), use
-        assert "thread other_0: found a Hand whose stream thread MainThread uses" in str(error)
+        assert "thread other_0: found a Hand whose stream is used by thread MainThread" in str(
+            error
+        )
     assert next(states).mode == hand.state().mode == "holding"
 
 

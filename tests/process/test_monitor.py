@@ -157,7 +157,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         fake.changes = {"mode": "armed", "goal_force": math.nan, "goal_angle": math.nan}
         page.shows("ARMED", "+- N")
         page.type(b"+")
-        page.shows("settings are not known yet")
+        page.shows("settings have not arrived yet")
         assert "grip:" not in page.text()
         fake.send(b"hand/settings", msgpack.packb({"settings": json.dumps(SETTINGS)}))
         page.shows("+- 10 N")
@@ -218,7 +218,7 @@ def test_the_page_shows_another_commander_of_a_real_daemon(start, profile, addre
 def test_commands_without_a_daemon():
     where = ["--address", NOBODY]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
-        page.shows("waiting for a daemon", "no stream yet", "—")
+        page.shows("waiting for a daemon", "no stream has arrived yet", "—")
         page.type(b"a" * 12 + b" ")
         page.shows("stop: no answer")
         page.type(b"\x1b[C")

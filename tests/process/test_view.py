@@ -227,7 +227,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
-    assert "the stream has schema 2, this page knows 1" in picture["notes"]
+    assert "the stream has schema 2, this page supports 1" in picture["notes"]
     assert "0 messages could not be read" in said
 
 
@@ -337,7 +337,9 @@ def test_only_the_token_gives_access_to_commands(served):
         assert status == 200
         assert "STOP" not in body
         assert "Watching" in body
-        assert ask(viewed.host, query, stop) == "✗ needs the token that the terminal prints"
+        assert (
+            ask(viewed.host, query, stop) == "✗ commands require the token printed in the terminal"
+        )
     with pytest.raises(InvalidStatus, match="403"):
         ask(viewed.host, token, stop, origin="http://evil.example")
     assert not fake.requests
@@ -513,7 +515,7 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
             waiting = f"waiting for a stream from {fake.state_address}"
             assert any(waiting in line for line in viewed.process.stderr)
             fake.silent.clear()
-            assert any("the stream has begun" in line for line in viewed.process.stderr)
+            assert any("the stream has started" in line for line in viewed.process.stderr)
             until(lambda: (page.next()["age"] or 1.0) < 0.1)
             fake.silent.set()
             until(lambda: page.next()["age"] > 1.0)

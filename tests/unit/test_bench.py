@@ -161,13 +161,13 @@ def test_an_object_that_is_not_held_is_counted_separately():
 
 def test_a_failed_part_does_not_affect_the_others(monkeypatch, capsys):
     def let_go(title: str, **_: object) -> Report:
-        raise RigError("the hand did not grip the object: grasping")
+        raise RigError("the hand failed to grip the object: grasping")
 
     monkeypatch.setattr(tick, "_in_turns", let_go)
     monkeypatch.setattr(tick, "in_the_loop", lambda title, **_: Report(title, [{"name": "x"}]))
     assert cli.main(["bench", "tick", "--brief"]) == 1
     printed = capsys.readouterr()
-    assert "bench: tick: tick: the hand did not grip the object: grasping\n" in printed.err
+    assert "bench: tick: tick: the hand failed to grip the object: grasping\n" in printed.err
     assert "the simulated hand" in printed.out
     assert printed.out.count("hardware in the loop") == 2
 

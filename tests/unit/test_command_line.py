@@ -24,7 +24,7 @@ def test_without_arguments_the_first_steps_are_shown_and_help_lists_all_subcomma
         ("recrod", "nearest: record"),
         ("versoin", "nearest: --version"),
         ("--verison", "nearest: --version"),
-        ("7", "`softfinger help` lists them"),
+        ("7", "run `softfinger help` to list them"),
     ):
         wrong = inline(word, "run.mcap")
         assert wrong.returncode == 2

@@ -176,7 +176,7 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
 @pytest.mark.parametrize(
     ("profile", "due", "hand", "why"),
     [
-        (None, ARM, (), "found a ramp of 0.0 mm by the joints"),
+        (None, ARM, (), "found a d ramp of 0.0 mm computed from the joints"),
         (None, FORCES, ("simulation.object_angle=0.3",), "neither slides nor tilts"),
         (VELOSTAT, GRASP, (), "found a standard deviation of 1"),
     ],

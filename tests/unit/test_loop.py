@@ -235,9 +235,11 @@ def test_a_tare_reports_the_change_of_the_zero(make):
 
     pascal = daemon.settings.tactile.pascal_per_count
     found = tared(0, 0)
-    assert found.startswith(f"left sensor's zero moved by +100.0 counts ({100 * pascal:+.0f} Pa)")
+    assert found.startswith(
+        f"left sensor's zero offsets changed by +100.0 counts ({100 * pascal:+.0f} Pa)"
+    )
     assert tared(30, 50) == (
-        f"left sensor's zero moved by +30.0 counts ({30 * pascal:+.0f} Pa), "
+        f"left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa), "
         "one cell by +80.0 counts"
     )
     # The change is that from the last zero, not from the first.

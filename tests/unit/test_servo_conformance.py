@@ -247,12 +247,14 @@ def test_position_limits_that_exclude_the_joint_range_are_reported(monkeypatch):
     rig = DynamixelRig(monkeypatch, servos={"mode": "position"})
     table = rig.bus.servos[1].table
     table.set(reg.MAX_POSITION_LIMIT, 2100)
-    with pytest.raises(ServoError, match=r"servo 2 .*max position limit is 2100, the joint needs"):
+    with pytest.raises(
+        ServoError, match=r"servo 2 .*max position limit is 2100, the joint requires"
+    ):
         rig.servos.connect()
     table.set(reg.MAX_POSITION_LIMIT, 4095)
     rig.servos.connect()
     notices = [each.text for each in rig.servos.notices]
-    assert notices.count("position mode does not limit its current") == 2
+    assert notices.count('servos.mode = "position" does not limit the current of the servo') == 2
     rig.close()
 
 
