@@ -96,7 +96,7 @@ def restore_registers(settings: Settings, path: Path) -> list[Finding]:
                 )
                 continue
             number = line.ping(servo_id)
-            model = "no answer" if number is None else reg.name_of(number)
+            model = "no reply" if number is None else reg.name_of(number)
             if model != kept.model:
                 text = f"not restored: {path} was saved from an {kept.model}, found {model}"
                 result.append(Finding("warn", name, text))

@@ -170,7 +170,7 @@ def other_model(number: int, model: ServoModel) -> tuple[str, str]:
         return f"is an {reg.name_of(number)}, expected an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
     return (
-        f"has unknown model number {number}, expected {model.number} ({model.name}",
+        f"has unknown model number {number}, expected {model.number} ({model.name})",
         f"use one of the known models: {known}",
     )
 
