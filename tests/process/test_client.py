@@ -114,7 +114,7 @@ def test_a_wait_times_out_with_the_last_state(hand):
 def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
     stream, commands = addresses
     timeout = SILENCE_TIME + 0.05
-    unanswered = rf"no answer to arm from {commands} within 1\.05 s"
+    unanswered = rf"no reply to arm from {commands} within 1\.05 s"
 
     async def ask() -> None:
         async with AsyncHand(*addresses, timeout=timeout) as hand:
@@ -131,7 +131,7 @@ def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
     asyncio.run(ask())
     said = [
         f"no hand/state from {stream} yet, waiting up to 1.05 s",
-        f"no answer to arm from {commands} yet, waiting up to 1.05 s",
+        f"no reply to arm from {commands} yet, waiting up to 1.05 s",
     ]
     assert caplog.messages == said + said
 
@@ -181,7 +181,7 @@ def test_a_value_that_is_not_a_number_is_refused_by_parameter_name(fake, hand, g
 
 LATE = {
     "ok": False,
-    "error": "arm: the command was 0.40 s old when it was handled",
+    "error": "arm: the command was 0.40 s old when it was processed",
     "reason": "late",
 }
 MODE = {
@@ -219,7 +219,7 @@ def test_a_late_command_is_repeated_with_its_key_and_a_refused_one_is_not(fake, 
     # No time remains for a second attempt.
     monkeypatch.setattr(command_client, "RETRY_DELAY", 100.0)
     fake.replies["arm"] = LATE
-    with pytest.raises(Refused, match="old when it was handled") as caught:
+    with pytest.raises(Refused, match="old when it was processed") as caught:
         arm(fake, 60.0)
     assert caught.value.reason == "late"
     assert len(fake.requests) == 5

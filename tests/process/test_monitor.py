@@ -185,7 +185,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
 def test_a_late_command_is_repeated_with_its_key(fake):
     late = {
         "ok": False,
-        "error": "arm: the command was 0.40 s old when it was handled",
+        "error": "arm: the command was 0.40 s old when it was processed",
         "reason": "late",
     }
     fake.replies["arm"] = [late, late, {"ok": True}]
@@ -220,7 +220,7 @@ def test_commands_without_a_daemon():
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         page.shows("waiting for a daemon", "no stream has arrived yet", "—")
         page.type(b"a" * 12 + b" ")
-        page.shows("stop: no answer")
+        page.shows("stop: no reply")
         page.type(b"\x1b[C")
         page.shows("rotate: the object's angle is unknown")
         page.type(b"q")

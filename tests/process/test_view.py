@@ -139,7 +139,7 @@ def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
         with connect(address, proxy=None, open_timeout=WAIT) as line:
             line.send(orjson.dumps({"command": "arm", "seen": time.monotonic()}).decode())
             # The viewer waits.
-            assert any("no answer to arm" in line for line in viewed.process.stderr)
+            assert any("no reply to arm" in line for line in viewed.process.stderr)
             viewed.process.send_signal(signal.SIGINT)
             assert viewed.process.wait(WAIT) == 1  # nothing was displayed
 
@@ -375,7 +375,7 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
         for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):
             assert ask(viewed.host, token, odd).startswith("✗ invalid command")
         fake.close()
-        assert "✗ grasp: no answer" in press()
+        assert "✗ grasp: no reply" in press()
         assert len(fake.requests) == 2
 
 

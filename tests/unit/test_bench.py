@@ -104,8 +104,8 @@ def test_a_missed_aim_is_not_a_success(monkeypatch, capsys):
     [
         (["tik"], "found 'tik', expected one of estimator"),
         (["faults", "--only", "no such fault"], "no case of faults contains this text"),
-        (["tick", "--full"], "--full: only for reflex"),
-        (["--trials", "3"], "--trials: only for faults or robustness"),
+        (["tick", "--full"], "--full: valid only for reflex"),
+        (["--trials", "3"], "--trials: valid only for faults or robustness"),
     ],
 )
 def test_invalid_options_are_refused_before_measuring(words, text, capsys):

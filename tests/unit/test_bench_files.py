@@ -283,7 +283,9 @@ def test_an_unknown_unit_is_reported(press, tmp_path, unit):
 
 def test_other_files_are_refused_with_the_supported_types(tmp_path):
     (tmp_path / "a.csv").write_text("t,force\n0,1\n")
-    with pytest.raises(RecordingError, match=r"expected a Tekscan-style export, \.npz or \.npy"):
+    with pytest.raises(
+        RecordingError, match=r"expected a Tekscan-style export, or an \.npz or \.npy"
+    ):
         load_recording(tmp_path / "a.csv", SCALE, 100.0)
 
 
@@ -351,7 +353,7 @@ def test_times_as_texts_are_reported(press, tmp_path):
 
 def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_path):
     np.savez(tmp_path / "a.npz", frames=press, t=np.array([0, 1, 2, 3, 3, 4, 5, 6]) * 0.01)
-    with pytest.raises(RecordingError, match=r"must increase; t\[3\] is 0\.03, t\[4\] is 0\.03"):
+    with pytest.raises(RecordingError, match=r"t\[3\] = 0\.03, t\[4\] = 0\.03"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
 
 
@@ -363,8 +365,8 @@ def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_
     [
         (1.0 / 4e4, np.float32, "floats between 0 and 1 are probably fractions"),
         (1e-3, np.float64, "convert kPa"),
-        (1.0 / 200.0, np.uint8, "counts of 8 bits"),
-        (1.0 / 200.0, np.uint16, "counts of 8 bits"),
+        (1.0 / 200.0, np.uint8, "the counts have 8 bits"),
+        (1.0 / 200.0, np.uint16, "the counts have 8 bits"),
         (1.0 / 40.0, np.uint16, "tactile.pascal_per_count is wrong for this sensor"),
         (0.0, np.uint16, "sensor's cable"),
     ],
@@ -435,9 +437,7 @@ def test_a_pitch_that_contradicts_the_header_is_reported(press, tmp_path, inline
     path = tmp_path / "a.asf"
     path.write_bytes(export(press))
     tactile = {"rows": 44, "cols": 44, "recording": (str(path), ""), "pitch": 0.00127}
-    wanted = (
-        r"cells of 1\.318 × 1\.318 mm, tactile\.pitch gives 1\.27 × 1\.27 mm: set tactile\.pitch"
-    )
+    wanted = r"cells of 1\.318 × 1\.318 mm in its header, expected 1\.27 × 1\.27 mm as in tactile\.pitch: set tactile\.pitch"
     with pytest.raises(TactileError, match=wanted):
         ReplayTactile(TactileSettings.model_validate(tactile), VirtualClock(), 0)
     done = inline("analyse", path, "--config", "paper", "--set", "tactile.pitch=0.00127")

@@ -159,7 +159,7 @@ def test_clipped_noise_far_from_the_contact_is_removed():
         (lambda: equilibrate([np.zeros((2, 4, 4))], np.zeros((4, 4))), "read no pressure"),
         (lambda: fit_curve("cubic", np.ones((2, 4, 4)), [1, 2], 1e-6, 10), "at least 3"),
         (lambda: fit_curve("power", np.ones((2, 4, 4)), [1, -2], 1e-6, 10), "above 0"),
-        (lambda: fit_curve("power", np.zeros((2, 4, 4)), [1, 2], 1e-6, 10), "reads nothing"),
+        (lambda: fit_curve("power", np.zeros((2, 4, 4)), [1, 2], 1e-6, 10), "gives no reading"),
         (lambda: fit_curve("cubic", np.ones((3, 4, 4)), [1, 2, 3], 1e-6, 10), "too similar"),
         (lambda: fit_centre(np.zeros((1, 32, 32)), [0], TIP, LINEAR, GRID, 600), "press 1"),
         (lambda: fit_modulus([0.001, 0.002], [0, 0], [1, 2], TIP), "at least three"),

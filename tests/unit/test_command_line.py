@@ -61,7 +61,7 @@ def test_invalid_numbers_are_not_sent(inline, words, said):
     done = inline("send", *words.split(), "--timeout", "0.1")
     assert done.returncode == 2
     assert said in done.stderr
-    assert "no answer" not in done.stderr
+    assert "no reply" not in done.stderr
 
 
 @pytest.mark.parametrize(

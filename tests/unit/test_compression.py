@@ -188,10 +188,10 @@ def shuffled(d, force):
     ("change", "told"),
     [
         (shuffled, "reversals of d in 210 rows"),
-        (lambda d, force: (d[140:], force[140:]), "only falling d"),
-        (lambda d, force: (0 * d, force), "one displacement"),
-        (lambda d, force: (d, 0.003 * force + 0.2), "not loaded"),
-        (lambda d, force: (d, -force), "compression counts as positive"),
+        (lambda d, force: (d[140:], force[140:]), "only decreasing d"),
+        (lambda d, force: (0 * d, force), "the same displacement"),
+        (lambda d, force: (d, 0.003 * force + 0.2), "tip was loaded"),
+        (lambda d, force: (d, -force), "expected positive d and F"),
         (lambda d, force: (d[:140:20], force[:140:20]), "expected at least 6"),
     ],
 )

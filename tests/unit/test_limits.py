@@ -268,7 +268,7 @@ def test_each_faulty_channel_is_named():
         "left sensor reports a jump of 11° in the object's angle"
     )
     assert told["consistency.right_sensor"].startswith("right sensor reads 50% of the pressure")
-    assert "current is 0.10 A, its goal 0.20 A" in told["consistency.right_current"]
+    assert "current is 0.10 A, but its goal is 0.20 A" in told["consistency.right_current"]
 
 
 def test_a_force_that_does_not_increase_as_commanded_is_a_fault():

@@ -239,4 +239,4 @@ def test_failed_and_successful_configurations_are_both_reported(wired):
     missing = f"{RIGHT}: no reply at any baud rate: check its power supply and cable"
     assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])
     _, problems = bus.provision(model="XL330-M288")
-    assert f"{LEFT}: is an XM430-W350, not an XL330-M288: set servos.model" in problems
+    assert f"{LEFT}: is an XM430-W350, expected an XL330-M288: set servos.model" in problems

@@ -99,7 +99,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
         ({"frames": -FRAMES.astype(float)}, "outside 0 to 65535"),
         ({"frames": FRAMES * np.nan}, "outside 0 to 65535"),
         ({"frames": FRAMES * 1e305}, "outside 0 to 65535"),
-        ({"frames": FRAMES, "t": np.zeros(5)}, "must increase"),
+        ({"frames": FRAMES, "t": np.zeros(5)}, "expected increasing times"),
         ({"frames": FRAMES, "t": np.arange(4)}, "5 numbers"),
         ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: not finite"),
         ({"frames": FRAMES, "live": np.ones(3)}, "live: found shape"),

@@ -168,4 +168,4 @@ def test_a_demo_ended_by_a_command_restarts(make):
     assert daemon.loop.state.mode == "disarmed"
     command(daemon, "demo")
     advance_to(daemon, "rotating", 8.0)
-    assert "defines no task" in refusal(make(), "demo")
+    assert "does not define a task" in refusal(make(), "demo")
