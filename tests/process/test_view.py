@@ -520,7 +520,7 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
             fake.silent.set()
             until(lambda: page.next()["age"] > 1.0)
             viewed.process.send_signal(signal.SIGINT)
-            assert "states seen" in viewed.process.stderr.read()
+            assert "states received" in viewed.process.stderr.read()
             assert viewed.process.wait(300) == 0
 
 

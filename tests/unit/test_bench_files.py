@@ -306,7 +306,7 @@ def test_times_in_other_units_are_converted_and_reported_once(
     read = load_recording(tmp_path / "a.npz", SCALE, rate)
     assert read.t == pytest.approx(STEPS * 1e-3, abs=1e-6)
     (note,) = read.notes
-    assert note.startswith(f"t: read as {name}, which gives 0.01 s between frames")
+    assert note.startswith(f"t: interpreted as {name}, which gives 0.01 s between frames")
 
 
 @pytest.mark.parametrize("key", ["t", "time", "timestamps"])
@@ -437,7 +437,10 @@ def test_a_pitch_that_contradicts_the_header_is_reported(press, tmp_path, inline
     path = tmp_path / "a.asf"
     path.write_bytes(export(press))
     tactile = {"rows": 44, "cols": 44, "recording": (str(path), ""), "pitch": 0.00127}
-    wanted = r"cells of 1\.318 × 1\.318 mm in its header, expected 1\.27 × 1\.27 mm as in tactile\.pitch: set tactile\.pitch"
+    wanted = (
+        r"cells of 1\.318 × 1\.318 mm in its header, expected 1\.27 × 1\.27 mm as in "
+        r"tactile\.pitch: set tactile\.pitch"
+    )
     with pytest.raises(TactileError, match=wanted):
         ReplayTactile(TactileSettings.model_validate(tactile), VirtualClock(), 0)
     done = inline("analyse", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
@@ -471,7 +474,7 @@ def test_generators_differ():
     ("changes", "told"),
     [
         ({}, ""),
-        ({"tip.radius": 0.010}, "sensor of 58 × 58 mm for a tip of 20 mm diameter"),
+        ({"tip.radius": 0.010}, "sensor area of 58 × 58 mm for a tip of 20 mm diameter"),
         (
             {"tactile.rows": 26},
             r"smaller than the tip's footprint at safety\.d_max = 12 mm, 36\.7 mm wide",
@@ -481,7 +484,7 @@ def test_generators_differ():
             r"smaller than the tip's footprint at control\.force_default = 24 N, 30\.9 mm wide",
         ),
         ({"tactile.centre": (0.02, 0.0)}, "smaller than the tip's footprint"),
-        ({"tactile.pitch_y": 0.0006}, "sensor of 58 × 26.4 mm, smaller than"),
+        ({"tactile.pitch_y": 0.0006}, "sensor area of 58 × 26.4 mm, smaller than"),
     ],
 )
 def test_a_sensor_size_that_does_not_fit_the_tip_is_reported(changes, told):

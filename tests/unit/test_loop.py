@@ -240,7 +240,7 @@ def test_a_tare_reports_the_change_of_the_zero(make):
     )
     assert tared(30, 50) == (
         f"left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa), "
-        "one cell by +80.0 counts"
+        "in one cell by +80.0 counts"
     )
     # The change is that from the last zero, not from the first.
     assert tared(-10, -60).endswith("one cell by -150.0 counts")

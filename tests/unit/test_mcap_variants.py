@@ -176,7 +176,7 @@ def test_view_and_replay_tolerate_malformed_messages(tmp_path, inline):
         ("/hand/state", "json", state),
     )
     done = inline("view", path, "--no-browser", "--duration", "0.5", "--port", "0")
-    assert (done.returncode, "1 states seen" in done.stderr) == (0, True)
+    assert (done.returncode, "1 states received" in done.stderr) == (0, True)
     assert "Traceback" not in done.stderr
     address = f"ipc://{tmp_path}/stream"
     done = inline("replay", path, "--no-wait", "--address", address)

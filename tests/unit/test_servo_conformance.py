@@ -225,7 +225,7 @@ def test_a_finger_outside_the_scene_stays_zero(make, mode):
 def test_a_model_without_current_sensing_only_supports_position_mode(make, mode):
     rig = make(mode, servos={"model": "XL430-W250"})
     if mode != "position":
-        with pytest.raises(ServoError, match=f"XL430-W250 has no {mode} mode"):
+        with pytest.raises(ServoError, match=f"XL430-W250 does not support {mode} mode"):
             rig.servos.connect()
         return
     armed(rig)
