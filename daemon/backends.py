@@ -119,7 +119,9 @@ def _plugin(kind: Kind, name: str) -> Backend:
     if not entries:
         raise KeyError(name)
     if len(entries) > 1:
-        raise PluginError(f"{' and '.join(map(source, entries))} have the same name: uninstall one")
+        raise PluginError(
+            f"{' and '.join(map(source, entries))} have the same name: uninstall one of them"
+        )
     (entry,) = entries
     try:
         made = entry.load()

@@ -107,19 +107,28 @@ class Reason(StrEnum):
 
 
 _MEANINGS = {
-    Reason.LATE: "The command was too old when it was handled, or a servo's reply was late. It "
-    "has no effect. Send it again if you still want it.",
-    Reason.STOPPED: "The command was received before the last `stop`, or too soon after it. Do "
-    "not repeat it automatically.",
+    Reason.LATE: (
+        "The command was too old when it was processed, or a servo's reply was late. The "
+        "command had no effect. Send it again if it is still needed."
+    ),
+    Reason.STOPPED: (
+        "The command was received before the last `stop`, or too soon after it. Programs must "
+        "not repeat it automatically."
+    ),
     Reason.SUPERSEDED: "A newer `hold` of the same connection replaced this one, or another "
     "command was carried out before this one was repeated.",
-    Reason.BUSY: "Too many commands are waiting, or this client sends too many. Send fewer.",
+    Reason.BUSY: (
+        "Too many commands are waiting, or this client exceeds the command rate. Send fewer "
+        "commands."
+    ),
     Reason.LEASE: "Another client has the lease (`commands.lease`).",
-    Reason.MODE: "The hand does not accept this command in its present mode.",
-    Reason.BOUNDS: "A number is outside the range that the hand accepts.",
-    Reason.SCENE: "The profile lacks something that the command needs: a sensor, servos, a task.",
-    Reason.STATE: "The present state prevents the command: a limit is exceeded, a tip is in "
-    "contact, a tare is in progress, or the servos do not answer.",
+    Reason.MODE: "The hand does not accept this command in its current mode.",
+    Reason.BOUNDS: "A number is out of range.",
+    Reason.SCENE: "The profile lacks a sensor, servos or a task that the command requires.",
+    Reason.STATE: (
+        "The current state prevents the command: a limit is exceeded, a tip is in contact, a "
+        "tare is in progress, or the servos do not reply."
+    ),
     Reason.REQUEST: "The request is malformed: unknown command, or a missing or unknown parameter.",
 }
 

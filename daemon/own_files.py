@@ -33,7 +33,7 @@ def open_regular(path: Path) -> BinaryIO:
     """
     mode = path.stat().st_mode  # Check before opening, because opening can affect a device.
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise OSError(errno.EINVAL, "a device or a pipe, expected a file", str(path))
+        raise OSError(errno.EINVAL, "found a device or a pipe, expected a regular file", str(path))
     no_wait = getattr(os, "O_NONBLOCK", 0)
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | no_wait))
 
@@ -43,7 +43,7 @@ def read_file(path: Path, most: int = SIZE_MAX) -> bytes:
     with open_regular(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
-        raise OSError(errno.EFBIG, f"more than {most >> 10} kB", str(path))
+        raise OSError(errno.EFBIG, f"larger than {most >> 10} kB", str(path))
     return data
 
 
@@ -140,5 +140,5 @@ def _refuse_foreign(path: str, found: os.stat_result) -> None:
     strange = HAS_OWNERS and found.st_uid not in (os.geteuid(), 0)
     link = stat.S_ISLNK(found.st_mode)
     if strange and (link or Path(path).parent.stat().st_mode & _WORLD_WRITABLE):
-        what = "a link" if link else "a file in a folder that all users may write to"
-        raise PermissionError(errno.EPERM, f"{what} that belongs to another user", path)
+        what = "a link" if link else "a file in a world-writable folder"
+        raise PermissionError(errno.EPERM, f"{what} owned by another user", path)

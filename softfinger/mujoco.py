@@ -252,7 +252,7 @@ class SoftTips:
             raise SettingsError("integrator: found RK4, expected Euler, implicit or implicitfast")
         simulation = settings.simulation
         if found := [name for name in _UNSUPPORTED if np.any(getattr(simulation, name))]:
-            raise SettingsError(f"{found[0]}: not in MuJoCo")
+            raise SettingsError(f"{found[0]}: not supported with MuJoCo")
         self._tips = [model.geom(name).id for name in tips]
         self._touching = [model.geom(name).id for name in touching]
         for name, geom in zip(tips, self._tips, strict=True):

@@ -155,7 +155,7 @@ class Sweep(Generic[Case, Result]):
                 else:
                     case = self._cases[self._left()[0]]
                     raise SweepError(
-                        f"{self._name}: all worker processes ended at {case}"
+                        f"{self._name}: all worker processes ended during {case}"
                     ) from None
 
     def _by(self, executor: Executor) -> Iterator[int]:
@@ -195,7 +195,7 @@ class Sweep(Generic[Case, Result]):
             lines = file.read().decode("utf-8", "replace").splitlines()
         if not lines or lines[0] != json.dumps(self._digest):
             raise SweepError(
-                f"{self._journal}: belongs to another sweep; remove it or choose another file"
+                f"{self._journal}: belongs to another sweep; remove the file or choose another one"
             )
         for line in lines[1:]:
             try:
@@ -228,7 +228,7 @@ def _cluster(address: str) -> Iterator[Executor]:
     try:
         client = connect(address, timeout=_CONNECT_TIMEOUT)
     except (OSError, ValueError) as error:
-        raise SweepError(f"--scheduler {address}: no Dask scheduler answers: {error}") from None
+        raise SweepError(f"--scheduler {address}: no Dask scheduler responds: {error}") from None
     with client:
         yield client.get_executor()
 

@@ -105,7 +105,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
         stopped = stop_locally(address, min(remaining, LOCAL_STOP_TIMEOUT))
         if stopped is not None:
             return stopped
-    answer = f"answer to {request['command']} from {address}"
+    answer = f"reply to {request['command']} from {address}"
     context: zmq.Context[Any] = zmq.Context()
     socket = context.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
@@ -123,7 +123,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
             _log.warning(still_waiting(answer, timeout))
             answered = socket.poll(math.ceil((remaining - silence) * 1e3))
         if not answered:
-            hint = " (with access.keys, give --keys or keys=)" if keys is None else ""
+            hint = " (if access.keys is set, pass --keys or keys=)" if keys is None else ""
             raise NoAnswer(
                 f"no {answer} within {timeout:g} s; is softfinger running, or still starting?{hint}"
             )
@@ -158,7 +158,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
     A warning is logged if the servos have not confirmed that torque is off.
     """
     if reply.get("ok") is not True:
-        text = str(reply.get("error", "refused without a reason"))
+        text = str(reply.get("error", "refused; the reply contains no reason"))
         raise Refused(text, str(reply.get("reason", "")))
     if reply.get("torque_off") == "unconfirmed":
         _log.warning(UNCONFIRMED_TEXT)

@@ -46,7 +46,7 @@ def both_addresses(named: str, where: str) -> tuple[str, str]:
         return stream, commands
     if len(addresses) != 2 or not all("://" in address for address in addresses):
         raise SettingsError(
-            f"{where}: found {named!r}, expected tcp://HOST, or STREAM,COMMANDS as in "
+            f"{where}: found {named!r}, expected tcp://HOST or STREAM,COMMANDS, for example "
             f"{STREAM_ADDRESS},{COMMAND_ADDRESS}"
         )
     return addresses[0], addresses[1]
@@ -71,8 +71,8 @@ def require_host(address: str) -> None:
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or "not a host name"
         raise SettingsError(
-            f"{address}: found the unknown host {host!r} ({why}), expected a name that this "
-            "machine can resolve, or an IP address"
+            f"{address}: found unknown host {host!r} ({why}), expected an IP address or a host "
+            "name that this machine can resolve"
         ) from None
 
 
@@ -95,8 +95,8 @@ class OneThread:
             owner = self._owner
         if owner is not thread:
             raise WrongThread(
-                f"thread {thread.name}: found a Hand whose stream thread {owner.name} uses, "
-                "expected one thread for each Hand; make another Hand in this thread"
+                f"thread {thread.name}: found a Hand whose stream is used by thread {owner.name}, "
+                "expected each Hand to be used by one thread; create another Hand in this thread"
             )
 
 

@@ -61,7 +61,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
             servo_id = settings.servos.ids[finger]
             table = line.read(servo_id, 0, CHECKED)
             if table is None:
-                found.append(Finding("FAIL", servo_name(servo_id, finger), "not saved: no answer"))
+                found.append(Finding("FAIL", servo_name(servo_id, finger), "not saved: no reply"))
                 continue
             number = int.from_bytes(table[reg.MODEL_NUMBER : reg.MODEL_NUMBER + 2], "little")
             values = {each.name: each.value_in(table) for each in REGISTERS}
@@ -91,12 +91,14 @@ def restore_registers(settings: Settings, path: Path) -> list[Finding]:
             servo_id = settings.servos.ids[finger]
             name, kept = servo_name(servo_id, finger), stored.get(servo_id)
             if kept is None:
-                result.append(Finding("warn", name, f"not restored: {path} has no ID {servo_id}"))
+                result.append(
+                    Finding("warn", name, f"not restored: {path} does not contain ID {servo_id}")
+                )
                 continue
             number = line.ping(servo_id)
-            model = "no answer" if number is None else reg.name_of(number)
+            model = "no reply" if number is None else reg.name_of(number)
             if model != kept.model:
-                text = f"not restored: {path} is of an {kept.model}, found {model}"
+                text = f"not restored: {path} was saved from an {kept.model}, found {model}"
                 result.append(Finding("warn", name, text))
                 continue
             _restore(line, servo_id, name, kept.registers, result)

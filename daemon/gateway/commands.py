@@ -31,8 +31,8 @@ from softfinger.daemon.wire.loop_link import ASK, Ask
 
 _PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't be part of a string
 _MALFORMED_REFUSAL = refusal(
-    "envelope: expected the command in one frame, alone or after an envelope of at most "
-    f"{bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes that ends with an "
+    "envelope: expected one frame with the command, optionally after an envelope of at most "
+    f"{bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes ending with an "
     "empty frame",
     Reason.REQUEST,
 )

@@ -87,7 +87,7 @@ class Admission(ThreadAuthenticator):
             return
         self._look_at = now + bounds.KEY_CHECK_INTERVAL
         if not self.is_alive():
-            raise RestartNeeded("the authenticator has ended")
+            raise RestartNeeded("the thread that authenticates clients has ended")
         if self._folder is None or self._keys is None:
             return
         try:
@@ -99,7 +99,9 @@ class Admission(ThreadAuthenticator):
             raise RestartNeeded(str(error)) from None
         gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
         if gone or found.secret != self._keys.secret:
-            raise RestartNeeded(f"access.keys: removed clients: {', '.join(gone) or 'all'}")
+            raise RestartNeeded(
+                f"access.keys: disconnected clients without a key file: {', '.join(gone) or 'all'}"
+            )
         self._keys = found
 
 
@@ -129,7 +131,7 @@ def _taken(path: str) -> str:
     if not Path(path).exists():
         return ""
     if not Path(path).is_socket():
-        return "exists and is not a socket"
+        return "exists but is not a socket"
     with socket.socket(socket.AF_UNIX) as trial:
         trial.setblocking(False)
         try:

@@ -118,7 +118,7 @@ class Daemon:
                     text = f"{silent}; waited servos.open_timeout = {patience:g} s"
                     raise ServosSilent(text) from None
                 if on_event is not None and not was_reported:
-                    text = f"{silent}; waiting up to servos.open_timeout = {patience:g} s"
+                    text = f"{silent}; waiting for up to servos.open_timeout = {patience:g} s"
                     on_event("warning", "servos", text)
                     was_reported = True
             time.sleep(_RETRY_INTERVAL)

@@ -145,9 +145,9 @@ class Loop:
             self._control.stop()
             self.torque.end()
             if self.state.torque:
-                self.emit("error", "end", "ended, torque MAY STILL BE ON")
+                self.emit("error", "end", "ended; torque MAY STILL BE ON")
             else:
-                self.emit("info", "end", "ended, torque off")
+                self.emit("info", "end", "ended; torque is off")
 
     def advance(self, duration: float | None = None) -> None:
         """Run ticks for ``duration`` [s] of machine time or until `end`; leave torque unchanged.

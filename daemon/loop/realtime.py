@@ -195,7 +195,7 @@ class RealTime:
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.mlockall(flags) != 0:
             why = os.strerror(ctypes.get_errno())
-            text = f"memory lock refused ({why}): pages of the loop can be swapped out"
+            text = f"memory lock refused ({why}): the loop's memory can be swapped out"
             self._refused(text, GRANT_MEMORY_LOCK)
         else:
             self._granted("memory locked", libc.munlockall)

@@ -143,7 +143,7 @@ class Lateness:
 
     def _text(self, new: float) -> str:
         did = (
-            f"the simulated hand waited {new:.2f} s"
+            f"the simulated hand paused for {new:.2f} s"
             if self._waits
             else f"ticks were {new:.2f} s late"
         )

@@ -19,9 +19,7 @@ def make_tip(settings: Settings) -> Fingertip:
     """Create the fingertip model. Raises SettingsError for a measured tip, which has none."""
     tip = settings.tip
     if tip.physics == "measured":
-        raise SettingsError(
-            'tip.physics: found "measured", expected "springs" or "solid", which have a model'
-        )
+        raise SettingsError('tip.physics: found "measured", expected "springs" or "solid"')
     return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base, tip.face)
 
 
@@ -31,8 +29,8 @@ def law_problem(material: Material, limit: float) -> str:
     if found <= limit:
         return ""
     return (
-        f"the smooth law deviates from its points by up to {material.fit_error:.4g} Pa, "
-        f"{found:.1%} of F; expected at most {limit:.1%} (material.force_error_max)"
+        f"the smooth law deviates from the measured points by up to {material.fit_error:.4g} Pa, "
+        f"{found:.1%} of the force; expected at most {limit:.1%} (material.force_error_max)"
     )
 
 

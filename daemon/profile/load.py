@@ -163,7 +163,7 @@ def find(path: Path) -> Path:
     file = _PROFILES / f"{path.name}.toml"
     if not file.exists():
         raise SettingsError(
-            f"{path}: no such profile; expected a file or one of {', '.join(names())}"
+            f"{path}: profile not found; expected a file or one of {', '.join(names())}"
         )
     return file
 
@@ -199,12 +199,16 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raw = tomllib.loads(profile_text(path))
         return {key: _tuples(item) for key, item in raw.items()}
     except OSError as error:
-        hint = f"; `{path.stem}` alone selects the packaged profile" if path.stem in names() else ""
+        hint = (
+            f"; `{path.stem}` without path and suffix selects the packaged profile"
+            if path.stem in names()
+            else ""
+        )
         raise SettingsError(f"{name}: can't be read: {error.strerror}{hint}") from None
     except UnicodeDecodeError as error:
         raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
     except RecursionError:
-        raise SettingsError(f"{name}: nested too deeply") from None
+        raise SettingsError(f"{name}: tables or arrays are nested too deeply") from None
     except ValueError as error:  # TOMLDecodeError, or ValueError for a number with 5000 digits
         raise SettingsError(f"{name}: not TOML: {error}") from None
 
@@ -244,7 +248,7 @@ def _tuples(value: Any, depth: int = 0) -> Any:
     # Large integers are rejected here, because an integer with 5000 digits could not be printed
     # later.
     if isinstance(value, int) and value.bit_length() > 63:
-        raise ValueError("an integer beyond 64 bits")
+        raise ValueError("an integer of more than 64 bits")
     return value
 
 
@@ -262,10 +266,16 @@ def _plugin_problems(settings: Settings) -> Iterator[str]:
             above = ["plugins", each.name]
             yield from (_line(every, above, each.section) for every in error.errors())
         if each.name in tables and each.section is None:
-            yield f"plugins.{each.name}: found settings, but {each.source} has no settings"
+            yield (
+                f"plugins.{each.name}: found settings, but {each.source} does not accept "
+                "settings; remove them"
+            )
     for name in tables:
         if not any(name in known(kind) for kind in BUILT_IN):
-            yield f"plugins.{name}: found settings, but this plugin is not installed"
+            yield (
+                f"plugins.{name}: found settings, but no plugin of this name is installed; "
+                "install it or remove the settings"
+            )
 
 
 def _line(

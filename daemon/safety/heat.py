@@ -149,6 +149,9 @@ class HeatWatch:
         action = self._limits.heat_action
         if not self._error_reported:
             self._error_reported = True
-            text = f"{who}, and the load does not allow a weaker grip: {action}"
+            text = (
+                f"{who}, and the load does not allow a lower grip force; safety.heat_action = "
+                f"{action}"
+            )
             events.append(("error", "servos.heat", text))
         return action if left < _ACTION_TIME and action != "hold" else ""

@@ -167,7 +167,7 @@ class TorqueState:
         if self._reported:
             self._reported = False
             waited = state.t - self._first
-            self._emit("info", TORQUE_OFF, f"servos confirmed torque off after {waited:.2f} s")
+            self._emit("info", TORQUE_OFF, f"the servos confirmed torque off after {waited:.2f} s")
 
     def _is_silent(self) -> bool:
         """Return True if the bus must stay silent on this tick to trip the servo watchdogs."""
@@ -187,13 +187,16 @@ class TorqueState:
             return
         self._reported = True
         state = self._state
-        text = f"servos have not confirmed torque off for {state.t - self._first:.2f} s: "
+        text = f"the servos have not confirmed torque off for {state.t - self._first:.2f} s: "
         if not self._silence:
-            text += "cut their power; servos.watchdog = 0, so nothing else stops them"
+            text += (
+                "switch off their supply, because servos.watchdog = 0 disables the watchdogs "
+                "that would stop them"
+            )
         elif self._port_gone:
-            text += "the port is lost; their watchdogs stop them"
+            text += "the port is lost; the watchdogs will stop the servos"
         else:
-            text += "the bus is kept silent until their watchdogs stop them"
+            text += "the daemon keeps the bus silent until the watchdogs stop the servos"
         if state.fault:
             self._emit("error", TORQUE_OFF, text)
         else:

@@ -108,7 +108,7 @@ MODE_NUMBERS: Final = {name: number for number, name in MODE_NAMES.items()}
 OVERHEATING: Final = 2
 OVERLOAD: Final = 5
 HARDWARE_ERRORS: Final = {
-    0: "input voltage out of limits",
+    0: "input voltage outside its limits",
     OVERHEATING: "overheating",
     3: "motor encoder",
     4: "electrical shock",

@@ -159,9 +159,9 @@ class DynamixelServos:
         """
         if not any(each.replies or each.errors for each in found):
             raise ServosSilent(
-                f"{port.port_name}: no servo answers at {port.baudrate} baud (IDs "
-                f"{', '.join(str(each.id) for each in found)}): check power and wiring; "
-                "`softfinger doctor` tries every rate"
+                f"{port.port_name}: no servo replies at {port.baudrate} baud (IDs "
+                f"{', '.join(str(each.id) for each in found)}): check the power supply and the "
+                "wiring; `softfinger doctor` tries every baud rate"
             )
         slow = check_latency_timer(port.port_name, allowed)
         errors = [slow] if slow and slow.status == "FAIL" else []
@@ -170,8 +170,8 @@ class DynamixelServos:
             errors += each.errors
             notices += each.notices
             if not each.replies and not each.errors:
-                fix = "check its cable and ID; `softfinger doctor` tries every rate"
-                errors.append(Finding("FAIL", each.name, f"no answer at {port.baudrate} baud", fix))
+                fix = "check its cable and ID; `softfinger doctor` tries every baud rate"
+                errors.append(Finding("FAIL", each.name, f"no reply at {port.baudrate} baud", fix))
         if errors:
             silent = sum(not each.replies and not each.errors for each in found)
             kind = ServosSilent if len(errors) == silent else ServoError
@@ -184,7 +184,7 @@ class DynamixelServos:
                 each.table.long(reg.MAX_POSITION_LIMIT),
             )
             if each.misplaced is not None:
-                fix = f"{each.misplaced.fix}; arming is refused until then"
+                fix = f"{each.misplaced.fix}; until then, `arm` is refused"
                 notices.append(replace(each.misplaced, fix=fix))
         self.notices = tuple(notices)
 
@@ -368,9 +368,14 @@ class DynamixelServos:
                     break
                 self.torque_off(reading)
             if torque.may_be_on:
-                _log.error("servos have not confirmed torque off; their bus watchdog stops them")
+                _log.error(
+                    "the servos have not confirmed torque off; their bus watchdogs will stop them"
+                )
         except PortLost:
-            _log.error("servos: the port was lost with torque on; their bus watchdog stops them")
+            _log.error(
+                "servos: the port was lost while torque was on; the bus watchdogs will stop "
+                "the servos"
+            )
         except Exception as error:
             _log.error("servos: torque off not confirmed: %s", error)
         self._line = self._torque = self._reads = None

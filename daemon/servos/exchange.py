@@ -79,14 +79,14 @@ def choose_reads(
         reads = TickReads(port, handler, ids, FastGroupRead)
         if reads.answered():
             return reads, notices
-        text = "the firmware should answer fast sync reads but does not"
+        text = "the servos do not reply to fast sync reads, although their firmware supports them"
         notices.append(Finding("warn", "servos", text, "the slower sync read is used"))
     reads = TickReads(port, handler, ids, GroupRead)
     if not reads.answered():
         listed = ", ".join(map(str, ids))
         raise ServoError(
-            f"{port.port_name}: the servos (IDs {listed}) answer single reads, but not a sync "
-            "read of all: check the cables between the servos, and lower servos.baud"
+            f"{port.port_name}: the servos (IDs {listed}) reply to single reads, but not to a "
+            "sync read of all servos: check the cables between the servos, and lower servos.baud"
         )
     return reads, notices
 
@@ -146,21 +146,23 @@ def judge_exchanges(
     rate, allowed = settings.loop.rate, settings.servos.reply_timeout
     failed = f"{times.failed:.0%} failed"
     if times.failed == 1.0:
-        text = f"{what}: none was answered within {_TIMED_REPLY_TIMEOUT * 1e3:g} ms"
+        text = f"{what}: no reply within {_TIMED_REPLY_TIMEOUT * 1e3:g} ms"
         return Finding("FAIL", "exchange", text, "check the cable, and lower servos.baud")
     text = f"{what}: p50 {_ms(times.p50)}, p99 {_ms(times.p99)}, {failed}"
     if decisive > min(1.0 / rate, allowed):
         text += (
-            f"; a tick takes {_ms(1.0 / rate)} (loop.rate = {rate:g}), and a reply may take "
+            f"; expected at most one tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}) and at most "
             f"{_ms(allowed)} (servos.reply_timeout)"
         )
         return Finding("FAIL", "exchange", text, _remedy(decisive, settings))
     if times.failed > _FAILED_FRACTION_WARN:
         status: Status = "FAIL" if times.failed > _FAILED_FRACTION_FAIL else "warn"
-        fix = "check the cable and its plugs, and lower servos.baud"
+        fix = "check the cable and its connectors, and lower servos.baud"
         return Finding(status, "exchange", text, fix)
     if decisive * rate > _REPLY_FRACTION_MAX:
-        text += f"; a tick takes {_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
+        text += (
+            f", too much of a tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
+        )
         return Finding("warn", "exchange", text, _remedy(decisive, settings))
     return Finding("pass", "exchange", text)
 
@@ -175,7 +177,10 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
         f"the servos take at least {_ms(least)} to reply, {least * rate:.0%} of a tick of "
         f"{_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
     )
-    fix = f"{_remedy(least, settings)}; `softfinger doctor` times {EXCHANGE_COUNT} exchanges"
+    fix = (
+        f"{_remedy(least, settings)}; to measure the reply times, run `softfinger doctor`, "
+        f"which times {EXCHANGE_COUNT} exchanges"
+    )
     return [Finding("warn", "servos", text, fix)]
 
 
@@ -188,7 +193,7 @@ def _remedy(duration: float, settings: Settings) -> str:
         parts.append(f"servos.reply_timeout = {1.5 * duration:.2g}")
     if duration * settings.loop.rate > _REPLY_FRACTION_MAX:
         parts.append(f"loop.rate = {max(rate // digit * digit, 1.0):g}")
-    return f"set {' and '.join(parts)}; or use a faster adapter (latency timer 1 ms)"
+    return f"set {' and '.join(parts)}, or use a faster adapter (latency timer of 1 ms)"
 
 
 def _ms(seconds: float) -> str:

@@ -133,7 +133,8 @@ class SerialPort(PortHandler):  # type: ignore[misc]
 
     def _gone(self, error: object) -> PortLost:
         return PortLost(
-            f"{self.port_name}: the port is lost ({error}): plug the adapter in and power the bus"
+            f"{self.port_name}: the port is lost ({error}): connect the adapter and switch on the "
+            "servo supply"
         )
 
 
@@ -141,11 +142,11 @@ def _why_not(path: str, error: Exception) -> str:
     code = getattr(error, "errno", None)
     if code == errno.ENOENT or not Path(path).exists():
         return (
-            f"{path}: no such port: {port_group_remedy(path)}, or set servos.port; `softfinger "
+            f"{path}: port not found: {port_group_remedy(path)}, or set servos.port; `softfinger "
             "doctor` lists the available ports"
         )
     if code == errno.EACCES:
         return f"{path}: no permission: {grant(path)}"
     if code in (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK) or "lock" in str(error).lower():
-        return f"{path}: the port is in use by another process: end it first"
+        return f"{path}: the port is in use by another process: end that process first"
     return f"{path}: can't be opened: {error}"

@@ -36,8 +36,8 @@ from softfinger.daemon.types import FINGERS
 SEARCH_TIME = 0.8  # s, listening time per baud rate, enough for 253 servos at 1 Mbaud
 FACTORY_ID = 1
 ONE_SERVO_ONLY = (
-    "connect one servo alone and run `softfinger doctor --fix`; then add the next one and run it "
-    "again"
+    "connect only one servo and run `softfinger doctor --fix`; then connect the next servo as "
+    "well, and run the command again"
 )
 _READ_COUNT = 8  # number of full-table reads
 _REBOOT_TIMEOUT = 2.0  # s, maximum time from a reboot until the servo responds
@@ -75,8 +75,8 @@ class Garbled:
     def __str__(self) -> str:
         factory = " (the factory setting)" if self.id == FACTORY_ID else ""
         return (
-            f"replies of ID {self.id} at {self.baud} baud are damaged: several servos have this "
-            f"ID{factory}, or the line is bad"
+            f"replies of ID {self.id} at {self.baud} baud are corrupted: several servos have this "
+            f"ID{factory}, or the line is faulty"
         )
 
 
@@ -261,11 +261,11 @@ def provision(settings: Settings) -> list[Finding]:
             name, number = servo_name(servo_id, finger), line.ping(servo_id)
             if number is None:
                 if name not in [each.subject for each in result if each.status == "warn"]:
-                    result.append(Finding("warn", name, f"no answer at {servos.baud} baud"))
+                    result.append(Finding("warn", name, f"no reply at {servos.baud} baud"))
             elif number != model.number:
                 result.append(Finding("warn", name, *other_model(number, model)))
             elif is_garbled(line, servo_id):
-                result.append(Finding("warn", name, "its replies are damaged", ONE_SERVO_ONLY))
+                result.append(Finding("warn", name, "its replies are corrupted", ONE_SERVO_ONLY))
             else:
                 _set_up(line, settings, finger, model, result)
     return result
@@ -279,10 +279,10 @@ def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
     names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
     fit = ", ".join(f"ID {each.id} at {each.baud} baud" for each in what.strangers)
     if not fit:
-        fix = "check its power and cable"
-        return [Finding("warn", name, "no answer at any rate", fix) for name in names]
+        fix = "check its power supply and cable"
+        return [Finding("warn", name, "no reply at any baud rate", fix) for name in names]
     return [
-        Finding("warn", name, f"may be any of these servos: {fit}", ONE_SERVO_ONLY)
+        Finding("warn", name, f"could be any of these servos: {fit}", ONE_SERVO_ONLY)
         for name in names
     ]
 
@@ -295,12 +295,12 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
         result.append(Finding("warn", name, problem, fix))
 
     if change.baud not in model.baud_rates:
-        return failed(f"an {model.name} has no {change.baud} baud", "set servos.baud")
+        return failed(f"an {model.name} does not support {change.baud} baud", "set servos.baud")
     with open_line(path, change.servo.baud) as line:
         if line.store(reg.STATUS_RETURN_LEVEL, {old: b"\x02"}):
-            return failed("answers a ping but no read")
+            return failed("replies to a ping but not to a read")
         if new != old and line.ping(new) is not None:
-            return failed(f"ID {new} at {change.servo.baud} baud is taken by another servo")
+            return failed(f"ID {new} at {change.servo.baud} baud is used by another servo")
         if line.read(old, reg.TORQUE_ENABLE, 1) != b"\x00" and not _torque_off(
             line, old, name, result
         ):
@@ -315,7 +315,7 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
             time.sleep(_WRITE_TIME)
     with open_line(path, change.baud) as line:
         if line.ping(new) != model.number:
-            return failed(f"no answer after its rate was set to {change.baud} baud")
+            return failed(f"no reply after its baud rate was set to {change.baud} baud")
     result.append(Finding("fixed", name, str(change)))
     return None
 
@@ -338,7 +338,7 @@ def _set_up(
     # read.
     if line.read(servo_id, reg.STATUS_RETURN_LEVEL, 1) is None:
         if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
-            return failed("answers a ping but no read")
+            return failed("replies to a ping but not to a read")
         result.append(Finding("fixed", name, "status return level 0 → 2"))
     table = line.read(servo_id, 0, CHECKED)
     if table is None:
@@ -377,24 +377,38 @@ def _reboot_if_needed(
     if error := table[reg.HARDWARE_ERROR_STATUS]:
         why = f"it had a hardware error: {reg.hardware_error_names(error)}"
     elif misplaced is not None and misplaced.fix == LOST_TURN_FIX:
-        why = f"its position was off by a turn: {table.long(reg.PRESENT_POSITION)} counts"
+        why = (
+            f"its position was wrong by at least one turn: {table.long(reg.PRESENT_POSITION)} "
+            "counts"
+        )
     else:
         return None
     match _reboot(line, servo_id):
         case None:
-            return result.append(Finding("warn", name, f"no answer after a reboot because {why}"))
+            return result.append(
+                Finding("warn", name, f"no reply after a reboot, which was necessary because {why}")
+            )
         case 0:
             return result.append(Finding("fixed", name, f"rebooted because {why}"))
         case error:
-            text = f"hardware error after a reboot: {reg.hardware_error_names(error)}"
-            return result.append(Finding("warn", name, text, "remove the cause"))
+            text = (
+                "it still reports a hardware error after a reboot: "
+                f"{reg.hardware_error_names(error)}"
+            )
+            return result.append(
+                Finding("warn", name, text, "remove the cause, and run the command again")
+            )
 
 
 def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]) -> bool:
     if line.store(reg.TORQUE_ENABLE, {servo_id: b"\x00"}):
         result.append(Finding("warn", name, "torque could not be switched off"))
         return False
-    result.append(Finding("fixed", name, "torque switched off, because it locks the EEPROM"))
+    result.append(
+        Finding(
+            "fixed", name, "torque switched off, because the EEPROM is locked while torque is on"
+        )
+    )
     return True
 
 

@@ -151,8 +151,8 @@ class SimulatedServos:
         self._exchange()
         if self._tripped:
             raise ServoError(
-                "the bus watchdog stopped the simulated servos because no packet arrived in "
-                "time: clear, then arm"
+                "the bus watchdog stopped the simulated servos because no packet arrived within "
+                "servos.watchdog: send `clear`, then `arm`"
             )
         for joint in self._joints:
             scale = self._scales[joint]

@@ -152,12 +152,12 @@ class Torque:
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.FIRMWARE_VERSION, 1)
             if raw is None:
-                raise ServoError(f"{joint.name}: no answer")
+                raise ServoError(f"{joint.name}: no reply")
             found.add(raw[0])
         if len({self._model.indirect_blocks(version)[0] for version in found}) > 1:
             raise ServoError(
-                "servos: their firmware versions differ in the addresses of indirect data: "
-                "update both to the same version"
+                "servos: found firmware versions with different indirect data addresses: update "
+                "both servos to the same version"
             )
         return max(found)
 
@@ -191,7 +191,9 @@ class Torque:
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
             if raw is None:
-                found.append(Finding("FAIL", joint.name, "no answer", "check its cable and power"))
+                found.append(
+                    Finding("FAIL", joint.name, "no reply", "check its cable and power supply")
+                )
             elif raw[0]:
                 error = f"hardware error: {reg.hardware_error_names(raw[0])}"
                 found.append(Finding("FAIL", joint.name, error, REBOOT_FIX))
@@ -215,13 +217,13 @@ class Torque:
         watchdog = table[reg.BUS_WATCHDOG - start]
         if watchdog == reg.WATCHDOG_ERROR:
             raise ServoError(
-                f"{joint.name}: its bus watchdog stopped it because no packet arrived in time: "
-                "clear, then arm"
+                f"{joint.name}: its bus watchdog stopped the servo because no packet arrived "
+                "within servos.watchdog: send `clear`, then `arm`"
             )
         if watchdog != self._ticks:
             raise ServoError(
-                f"{joint.name}: its bus watchdog is off; it may have rebooted: check its supply, "
-                "then clear and arm"
+                f"{joint.name}: its bus watchdog is off, possibly because the servo has rebooted: "
+                "check the supply, then send `clear` and `arm`"
             )
         return goal_in(self._mode, table, start) in joint.sent
 

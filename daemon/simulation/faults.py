@@ -135,7 +135,11 @@ class FaultEvent(NamedTuple):
 
     def __str__(self) -> str:
         if self.kind == WELL:
-            return "all faults ended" if self.part == ALL else f"{self.part}: all faults ended"
+            return (
+                "all faults have ended"
+                if self.part == ALL
+                else f"{self.part}: all faults have ended"
+            )
         value = "" if self.kind in _PORT_FAULTS else f"={self.value:g}"
         over = f" within {self.over:g} s" * bool(self.over)
         return f"fault: {self.part}: {self.kind}{value}{over}"
@@ -223,22 +227,24 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     match = _WORD.fullmatch(word)
     side, kind, text, start, end = match.groups() if match else (None, "", None, None, None)
     if side is not None and side not in FINGERS:
-        raise refused(f"expected left: or right:, found {side}:")
+        raise refused(f"expected the prefix left: or right:, found {side}:")
     value = None if text is None else _number(text)
     if value is not None and not math.isfinite(value):
         raise refused(f"{text!r} is not a number")
     after = 0.0 if start is None else _number(start)
     if not 0.0 <= after < math.inf:
-        raise refused(f"start {start!r} is not a time of at least 0 s")
+        raise refused(f"start {start!r} is not a valid time, expected at least 0 s")
     until = after if end is None else _number(end)
     if not after <= until < math.inf:
-        raise refused(f"end {end!r} is not a time of at least {start} s")
+        raise refused(f"end {end!r} is not a valid time, expected at least {start} s")
     form = next((each for each in _FORMS if each.fits(side, kind, value is not None)), None)
     if form is None:
         known = (f"{', '.join(each.kinds)} {each.value}".strip() for each in _FORMS)
         raise refused(f"expected one of {'; '.join(known)}")
     if end is not None and (kind not in MEASUREMENT_FAULTS or kind in SWITCHED_FAULTS):
-        raise refused(f"{kind} changes at once; give one start time such as @{start}")
+        raise refused(
+            f"{kind} does not change gradually; give a single start time such as @{start}"
+        )
     if form.value == _ID and value not in ids:
         raise refused("no servo has this ID")
     if value is None:

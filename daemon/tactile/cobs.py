@@ -124,7 +124,7 @@ class CobsDecoder(DelimitedDecoder):
         message = np.empty(self.longest, np.uint8)
         size = unstuff(np.frombuffer(packet, np.uint8), message) - _CRC.size
         if size < _HEADER.size:
-            self._reason = "packets that are too short or not COBS"
+            self._reason = "packets that are too short or not COBS-encoded"
             return None
         if (
             binascii.crc_hqx(message.data[:size], _CRC_START)
@@ -135,7 +135,7 @@ class CobsDecoder(DelimitedDecoder):
             return None
         kind, version, seq, ticks, rows, cols = _HEADER.unpack_from(message.data)
         if kind not in (1, 2) or version != 0:
-            self._reason = f"packets of the unknown kind {kind}.{version}"
+            self._reason = f"packets of unknown kind {kind}.{version}"
             return None
         if (rows, cols) != (self.rows, self.cols) or size != _HEADER.size + kind * rows * cols:
             self._reason = f"frames of {rows} × {cols} cells in {size} bytes"

@@ -148,4 +148,4 @@ class DelimitedDecoder(Decoder):
         if self._reason:
             return f"{self._reason}; expected {self._grid()}"
         end = self._delimiter.hex().upper()
-        return f"no packet that ends with {end}; check the board and its baud rate"
+        return f"no packet ended with {end}; check the board and its baud rate"

@@ -100,9 +100,12 @@ class FlexiTacDecoder(Decoder):
             shape = f"{found} cells" + (f" ({side} × {side} if square)" if side**2 == found else "")
             return f"frames of {shape}, expected {expected}: set tactile.rows and tactile.cols"
         if self._ambiguous:
-            return f"several places in each frame of {expected} contain AA 55: move the sensor"
+            return (
+                f"the marker AA 55 occurs several times in each frame of {expected}, so the frame "
+                "boundary is ambiguous: load the sensor differently"
+            )
         if self._markers:
-            return f"markers AA 55, but not at the spacing of {expected}"
+            return f"found markers AA 55, but not at the distance of one frame of {expected}"
         return f"no marker AA 55; expected frames of {expected}: check the board and its baud rate"
 
     def _search(self) -> bool:

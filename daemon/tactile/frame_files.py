@@ -153,7 +153,9 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
             part = _part(archive, name)
             left -= part.file_size
             if left < 0:
-                raise ValueError(f"{name}: unpacks to more data than its size allows")
+                raise ValueError(
+                    f"{name}: the unpacked data are suspiciously large for the size of the file"
+                )
             with archive.open(part) as unpacked:
                 held[ours] = _read_array(unpacked, part.file_size)
     return held
@@ -166,13 +168,15 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
     shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
     stacks = [name for name, (shape, kind) in shapes.items() if len(shape) == 3 and kind in "uif"]
     if len(stacks) == 1:
-        notes.append(f"found no array 'frames'; uses {stacks[0]!r}, the only 3-d array")
+        notes.append(
+            f"found no array 'frames'; using {stacks[0]!r}, the only three-dimensional array"
+        )
         return stacks[0]
     described = [f"{name} {shape}" for name, (shape, _) in [*shapes.items()][:_LISTED_COUNT_MAX]]
     described += ["…"] * (len(names) > _LISTED_COUNT_MAX)
     raise ValueError(
-        f"found no array 'frames', but {', '.join(described) or 'no other array'}: name the "
-        "array [n, rows, cols] frames"
+        f"found no array 'frames', but {', '.join(described) or 'no other array'}; rename the "
+        "array of shape [n, rows, cols] to frames"
     )
 
 
@@ -214,7 +218,8 @@ def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
         raise ValueError(
-            f"its header states the shape {shape} of {kind}, more than the file contains"
+            f"found a header with the shape {shape} of {kind}, expected at most as much data as "
+            "the file contains"
         )
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
@@ -300,15 +305,17 @@ def _check_below(
     noise = max(noise, 1.4826 * float(np.median(np.abs(sample - middle))))
     k, i, j = np.unravel_index(int(frames.argmin()), frames.shape)
     if middle < -noise:
-        expected = f"0 or noise; half of the readings are {middle:.3g} or less: tare them"
+        expected = (
+            f"0 or noise around 0; half of the readings are {middle:.3g} or less: tare the frames"
+        )
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     if lowest < -_NOISE_SIGMA_MAX * noise:
         expected = f"at least {-_NOISE_SIGMA_MAX * noise:.3g}, the range of noise around 0"
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     share = np.count_nonzero(frames < 0) / (len(frames) * np.count_nonzero(live))
     notes.append(
-        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: noise around a tared "
-        "zero, set to 0"
+        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: this is noise after a "
+        "tare, and these readings are set to 0"
     )
 
 
@@ -342,7 +349,9 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
     steps = np.diff(since)
     if (steps <= 0.0).any():
         k = int(np.argmax(steps <= 0.0))
-        raise ValueError(f"t: the times must increase; t[{k}] is {t[k]}, t[{k + 1}] is {t[k + 1]}")
+        raise ValueError(
+            f"t: expected increasing times, found t[{k}] = {t[k]}, t[{k + 1}] = {t[k + 1]}"
+        )
     if not steps.size:
         return since
     step = float(np.median(steps))
@@ -353,13 +362,13 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
         factor = _factor(t, step, rate)
     if factor in _UNITS:
         notes.append(
-            f"t: read as {_UNITS[factor]}, which gives {step * factor:.4g} s between frames; "
-            f"tactile.rate gives {1.0 / rate:.4g} s"
+            f"t: interpreted as {_UNITS[factor]}, which gives {step * factor:.4g} s between "
+            f"frames, but tactile.rate corresponds to {1.0 / rate:.4g} s"
         )
     elif not 1.0 / _INTERVAL_RATIO_NOTED < step * rate < _INTERVAL_RATIO_NOTED:
         notes.append(
-            f"t: read as s, which gives {step:.4g} s between frames; tactile.rate gives "
-            f"{1.0 / rate:.4g} s"
+            f"t: interpreted as s, which gives {step:.4g} s between frames, but tactile.rate "
+            f"corresponds to {1.0 / rate:.4g} s"
         )
     return np.multiply(since, factor)
 
@@ -370,7 +379,10 @@ def _factor(t: NDArray[Any], step: float, rate: float) -> float:
     if len(t) > 2 and (t % 1 == 0).all() and (np.diff(t) == 1).all():
         if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # a frame per second
             return 1.0
-        raise ValueError("t: whole numbers that increase by 1, expected times in s, or no t")
+        raise ValueError(
+            "t: found frame numbers that increase by 1, expected times in s; remove t if the "
+            "times are unknown"
+        )
     if not whole and step * rate <= _INTERVAL_RATIO_MAX:
         return 1.0
     return min((1.0, *_UNITS)[whole:], key=lambda factor: abs(math.log(step * factor * rate)))
@@ -390,6 +402,6 @@ def _clipped(found: FrameRecording, scale: float, full: int) -> str:
         return ""
     unit = "counts" if found.whole else f"counts of {scale:g} Pa"
     return (
-        f"{cells} cells share the largest reading, {top} {unit}: if they are saturated, set "
-        f"tactile.full_count = {top}; otherwise d is too large"
+        f"{cells} cells have the same maximum reading, {top} {unit}: if these cells are "
+        f"saturated, set tactile.full_count = {top}; otherwise the estimated d is too large"
     )

@@ -31,13 +31,14 @@ class GloveDecoder(DelimitedDecoder):
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
         if len(packet) != self.longest - 1:
             cells = (len(packet) - 1) // 2
-            self._reason = f"lines of {len(packet)} bytes, which is {cells} cells"
+            self._reason = f"lines of {len(packet)} bytes, which correspond to {cells} cells"
             return None
         halves = np.frombuffer(packet, np.uint8, len(packet) - 1, 1) - np.uint8(_OFFSET)
         # Bytes below the offset wrap around to large values here.
         if packet[0] < _OFFSET or halves.max() >= self._values:
             self._reason = (
-                "a byte that is not half of a count; tactile.full_count = 4095 may be needed"
+                "a byte that is not half of a count; set tactile.full_count = 4095 if the board "
+                "sends 12-bit counts"
             )
             return None
         counts = halves[0::2].astype(np.uint16)

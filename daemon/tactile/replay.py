@@ -31,8 +31,8 @@ def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> s
         return ""
     x, y = (each * 1e3 for each in recording.pitch)
     return (
-        f"its header gives cells of {x:.4g} × {y:.4g} mm, tactile.pitch gives "
-        f"{wanted[0] * 1e3:.4g} × {wanted[1] * 1e3:.4g} mm: set tactile.pitch = {x * 1e-3:.6g}, "
+        f"found cells of {x:.4g} × {y:.4g} mm in its header, expected {wanted[0] * 1e3:.4g} × "
+        f"{wanted[1] * 1e3:.4g} mm as in tactile.pitch: set tactile.pitch = {x * 1e-3:.6g}, "
         f"tactile.pitch_y = {y * 1e-3:.6g}"
     )
 
@@ -82,7 +82,7 @@ class ReplayTactile:
         """
         path = settings.recording[finger]
         if not path:
-            raise TactileError(f"tactile.recording: found none for the {FINGERS[finger]} finger")
+            raise TactileError(f"tactile.recording: found no file for the {FINGERS[finger]} finger")
         try:
             recording = load_recording(
                 Path(path),

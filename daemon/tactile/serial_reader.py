@@ -175,8 +175,8 @@ class SerialReader:
         within = f"within tactile.open_timeout = {self.settings.open_timeout:g} s"
         if self._bytes == 0:
             return (
-                f"no data {within}: check the board's power, tactile.port and its rate of "
-                f"{self.settings.baud} baud"
+                f"no data {within}: check the board's power supply, tactile.port and tactile.baud "
+                f"= {self.settings.baud}"
             )
         return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
 
@@ -200,7 +200,7 @@ class SerialReader:
             except OSError as error:
                 return self._end(f"the port is lost ({os.strerror(error.errno or errno.EIO)})")
             if not data:
-                return self._end("the port is lost (it reports data but has none)")
+                return self._end("the port is lost (it signals data, but a read returns nothing)")
             self._bytes += len(data)
             decoded = decoder.feed(data, self._clock.now())
             self._hand_over(decoded)
@@ -264,13 +264,13 @@ def open_port(path: str, baud: int) -> serial.Serial:
     except serial.SerialException as error:
         number = error.errno
         if number == errno.ENOENT:
-            why = "no such port; is the board plugged in?"
+            why = "port not found; check that the board is connected"
             if not path.startswith("/dev/"):
-                why = "no such port; is `softfinger emulate` running?"
+                why = "port not found; check that `softfinger emulate` is running"
         elif number in (errno.EACCES, errno.EPERM):
             why = f"no permission to open it: {grant(path)}"
         elif number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
-            why = "busy: another program uses this port"
+            why = "the port is in use by another program; end that program first"
         else:
             why = f"can't be opened as a serial port ({error})"
     except (OSError, ValueError) as error:

@@ -122,7 +122,7 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     if "SECONDS_PER_FRAME" in header:
         step = _quantity(header, "SECONDS_PER_FRAME", _TIMES)
     if not step > 0.0:
-        raise TekscanError("SECONDS_PER_FRAME: expected a time above 0")
+        raise TekscanError("SECONDS_PER_FRAME: expected a positive number of seconds")
     t = (np.array(numbers, np.float64) - numbers[0]) * step
     return Export(values, live, t, raw, pitch, full if full > 0.0 else math.inf)
 
@@ -139,9 +139,9 @@ def _live_cells(
     wrong = np.argwhere(unknown & live)
     if wrong.size:
         k, i, _ = wrong[0].tolist()
-        raise TekscanError(f"line {places[k][i]}: a cell is not a number")
+        raise TekscanError(f"line {places[k][i]}: found a cell that is not a number")
     if not live.any():
-        raise TekscanError("contains no cells")
+        raise TekscanError("the file does not contain any cells")
     return np.where(live, values, 0.0), live
 
 
@@ -169,7 +169,7 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
             header[key] = value
             in_comments = key.startswith("COMMENT")
     raise TekscanError(
-        "found no line ASCII_DATA, expected a Tekscan-style export, .npz or .npy file"
+        "found no line ASCII_DATA, expected a Tekscan-style export, or an .npz or .npy file"
     )
 
 
@@ -195,7 +195,7 @@ def _frames(
             else:
                 if frames and len(frames[-1]) < rows:
                     had = f"{len(frames[-1])} rows of {rows}"
-                    raise TekscanError(f"line {number}: frame {numbers[-1]} has {had}")
+                    raise TekscanError(f"line {number}: frame {numbers[-1]} has only {had}")
                 if numbers and int(match[1]) <= numbers[-1]:
                     raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
                 numbers.append(int(match[1]))
@@ -212,7 +212,7 @@ def _frames(
         frames[-1].append(_row(line, separator, cols, number))
         places[-1].append(number)
     if not frames:
-        raise TekscanError("contains no frames")
+        raise TekscanError("the file does not contain any frames")
     if len(frames[-1]) < rows:
         raise TekscanError(
             f"the file ends in frame {numbers[-1]}: {len(frames[-1])} rows of {rows}"
@@ -251,8 +251,8 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
         elif cols < len(cells) < 2 * cols and all(each.isdigit() or each == "B" for each in cells):
             raise TekscanError(
-                f"line {number}: {len(cells)} cells, expected {cols}: commas separate the cells "
-                "and their decimals; export with decimal points or another separator"
+                f"line {number}: {len(cells)} cells, expected {cols}: the comma is both the "
+                "separator and the decimal sign; export with decimal points or another separator"
             )
     if len(cells) != cols:
         raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
@@ -261,7 +261,7 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
     except ValueError as error:
         raise TekscanError(f"line {number}: {error}") from None
     if np.count_nonzero(np.isneginf(values)) != missing:
-        raise TekscanError(f"line {number}: a cell is not a number")
+        raise TekscanError(f"line {number}: found a cell that is not a number")
     return values
 
 
@@ -300,7 +300,9 @@ def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> floa
     unit = _plain_unit(match[2]) if match else ""
     if not math.isfinite(value) or unit not in units:
         known = ", ".join(name for name in units if 0 < len(name) <= 4)
-        raise TekscanError(f"{key}: found {header[key]!r}, expected a number in one of {known}")
+        raise TekscanError(
+            f"{key}: found {header[key]!r}, expected a number with one of the units {known}"
+        )
     return value * units[unit]
 
 
@@ -310,7 +312,7 @@ def _pitch(header: dict[str, str]) -> tuple[float, float]:
     for key in ("COL_SPACING", "ROW_SPACING"):
         value = _quantity(header, key, _LENGTHS) if key in header else math.nan
         if value <= 0.0:
-            raise TekscanError(f"{key}: expected a length above 0")
+            raise TekscanError(f"{key}: expected a positive length")
         found.append(value)
     return found[0], found[1]
 

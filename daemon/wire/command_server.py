@@ -102,9 +102,8 @@ class CommandServer:
             size += len(ask.payload)
             try:
                 request = decode(ask.payload)
-                # two entries have the key "command"
-                if ask.urgent and request["command"] != "stop":
-                    raise _malformed('expected one string under "command"')
+                if ask.urgent and request["command"] != "stop":  # two keys are named "command"
+                    raise _malformed('expected exactly one string under the key "command"')
             except Refused as refused:
                 self._link.reply(ask, refusal(str(refused), refused.reason))
                 continue
@@ -136,7 +135,7 @@ class CommandServer:
                     text = "rejected: received before the last stop, or too soon after it"
                     raise Refused(text, Reason.STOPPED)
                 if first.changes != self._changes:
-                    text = f"{name}: another command has been carried out since the first attempt"
+                    text = f"{name}: another command was carried out after the first attempt"
                     raise Refused(text, Reason.SUPERSEDED)
                 reply = accepted(handler(request, self._clock() - ask.came))
                 self._changes += name != "status"
@@ -187,13 +186,13 @@ def decode(payload: bytes) -> dict[str, Any]:
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
     except msgpack.StackError:
-        raise _malformed("not msgpack: nested too deeply") from None
+        raise _malformed("not valid msgpack: nested too deeply") from None
     except Exception as error:  # msgpack's exceptions have no common base class
-        raise _malformed(f"not msgpack: {str(error) or 'invalid format'}") from None
+        raise _malformed(f"not valid msgpack: {str(error) or 'invalid format'}") from None
     if not isinstance(request, dict):
         raise _malformed(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):
-        raise _malformed('expected a string under "command"')
+        raise _malformed('expected a string under the key "command"')
     # Requests are published unchanged, so nested values are rejected.
     plain = {
         key: value

@@ -87,8 +87,8 @@ def check_curve() -> None:
     """Raise KeyFileError if the installed libzmq does not support CURVE."""
     if not zmq.has("curve"):
         raise KeyFileError(
-            f"libzmq {zmq.zmq_version()} was built without CURVE: install one of pyzmq's "
-            "published wheels, or use addresses on this machine only"
+            f"libzmq {zmq.zmq_version()} was built without CURVE: install a published pyzmq "
+            "wheel, or use only addresses on this machine"
         )
 
 
@@ -118,10 +118,10 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
             )
         there = [server / "clients" / f"{name}.key", folder / name]
         if any(path.exists() for path in there) or wanted.count(name) > 1:
-            raise KeyFileError(f"{folder}: client {name} already exists; choose another name")
+            raise KeyFileError(f"{folder}: the client {name} already exists; choose another name")
     if not wanted:
         raise KeyFileError(
-            f"{folder}: the server's keys already exist; give names of clients to add"
+            f"{folder}: the server's keys already exist; to add clients, give their names"
         )
     try:
         return _write_keys(folder, server, wanted, new)
@@ -164,7 +164,7 @@ def load_server(folder: Path) -> ServerKeys:
     clients = {_keys(path)[0]: path.stem for path in files}
     if not clients:
         raise KeyFileError(
-            f"{place / 'clients'}: found no client keys; create them with `softfinger keys`"
+            f"{place / 'clients'}: found no client keys; create client keys with `softfinger keys`"
         )
     return ServerKeys(public, secret, clients)
 
@@ -187,14 +187,14 @@ def _place(folder: Path) -> Path:
 
 def _unreadable(path: Path, error: OSError) -> KeyFileError:
     kind = NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
-    return kind(f"{path}: can't be read: {error.strerror}; `softfinger keys` creates key files")
+    return kind(f"{path}: can't be read: {error.strerror}; create key files with `softfinger keys`")
 
 
 def _pair(path: Path) -> tuple[bytes, bytes]:
     _check_above(path)
     public, secret = _keys(path, secret=True)
     if secret is None:
-        raise KeyFileError(f"{path}: contains no secret key")
+        raise KeyFileError(f"{path}: the file does not contain a secret key")
     return public, secret
 
 
@@ -216,7 +216,9 @@ def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
     """Raise KeyFileError if another user owns or may write a file, or may read a secret key."""
     mode = stat.S_IMODE(status.st_mode)
     if secret and mode & 0o077:
-        raise KeyFileError(f"{path}: other users may read it ({mode:04o}): chmod 600 {path}")
+        raise KeyFileError(
+            f"{path}: other users can read this file ({mode:04o}); run chmod 600 {path}"
+        )
     if wrong := fault(path, status):
         raise KeyFileError(wrong)
 

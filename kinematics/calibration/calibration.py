@@ -91,7 +91,8 @@ def tare(frames: ArrayLike) -> Tare:
     restless = np.count_nonzero(noise > _UNREST_SIGMA * max(float(np.median(noise)), 0.5))
     if restless >= _UNREST_CELL_COUNT:
         raise CalibrationError(
-            f"tare: the readings of {restless} cells change; is the tip in contact?"
+            f"tare: found changing readings in {restless} cells, expected constant readings; "
+            "check that the tip is not in contact"
         )
     zero = stack.mean(axis=0)
     excess = float(np.maximum(stack - zero, 0.0).mean())
@@ -155,16 +156,18 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     if the frames show no pressure.
     """
     if not loads:
-        raise CalibrationError("equilibrate: expected at least one uniform pressure")
+        raise CalibrationError("equilibrate: found no uniform pressure, expected at least one")
     readings = np.stack([_stack(load, "equilibrate").mean(axis=0) - zero for load in loads])
     response = readings.sum(axis=0)
     typical = float(np.median(response))
     if not typical > 0.0:
-        raise CalibrationError("equilibrate: most cells read no pressure above their zero")
+        raise CalibrationError("equilibrate: most cells read no pressure above their zero offset")
     active = response > DEAD_RESPONSE * typical
     target = np.array([reading[active].mean() for reading in readings])
     if (target <= 0.0).any():
-        raise CalibrationError("equilibrate: one of the pressures reads nothing above the zero")
+        raise CalibrationError(
+            "equilibrate: one of the pressures gives no reading above the zero offset"
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = np.tensordot(target, readings, 1) / (readings**2).sum(axis=0)
     gain = np.where(active, gain, 0.0)
@@ -219,12 +222,12 @@ def fit_curve(
     x = x.reshape(len(x), -1)
     known = np.asarray(force, np.float64)
     if known.shape != (len(x),) or not (np.isfinite(known).all() and (known > 0.0).all()):
-        raise CalibrationError("curve: each load needs a force above 0")
+        raise CalibrationError("curve: expected a force above 0 for each load")
     need = 2 if kind == "power" else 3
     if len(np.unique(known)) < need:
-        raise CalibrationError(f"curve: a {kind} needs at least {need} different forces")
+        raise CalibrationError(f"curve: a {kind} requires at least {need} different forces")
     if (x.max(axis=1) <= 0.0).any():
-        raise CalibrationError("curve: one of the loads reads nothing above the zero")
+        raise CalibrationError("curve: one of the loads gives no reading above the zero offset")
     if kind == "power":
         coefficients, errors = _power(x, known, area, full)
     else:
@@ -239,10 +242,12 @@ def _cubic(
     rows = np.stack([(u**j).sum(axis=1) * area / force for j in (1, 2, 3)], axis=1)
     c, _, rank, _ = np.linalg.lstsq(rows, np.ones(len(force)), rcond=1e-10)
     if rank < 3:
-        raise CalibrationError("curve: the loads are too similar for a cubic; try a power")
+        raise CalibrationError("curve: the loads are too similar for a cubic; use a power law")
     at = np.linspace(0.0, 1.0, 201)
     if (c[0] + 2 * c[1] * at + 3 * c[2] * at**2 <= 0.0).any():
-        raise CalibrationError("curve: the cubic through these loads decreases; try a power")
+        raise CalibrationError(
+            "curve: the cubic through these loads is not increasing; use a power law"
+        )
     scaled = (1.0, float(c[0] / full), float(c[1] / full**2), float(c[2] / full**3))
     return scaled, rows @ c - 1.0
 
@@ -268,7 +273,9 @@ def _power(
     low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
     exponent = golden_section(cost, low, high, 1e-9)
     if not _EXPONENTS[0] + 0.02 < exponent < _EXPONENTS[1] - 0.02:
-        raise CalibrationError(f"curve: these loads need an exponent outside {_EXPONENTS}")
+        raise CalibrationError(
+            f"curve: these loads require an exponent outside the range {_EXPONENTS}"
+        )
     factor, errors = fit(exponent)
     return (exponent, factor / full**exponent, 0.0, 0.0), errors
 
@@ -339,16 +346,17 @@ def fit_centre(
     stack = _stack(frames, "centre")
     s = np.sin(np.asarray(theta, np.float64))
     if s.shape != (len(stack),):
-        raise CalibrationError("centre: each press needs its tilt, 0 for upright ones")
+        raise CalibrationError("centre: expected a tilt for each press, 0 for an upright press")
     tilted = float(np.ptp(s)) > math.sin(_TILT_MIN)
     if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT_ERROR):
         raise CalibrationError(
             f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so tilt and "
-            "position can't be separated; press upright alone, or upright and tilted further"
+            "position can't be separated; use only upright presses, or both upright presses and "
+            "presses with a larger tilt"
         )
     for k, frame in enumerate(stack):
         if not frame.max() > _PRESSED_SIGMA * noise:
-            raise CalibrationError(f"centre: press {k + 1} gives no valid contact")
+            raise CalibrationError(f"centre: press {k + 1} does not give a valid contact")
     used = np.broadcast_to(True if active is None else active, stack.shape)
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
@@ -384,15 +392,15 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
-        raise CalibrationError("modulus: each frame needs its d and its force")
+        raise CalibrationError("modulus: expected a d and a force for each frame")
     used = (depth > 0.0) & (load > 0.0)
     if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
         raise CalibrationError(
-            "modulus: expected at least three frames of different d with contact"
+            "modulus: expected at least three frames in contact with different d"
         )
     depth, tilt, load = depth[used], tilt[used], load[used]
     if not np.polyfit(depth, load, 1)[0] > 0.0:
-        raise CalibrationError("modulus: the force does not rise with d")
+        raise CalibrationError("modulus: the force does not increase with d")
     unit, offset, modulus = ContactTable.build(tip, Material.constant(1.0)), 0.0, 0.0
     for _ in range(30):
         c = unit(np.maximum(depth - offset, 1e-9), tilt)
@@ -455,13 +463,15 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
     """
     at, load = np.asarray(t, np.float64), np.asarray(force, np.float64)
     if at.size < 8 or not load.max() > 0.0:
-        raise CalibrationError("relaxation: expected at least eight frames of one press and hold")
+        raise CalibrationError(
+            "relaxation: expected at least eight frames of a single press that is held"
+        )
     noise = float(np.std(np.diff(load[at.size // 2 :]))) / math.sqrt(2.0)
     held = int(np.argmax(load >= load.max() - _SIGNIFICANT_SIGMA * noise))  # start of the hold
     told = [k for k, time in enumerate(times) if time > 2.0 * (at[-1] - at[0]) / (at.size - 1)]
     if told and at[-1] - at[held] < _HOLD_RATIO_MIN * max(times[k] for k in told):
         raise CalibrationError(
-            f"relaxation: found {at[-1] - at[held]:.1f} s of hold, expected at least "
+            f"relaxation: found {at[-1] - at[held]:.1f} s of holding, expected at least "
             f"{_HOLD_RATIO_MIN:g} times the longest of tip.relaxation_times, {max(times):g} s"
         )
     lasting = np.maximum(load, 0.0)

@@ -40,8 +40,8 @@ _CLIP = 0.02  # maximum step of the zero of d, as a fraction of the depth
 _STEP = 1e-8  # m, step for numerical derivatives
 _TOLERANCE = 1e-7  # relative tolerance of the tables
 _EDGE = 1.0 - 1e-4  # usable fraction of a table's range; leaves room for the step
-_TOO_DEEP = "the run is deeper or more tilted than its data"
-_NO_BEGINNING = "no zero of d fits: the run must show where the contact begins"
+_TOO_DEEP = "the run exceeds the depth or tilt range of the model's data"
+_NO_BEGINNING = "no zero offset of d fits the run: the run must include the onset of contact"
 # Higher-order coefficients of three laws. The forces for σ = c_1 ε + c_2 ε² + c_3 ε³ are linear
 # combinations of the forces for these laws.
 _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
@@ -110,12 +110,12 @@ def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
     run = Run(theta, depth[used], load[used], begin, cycles, dropped)
     if (count := np.count_nonzero(run.pressed)) < _FEWEST:
         raise CalibrationError(
-            f"found {count} rows of loading beyond the toe, expected at least {_FEWEST}"
+            f"found {count} loading rows beyond the toe region, expected at least {_FEWEST}"
         )
     if np.ptp(run.force[run.pressed]) < _LOADED * _noise([run]):
         raise CalibrationError(
             f"found a force of {np.ptp(run.force):.3g} N with a scatter of {_noise([run]):.2g} N, "
-            f"expected {_LOADED:g} times the scatter: the tip was not loaded"
+            f"expected {_LOADED:g} times the scatter: check that the tip was loaded"
         )
     return run
 
@@ -127,18 +127,20 @@ def rising(d: FloatArray) -> tuple[slice, int]:
     """
     span = float(np.ptp(d)) if d.size else 0.0
     if not span > 0.0:
-        raise CalibrationError("found one displacement in all rows, expected a run that presses")
+        raise CalibrationError(
+            "found the same displacement in all rows, expected a run with increasing displacement"
+        )
     turns = _turning_points(d, _SLACK * span)
     if len(turns) - 2 > max(2, d.size // _TURNS):
         raise CalibrationError(
-            f"found {len(turns) - 2} reversals of d in {d.size} rows, expected the order of the "
-            "test: sort the rows by time"
+            f"found {len(turns) - 2} reversals of d in {d.size} rows, expected rows in the order "
+            "of the test: sort the rows by time"
         )
     top = d.max() - (1.0 - _DEEP) * span
     found = [(i, j) for i, j in itertools.pairwise(turns) if d[j] > d[i] and d[j] >= top]
     if not found:
         raise CalibrationError(
-            "found only falling d, the unloading; expected d to rise with the compression"
+            "found only decreasing d, which is unloading; expected d to increase during compression"
         )
     start, peak = found[-1]
     reached = np.argmax(d[start : peak + 1] >= d[peak] - 0.25 * _SLACK * span)
@@ -169,19 +171,21 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
     most = float(rise.max())
     if most <= 0.0 or rise[np.argmax(d)] < 0.5 * most:
         raise CalibrationError(
-            "found no force that rises with d; compression counts as positive in d and F"
+            "found no force that increases with d, expected positive d and F in compression"
         )
     begin = float(d[0])
     for _ in range(4):  # improve the zero of F using the rows before contact, if any
         steep = rise > _STEEP * most
         if (count := np.count_nonzero(steep)) < 3:
             raise CalibrationError(
-                f"found {count} rows above {_STEEP:.0%} of the largest force, expected at least "
+                f"found {count} rows above {_STEEP:.0%} of the maximum force, expected at least "
                 f"{_FEWEST}"
             )
         slope, start = np.polyfit(d[steep], rise[steep] ** _POWER, 1)
         if not slope > 0.0:
-            raise CalibrationError("found a force that falls with d, expected it to rise")
+            raise CalibrationError(
+                "found a force that decreases with d, expected a force that increases with d"
+            )
         begin = float(-start / slope)
         before = d < begin - TOE * (d.max() - begin)
         if np.count_nonzero(before) < 3:

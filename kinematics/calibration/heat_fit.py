@@ -64,8 +64,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
     if warmed < _RISE_MIN:
         raise CalibrationError(
-            f"heat: found {warmed:.0f} °C of warming, expected at least {_RISE_MIN:g} °C: hold "
-            "longer, or with more force"
+            f"heat: found {warmed:.0f} °C of temperature rise, expected at least {_RISE_MIN:g} "
+            "°C: hold the grip longer, or use more force"
         )
     grid = np.arange(at[0], at[-1], _STEP)
     squares, readings = np.interp(grid, at, square), np.interp(grid, at, shown)

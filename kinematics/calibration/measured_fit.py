@@ -68,8 +68,8 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     ):
         raise CurvesError(
             f"found {len(d)} presses at {len(np.unique(d))} depths, {tilted.sum()} of them "
-            f"tilted; expected at least {_PRESS_COUNT_MIN} at 3 depths, some upright and 2 "
-            "tilted by 5° or more"
+            f"tilted; expected at least {_PRESS_COUNT_MIN} at 3 depths, including upright presses "
+            "and 2 presses tilted by 5° or more"
         )
     frames = [each for each, use in zip(presses.frames, used, strict=True) if use]
     first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
@@ -159,7 +159,7 @@ def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """Return the covariance [4, 4] of one frame's sums, from the frames of each press."""
     if min(map(len, frames)) < 5:
-        raise CurvesError("expected at least five frames of each press, to measure their noise")
+        raise CurvesError("expected at least five frames of each press to measure the noise")
     each = [weights @ every.reshape(len(every), -1).T for every in frames]
     return np.asarray(np.mean([np.cov(sums) for sums in each], axis=0))
 

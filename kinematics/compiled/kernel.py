@@ -40,9 +40,14 @@ class JitDisabled(SoftfingerError):
 def _chosen_compiler() -> tuple[ModuleType, str]:
     """Return the compiler module and the reason for using `plain`, or an empty string."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        raise JitDisabled("NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset it")
+        raise JitDisabled(
+            "NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset this variable"
+        )
     if ".".join(numba.__version__.split(".")[:2]) not in TESTED_NUMBA:
-        return plain, f"Numba {numba.__version__} is not one of {', '.join(TESTED_NUMBA)}"
+        return plain, (
+            f"Numba {numba.__version__} has not been tested, expected one of "
+            f"{', '.join(TESTED_NUMBA)}"
+        )
     try:
         from softfinger.kinematics.compiled import compiler
     except (ImportError, AttributeError) as error:

@@ -52,8 +52,8 @@ def kernel_folder() -> OwnFolder | None:
         return find_kernel_folder()
     except (OSError, RuntimeError) as error:
         warnings.warn(
-            f"compiled kernels can't be stored, so every start compiles them again: {error} "
-            "(NUMBA_CACHE_DIR selects another folder)",
+            "compiled kernels can't be stored, so they will be recompiled at every start: "
+            f"{error} (to use another folder, set NUMBA_CACHE_DIR)",
             RuntimeWarning,
             stacklevel=2,
         )
@@ -100,7 +100,7 @@ def kept(folder: OwnFolder, name: str) -> bytes | None:
 def _without_checksum(data: bytes) -> bytes:
     content = data[_DIGEST:]
     if hashlib.sha256(content).digest() != data[:_DIGEST]:
-        raise ValueError("kernels are damaged")
+        raise ValueError("stored kernels are corrupted")
     return content
 
 

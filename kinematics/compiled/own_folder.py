@@ -46,7 +46,7 @@ def _written_by_others(path: Path, found: os.stat_result) -> str:
         return ""
     others = stat.S_IWOTH | (0 if _alone_in(found.st_gid) else stat.S_IWGRP)
     mode = stat.S_IMODE(found.st_mode)
-    return f"{path}: other users may write to it ({mode:04o}): chmod go-w {path}" * bool(
+    return f"{path}: other users can write to it ({mode:04o}): chmod go-w {path}" * bool(
         mode & others
     )
 

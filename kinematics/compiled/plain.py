@@ -38,8 +38,8 @@ class InnerKernel:
     def __call__(self, *values: Any) -> Any:
         """Raise TypeError; only kernels can call inner kernels."""
         raise TypeError(
-            f"{self.__module__}.{self.__name__} is an inner kernel, which only kernels may call; "
-            "mark it with @kernel to call it from Python"
+            f"{self.__module__}.{self.__name__} is an inner kernel, which can be called only by "
+            "kernels; decorate it with @kernel to call it from Python"
         )
 
 

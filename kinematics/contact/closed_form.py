@@ -79,11 +79,11 @@ class Fingertip:
                 raise ValueError(f"{name} must be {expected}, not {getattr(self, name)!r}")
         if not POISSON[0] <= self.poisson <= POISSON[1]:
             low, high = POISSON
-            raise ValueError(f"poisson must be {low} to {high}, not {self.poisson!r}")
+            raise ValueError(f"poisson must be between {low} and {high}, not {self.poisson!r}")
         if (self.physics == "measured") != (self.law is not None):
             raise ValueError(
-                "a measured tip requires a law, and other tips must not have one; "
-                f"physics: {self.physics!r}"
+                "law must be given if and only if physics is 'measured'; found physics "
+                f"{self.physics!r}"
             )
         radius = float(self.radius)
         if not (radius > 0.0 and math.isfinite(radius)):

@@ -71,7 +71,7 @@ class Material:
         while len(c) > 1 and c[-1] == 0:
             c = c[:-1]
         if not c or c[0] <= 0:
-            raise MaterialError("the law needs a positive modulus at zero strain")
+            raise MaterialError("the law must have a positive modulus at zero strain")
         object.__setattr__(self, "coefficients", c)
         stress = (Fraction(0), *c)
         object.__setattr__(self, "law", _floats(stress))
@@ -82,8 +82,8 @@ class Material:
         if not np.all(slope > 0.0):
             worst = int(np.argmin(slope))
             raise MaterialError(
-                f"stress must rise with strain everywhere; its slope is {slope[worst]:.4g} Pa at "
-                f"strain {worst / 512:.3f}"
+                "stress must increase with strain everywhere, but its slope is "
+                f"{slope[worst]:.4g} Pa at strain {worst / 512:.3f}"
             )
 
     def __repr__(self) -> str:

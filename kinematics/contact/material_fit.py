@@ -44,31 +44,41 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
     wrong = []
     bad = np.flatnonzero(~(np.isfinite(x) & np.isfinite(y)))
     if bad.size:
-        raise MaterialError(f"point {bad[0] + 1} is not a number: ({x[bad[0]]}, {y[bad[0]]})")
+        raise MaterialError(f"point {bad[0] + 1} is not finite: ({x[bad[0]]}, {y[bad[0]]})")
     if x.size < MIN_POINTS:
-        wrong.append(f"too few points: {x.size}, at least {MIN_POINTS} are needed")
+        wrong.append(f"too few points: found {x.size}, expected at least {MIN_POINTS}")
     if x.size and x[0] < 0.0:
-        wrong.append(f"strain starts below zero, at {x[0]:.6g}; compression counts as positive")
+        wrong.append(
+            f"strain must not be negative, but the first point has {x[0]:.6g}; compression "
+            "counts as positive"
+        )
     for i in np.flatnonzero(np.diff(x) <= 0.0)[:3]:
-        wrong.append(f"strain must rise: point {i + 2} has {x[i + 1]:.6g} after {x[i]:.6g}")
+        wrong.append(f"strain must increase, but point {i + 2} has {x[i + 1]:.6g} after {x[i]:.6g}")
     for i in np.flatnonzero(np.diff(y) <= 0.0)[:3]:
         wrong.append(
-            f"not monotone: stress must rise, but point {i + 2} has {y[i + 1]:.6g} Pa after "
+            f"not monotonic: stress must increase, but point {i + 2} has {y[i + 1]:.6g} Pa after "
             f"{y[i]:.6g} Pa"
         )
     top = float(np.max(np.abs(y))) if y.size else 0.0
     if x.size and abs(x[0]) <= 1e-9 and abs(y[0]) > 1e-3 * top:
-        wrong.append(f"the curve starts off zero: {y[0]:.6g} Pa at zero strain; tare it first")
+        wrong.append(
+            f"the curve must start at zero stress, but its first point has {y[0]:.6g} Pa at zero "
+            "strain; subtract this offset first"
+        )
     elif x.size and x[0] > 1e-9 and y[0] <= 0.0:
-        wrong.append(f"the curve starts off zero: {y[0]:.6g} Pa at strain {x[0]:.6g}")
+        wrong.append(
+            f"the curve must start at zero stress, but its first point has {y[0]:.6g} Pa at "
+            f"strain {x[0]:.6g}"
+        )
     if not wrong and x[-1] > 2.0:
-        wrong.append(f"strain reaches {x[-1]:.6g}; it is a ratio, not per cent")
+        wrong.append(f"strain reaches {x[-1]:.6g}; strain must be a ratio, not a percentage")
     if wrong:
         raise MaterialError("the stress-strain points can't be used: " + "; ".join(wrong))
     used = (x > 1e-9) & (x <= 1.0)
     if used.sum() < MIN_POINTS - 1:
         raise MaterialError(
-            f"too few points between strain 0 and 1: {used.sum()}, at least {MIN_POINTS - 1}"
+            f"too few points between strain 0 and 1: found {used.sum()}, expected at least "
+            f"{MIN_POINTS - 1}"
         )
     return x[used], y[used]
 
@@ -93,7 +103,7 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
     misfit, modulus = next(one for one in tried if one[0] <= enough)
     if misfit > _MISFIT_MAX:
         raise MaterialError(
-            "no smooth monotone law fits the points: the best deviates from one by "
+            "no smooth monotonic law fits the points: the best law deviates from a point by "
             f"{misfit * top:.4g} Pa of {top:.4g} Pa"
         )
     rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])

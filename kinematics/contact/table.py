@@ -149,8 +149,9 @@ class ContactTable:
             return cls(solid_table(tip, material))
         if material.worst_force_error > _LAW_ERROR:
             warnings.warn(
-                f"the smooth law deviates from its points by up to {material.fit_error:.4g} Pa, "
-                f"{material.worst_force_error:.1%} of F; expected at most {_LAW_ERROR:.0%}",
+                "the smooth law deviates from the measured points by up to "
+                f"{material.fit_error:.4g} Pa, {material.worst_force_error:.1%} of the force; "
+                f"expected at most {_LAW_ERROR:.0%}",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -228,8 +229,8 @@ class ContactTable:
             first = outside[0]
             warnings.warn(
                 f"{outside.size} of {d.size} points are outside the contact table, the first at "
-                f"d = {1e3 * d[first]:g} mm, θ = {math.degrees(theta[first]):.3g}°; they get the "
-                "values at its edge, and `inside` is False",
+                f"d = {1e3 * d[first]:g} mm, θ = {math.degrees(theta[first]):.3g}°; for these "
+                "points, the values at the table's edge are returned and `inside` is False",
                 RuntimeWarning,
                 stacklevel=3,
             )

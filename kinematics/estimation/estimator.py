@@ -116,7 +116,7 @@ class ContactEstimate:
         if not self.valid:
             return f"ContactEstimate: not valid: {self.invalid.text}"
         if not self.contact:
-            return f"ContactEstimate: no contact of more than {1e3 * self.d_std:.2g} mm"
+            return f"ContactEstimate: no contact deeper than {1e3 * self.d_std:.2g} mm"
         pairs = (self.tilt_x, self.tilt_x_std), (self.tilt_y, self.tilt_y_std)
         tilts = ", ".join(f"{math.degrees(a):z.2f} ± {math.degrees(std):.2f}°" for a, std in pairs)
         d = f"d {1e3 * self.d:.3f} ± {1e3 * self.d_std:.3f} mm"
@@ -274,7 +274,7 @@ class ContactEstimator:
     ) -> None:
         if tip.physics == "measured":
             raise ValueError(
-                "a measured tip has no frame model: use "
+                "the frames of a measured tip can't be modelled by this class: use "
                 "softfinger.kinematics.estimation.measured.MeasuredEstimator"
             )
         if active is not None and np.shape(active) != grid.shape:
@@ -291,7 +291,8 @@ class ContactEstimator:
             alive = alive & cells_within_rim(grid, tip, known)
             if alive.sum() < CELLS_MIN:
                 raise ValueError(
-                    f"a solid tip needs {CELLS_MIN} active cells within its rim, got {alive.sum()}"
+                    f"a solid tip requires at least {CELLS_MIN} active cells within its rim, got "
+                    f"{alive.sum()}"
                 )
         state = self.state = EstimatorState()
         options = self._options = state.options
@@ -479,7 +480,7 @@ class ContactEstimator:
         full = _SATURATION_COUNTS.get(frame.dtype) if isinstance(frame, np.ndarray) else None
         if full is None:
             kind = getattr(frame, "dtype", type(frame).__name__)
-            raise ValueError(f"a frame is uint8, uint16, float32 or float64, got {kind}")
+            raise ValueError(f"a frame must be uint8, uint16, float32 or float64, got {kind}")
         if frame.shape != self.grid.shape:
             raise ValueError(f"a frame must have shape {self.grid.shape}, got {frame.shape}")
         if not 0.0 < pascal_per_count < math.inf:

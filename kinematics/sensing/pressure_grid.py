@@ -58,9 +58,11 @@ class SensorGrid:
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1:
-            raise ValueError(f"a grid needs rows and columns, got {self.rows} × {self.cols}")
+            raise ValueError(
+                f"a grid must have at least one row and one column, got {self.rows} × {self.cols}"
+            )
         if not all(0.0 < p <= _PITCH_MAX for p in self.pitches):
-            raise ValueError(f"pitch must be in metres, up to {_PITCH_MAX:g}, got {self.pitch}")
+            raise ValueError(f"pitch must be in metres, at most {_PITCH_MAX:g}, got {self.pitch}")
         if not all(math.isfinite(c) for c in (*self.centre, self.rotation)):
             raise ValueError("centre and rotation must be finite")
         if (
@@ -68,7 +70,9 @@ class SensorGrid:
             <= self.blur
             <= 0.5 * min(self.rows * self.pitches[1], self.cols * self.pitches[0])
         ):
-            raise ValueError(f"blur must be 0 to half the grid's shorter side, got {self.blur}")
+            raise ValueError(
+                f"blur must be between 0 and half of the grid's shorter side, got {self.blur}"
+            )
 
     @property
     def pitches(self) -> tuple[float, float]:
@@ -176,5 +180,7 @@ def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float
         raise ValueError(f"d = {d} m is more than the tip's radius {radius} m")
     n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
     if abs(tilt_x) >= 0.5 * math.pi or abs(tilt_y) >= 0.5 * math.pi or n_x**2 + n_y**2 >= 1.0:
-        raise ValueError(f"tilts {tilt_x}, {tilt_y} rad give no normal that points out of the tip")
+        raise ValueError(
+            f"tilts {tilt_x}, {tilt_y} rad are too large: the face normal must point out of the tip"
+        )
     return n_x, n_y

@@ -73,7 +73,7 @@ class Softfinger(Robot):
         size, expected = (frame.rows, frame.cols), (self.config.rows, self.config.cols)
         if size != expected:
             raise ValueError(
-                "--robot.rows, --robot.cols: found {} × {}, the hand's grids have {} × {}".format(
+                "--robot.rows, --robot.cols: found {} × {}, expected the hand's {} × {}".format(
                     *expected, *size
                 )
             )

@@ -51,7 +51,9 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
     kept = np.zeros(shape, np.uint16)
     for count in range(frames):
         while (frame := sensor.latest()) is last or frame is None:
-            assert time.monotonic() < deadline, f"found {count} frames in time, expected {frames}"
+            assert time.monotonic() < deadline, (
+                f"found {count} frames within the test time, expected {frames}"
+            )
             time.sleep(_POLL)
         assert isinstance(frame, Frame), f"found {type(frame).__name__}, expected a Frame"
         found = f"{frame.data.dtype} {frame.data.shape}"
@@ -97,11 +99,13 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
                 _read(servos, reading, patience)
                 moved = np.abs(np.subtract(reading.q, first)).max()
                 assert moved < 0.05, (
-                    f"found joints that moved by {moved:.3g} rad when torque was switched on"
+                    f"the joints moved by {moved:.3g} rad when torque was switched on"
                 )
             deadline = time.monotonic() + patience
             while not servos.torque_off(reading):
-                assert time.monotonic() < deadline, "torque off is not confirmed in time"
+                assert time.monotonic() < deadline, (
+                    "torque off was not confirmed within the test time"
+                )
         finally:
             servos.close()
     servos.close()
@@ -111,7 +115,7 @@ def _read(servos: Servos, reading: Reading, patience: float) -> None:
     deadline = time.monotonic() + patience
     reading.valid = False
     while not reading.valid:
-        assert time.monotonic() < deadline, "no valid reading in time"
+        assert time.monotonic() < deadline, "no valid reading arrived within the test time"
         time.sleep(_POLL)
         servos.read(reading)
 
@@ -127,7 +131,7 @@ def check_shape(settings: Settings) -> None:
     shape = shape_of(settings)
     assert isinstance(shape, Shape), f"found {type(shape).__name__}, expected a Shape"
     if shape.kind == DISC:
-        assert shape.roundness > 0.0, "found a disc without radius"
+        assert shape.roundness > 0.0, "found a disc without a radius"
         return
     sound = polygon(shape.corners)
     away = float(np.abs(sound.corners - shape.corners).max())

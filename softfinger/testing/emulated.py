@@ -186,7 +186,7 @@ class EmulatedBus:
         events = parse_faults(words, tuple(servo.id for servo in self.bus.servos))
         for event in events:
             if event.part not in (SERVOS, ALL) or event.after:
-                raise FaultError(f"{event}: expected a fault of servos that begins at once")
+                raise FaultError(f"{event}: expected a servo fault that starts immediately")
         with self._between_packets:
             for event in events:
                 self._terminal.apply_fault(event.kind, event.value, self.now())

@@ -150,8 +150,8 @@ class VirtualTimeHand(Hand):
         """Advance by the smallest step: a tick, or a recorded message."""
         if self._serving:
             raise RuntimeError(
-                "found a call that advances the time within serve(), which does that: use a "
-                "client, such as Hand(hand.address)"
+                "found a call that advances the time inside serve(), which advances the time "
+                "itself: use a client, such as Hand(hand.address)"
             )
         self._step()
 
@@ -337,7 +337,7 @@ class VirtualHand(VirtualTimeHand):
             event = self._faults.pop(0)
             if not self.plant.apply_fault(event):
                 raise FaultError(
-                    f"{event}: found a fault of servos or boards, expected one of measurements or "
+                    f"{event}: found a fault of servos or boards, expected a measurement fault or "
                     "a load: use emulated_hand"
                 )
 
@@ -366,7 +366,7 @@ def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
     settings = load(None if profile is None else Path(profile), Path(), changes)
     if not settings.simulated:
         raise SettingsError(
-            f"{profile or 'changes'}: found backends of hardware, expected a simulated hand: use "
+            f"{profile or 'changes'}: found hardware backends, expected simulated backends: use "
             "emulated_hand, which emulates the hardware"
         )
     loop = settings.loop.model_copy(update={"clock": "virtual"})

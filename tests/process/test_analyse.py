@@ -104,7 +104,10 @@ def test_a_recording_without_frames_is_an_error(inline, tmp_path):
     path.write_bytes(b"\x89MCAP0\r\n")
     done = inline("analyse", path)
     assert (done.returncode, "cut short" in done.stderr) == (1, True)
-    assert done.stderr.splitlines()[-1] == f"analyse: {path}: contains no tactile frames"
+    assert (
+        done.stderr.splitlines()[-1]
+        == f"analyse: {path}: the file does not contain any tactile frames"
+    )
 
 
 def test_frames_without_settings_need_matching_settings(inline, counts, tmp_path):
@@ -113,7 +116,7 @@ def test_frames_without_settings_need_matching_settings(inline, counts, tmp_path
     done = inline("analyse", path)
     assert (done.returncode, done.stdout) == (2, "")
     assert (
-        "small.npy: contains no settings: describe the tip and the sensor with --config"
+        "small.npy: the file does not contain settings: describe the tip and the sensor with"
         in done.stderr
     )
     done = inline("analyse", path, "--config", "paper")

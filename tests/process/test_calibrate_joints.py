@@ -46,7 +46,7 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
     servos.close()
     assert calibrate(folder, file, "--config", "hil", *by_hand(folder)) == 0
     told = capsys.readouterr()
-    assert "left finger: close it fully\n" in told.err
+    assert "left finger: close the finger fully\n" in told.err
     assert "left: servo 2 (not 1: IDs are swapped), direction -1, zero 1" in told.out
     assert "servos.direction = [-1, 1]" in told.out
     found = load(file, folder)
@@ -62,8 +62,8 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("turn", "told"),
     [
-        ("left={pose} right={pose}", "servos 1 and 2 turned, expected one: move it alone"),
-        ("left={pose}", "servo 2 turned for both fingers"),
+        ("left={pose} right={pose}", "servos 1 and 2 rotated, expected one servo: move only one"),
+        ("left={pose}", "servo 2 rotated with both fingers"),
         ("left=ajar", "ended with status 1"),
     ],
 )
@@ -93,7 +93,7 @@ def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
     assert "left finger: found 0.0° between closed and open" in capsys.readouterr().err
     monkeypatch.setattr(emulator._servos.bus.servos[0]._joint, "shift", 4000)
     assert calibrate(folder, *words) == 1
-    assert "is outside one turn" in capsys.readouterr().err
+    assert "(one turn), because the position changes" in capsys.readouterr().err
 
 
 def test_only_calibrated_values_change_in_a_profile():

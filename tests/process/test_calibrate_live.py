@@ -129,5 +129,5 @@ def test_without_matplotlib_the_step_succeeds_and_reports_the_missing_plot(
     np.savez(frames, frames=MadeUp().counts(np.zeros((N, N)), 10))
     words = ["--config", str(live / "profile.toml"), "--recording", str(frames)]
     assert main(["calibrate", "tare", str(tmp_path / "a.json"), *words]) == 0
-    assert "no picture was drawn: pictures need matplotlib" in capsys.readouterr().err
+    assert "the result was not plotted: plots require matplotlib" in capsys.readouterr().err
     assert load_calibration(tmp_path / "a.json").tare.frames == 10

@@ -53,7 +53,7 @@ def test_duration_and_settings_on_the_command_line(profile, inline):
     done = softfinger("run", "--config", path, "--set", "loop.rate=250", "--duration", "0.3")
     assert done.returncode == 0, done.stderr
     assert "simulated, 250 Hz" in done.stderr
-    assert "ended, torque off" in done.stderr
+    assert "ended; torque is off" in done.stderr
 
 
 def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
@@ -76,10 +76,10 @@ def test_a_missing_serial_port_is_named(profile, inline):
 def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
     done = inline("send", "arm", "--address", addresses[1], "--timeout", "0.1")
     assert done.returncode == 2
-    assert f"send: no answer to arm from {addresses[1]} within 0.1 s" in done.stderr
+    assert f"send: no reply to arm from {addresses[1]} within 0.1 s" in done.stderr
     assert "is softfinger running, or still starting?" in done.stderr
     done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "3")
-    assert f"no answer to arm from {addresses[1]} yet, waiting up to 3 s" in done.stderr
+    assert f"no reply to arm from {addresses[1]} yet, waiting up to 3 s" in done.stderr
     done = inline("send", "grasp", "force:5", "--address", addresses[1])
     assert done.returncode == 2
     assert "found 'force:5', expected key=number" in done.stderr
@@ -113,7 +113,7 @@ def test_fatal_signals_turn_torque_off_first(profile, addresses, number):
     process.send_signal(number)
     said = process.communicate(timeout=300)[1]
     assert process.returncode == 0
-    assert "ended, torque off" in said
+    assert "ended; torque is off" in said
 
 
 @pytest.mark.extended
@@ -185,7 +185,7 @@ def test_an_ipc_address_never_replaces_a_file(tmp_path, profile, inline):
     words = ("--set", f"stream.address=ipc://{file}", "--duration", "0.2")
     done = inline("run", "--config", profile(""), *words)
     assert done.returncode == 1
-    assert "exists and is not a socket" in done.stderr
+    assert "exists but is not a socket" in done.stderr
     assert file.read_text(encoding="utf-8") == "kept"
 
 
@@ -204,5 +204,5 @@ def test_a_disabled_compiler_is_reported_in_one_line():
     assert done.returncode == 1
     assert done.stdout == ""
     assert done.stderr == (
-        "limits: NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset it\n"
+        "limits: NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset this variable\n"
     )

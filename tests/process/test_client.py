@@ -114,7 +114,7 @@ def test_a_wait_times_out_with_the_last_state(hand):
 def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
     stream, commands = addresses
     timeout = SILENCE_TIME + 0.05
-    unanswered = rf"no answer to arm from {commands} within 1\.05 s"
+    unanswered = rf"no reply to arm from {commands} within 1\.05 s"
 
     async def ask() -> None:
         async with AsyncHand(*addresses, timeout=timeout) as hand:
@@ -131,7 +131,7 @@ def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
     asyncio.run(ask())
     said = [
         f"no hand/state from {stream} yet, waiting up to 1.05 s",
-        f"no answer to arm from {commands} yet, waiting up to 1.05 s",
+        f"no reply to arm from {commands} yet, waiting up to 1.05 s",
     ]
     assert caplog.messages == said + said
 
@@ -181,7 +181,7 @@ def test_a_value_that_is_not_a_number_is_refused_by_parameter_name(fake, hand, g
 
 LATE = {
     "ok": False,
-    "error": "arm: the command was 0.40 s old when it was handled",
+    "error": "arm: the command was 0.40 s old when it was processed",
     "reason": "late",
 }
 MODE = {
@@ -219,7 +219,7 @@ def test_a_late_command_is_repeated_with_its_key_and_a_refused_one_is_not(fake, 
     # The long delay leaves no time for a second attempt.
     monkeypatch.setattr(command_client, "RETRY_DELAY", 100.0)
     fake.replies["arm"] = LATE
-    with pytest.raises(Refused, match="old when it was handled") as caught:
+    with pytest.raises(Refused, match="old when it was processed") as caught:
         arm(fake, 60.0)
     assert caught.value.reason == "late"
     assert len(fake.requests) == 5
@@ -429,7 +429,7 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
             Hand()
 
 
-UNKNOWN = "found the unknown host 'no..host' (not a host name), expected a name that"
+UNKNOWN = "found unknown host 'no..host' (not a host name), expected an IP address or a"
 
 
 @pytest.mark.parametrize("cls", [Hand, AsyncHand])
@@ -490,7 +490,9 @@ def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     ):
         error = in_a_thread(use)
         assert isinstance(error, WrongThread), use
-        assert "thread other_0: found a Hand whose stream thread MainThread uses" in str(error)
+        assert "thread other_0: found a Hand whose stream is used by thread MainThread" in str(
+            error
+        )
     assert next(states).mode == hand.state().mode == "holding"
 
 

@@ -72,7 +72,9 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     mark.unlink()
     bad = compiled(tmp_path, "--config", str(steep(tmp_path)))
     assert bad.returncode == 1
-    assert "contact table was not compiled ahead: SettingsError: table.tolerance" in bad.stderr
+    assert (
+        "contact table was not compiled ahead of time: SettingsError: table.tolerance" in bad.stderr
+    )
 
 
 def test_ctrl_c_before_a_compiler_thread_starts_is_passed_on(monkeypatch):

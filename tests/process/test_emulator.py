@@ -280,7 +280,7 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
         assert servos.silent(1)
         assert servos.silent(2)
         assert send(tmp_path, "well") == 0
-        assert log[-1] == "all faults ended"
+        assert log[-1] == "all faults have ended"
         assert servos.ping(1) == servos.ping(2) == 1020
         for ended in ("plug left:plug@0.05", "well@0.05"):
             assert send(tmp_path, "unplug left:unplug") == 0
@@ -335,7 +335,9 @@ def test_injected_faults_change_measurements_but_not_the_hand(tmp_path):
         assert (left("current", 9.0), right("current", 9.0)) == (3.0, 1.0)
         assert send(tmp_path, "right:well left:gain=0@0.1..0.2") == 0
         until(lambda: board_mean(tmp_path, 1) < 10)
-        until(lambda: log[-2:] == ["right: all faults ended", "fault: left: gain=0 within 0.1 s"])
+        until(
+            lambda: log[-2:] == ["right: all faults have ended", "fault: left: gain=0 within 0.1 s"]
+        )
         until(lambda: left("gain", made.clock.now()) == 0.0)
         assert left("current", 9.0) == 3.0
         assert send(tmp_path, "well") == 0

@@ -101,11 +101,13 @@ def test_a_frame_is_delivered_before_the_next_one_arrives(board):
 
 def test_a_port_that_cannot_be_opened_is_reported(tmp_path, board):
     missing, file = tmp_path / "tactile-left", tmp_path / "file"
-    assert "tactile-left: no such port; is `softfinger emulate`" in why_not_open(sensor(missing))
+    assert "tactile-left: port not found; check that `softfinger emulate`" in why_not_open(
+        sensor(missing)
+    )
     file.write_text("")
     assert "can't be opened as a serial port" in why_not_open(sensor(file))
     with serial.Serial(board.path, 2_000_000, exclusive=True):
-        assert "busy: another program" in why_not_open(sensor(board.path))
+        assert "the port is in use by another program" in why_not_open(sensor(board.path))
     board.stream(lambda k: bytes(1024))
     assert "no marker AA 55" in why_not_open(sensor(board.path, timeout=5.0))
 

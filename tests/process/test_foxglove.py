@@ -268,4 +268,4 @@ def masked(message: dict[str, Any]) -> bytes:
 
 def test_foxglove_requires_the_live_stream(capsys):
     assert cli.main(["view", "run.mcap", "--foxglove"]) == 2
-    assert "--foxglove serves only the stream" in capsys.readouterr().err
+    assert "only the live stream can be served" in capsys.readouterr().err

@@ -135,8 +135,8 @@ def test_a_replay_is_sent_only_to_holders_of_keys(addresses, tmp_path):
 @pytest.mark.parametrize(
     ("address", "reason"),
     [
-        ("tcp://0.0.0.0:9999", "other addresses need --keys"),
-        ("tcp://*:9999", "other addresses need --keys"),
+        ("tcp://0.0.0.0:9999", "other addresses require --keys"),
+        ("tcp://*:9999", "other addresses require --keys"),
         ("nonsense", "expected tcp://127.0.0.1:PORT"),
     ],
 )

@@ -48,7 +48,7 @@ def test_a_simulated_hand_survives_a_suspended_machine(start, profile, hand):
         assert state.behind_s >= before.behind_s + 0.9 * STILL
         passed = 1e-9 * (state.mono_ns - before.mono_ns)
         assert passed == pytest.approx((state.seq - before.seq) / 100.0)
-        assert told(events, "late", "the simulated hand waited")
+        assert told(events, "late", "the simulated hand paused for")
     assert running.end() == 0
 
 

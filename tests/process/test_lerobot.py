@@ -71,7 +71,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     robot = make()
     with pytest.raises(DeviceNotConnectedError):
         robot.get_observation()
-    with pytest.raises(ValueError, match="found 10 × 44, the hand's grids have 44 × 44"):
+    with pytest.raises(ValueError, match="found 10 × 44, expected the hand's 44 × 44"):
         make(rows=10).connect()
     robot.connect()
     first = robot.get_observation()

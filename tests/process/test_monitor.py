@@ -157,7 +157,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         fake.changes = {"mode": "armed", "goal_force": math.nan, "goal_angle": math.nan}
         page.shows("ARMED", "+- N")
         page.type(b"+")
-        page.shows("settings are not known yet")
+        page.shows("settings have not arrived yet")
         assert "grip:" not in page.text()
         fake.send(b"hand/settings", msgpack.packb({"settings": json.dumps(SETTINGS)}))
         page.shows("+- 10 N")
@@ -186,7 +186,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
 def test_a_late_command_is_repeated_with_its_key(fake):
     late = {
         "ok": False,
-        "error": "arm: the command was 0.40 s old when it was handled",
+        "error": "arm: the command was 0.40 s old when it was processed",
         "reason": "late",
     }
     fake.replies["arm"] = [late, late, {"ok": True}]
@@ -219,9 +219,9 @@ def test_the_page_shows_another_commander_of_a_real_daemon(start, profile, addre
 def test_commands_without_a_daemon():
     where = ["--address", NOBODY]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
-        page.shows("waiting for a daemon", "no stream yet", "—")
+        page.shows("waiting for a daemon", "no stream has arrived yet", "—")
         page.type(b"a" * 12 + b" ")
-        page.shows("stop: no answer")
+        page.shows("stop: no reply")
         page.type(b"\x1b[C")
         page.shows("rotate: the object's angle is unknown")
         page.type(b"q")

@@ -123,11 +123,11 @@ def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
     assert ElementTree.parse(files[0]).getroot().tag.endswith("svg")
     status, said = call(path, "--to", "0.2", "--out", tmp_path / "none")
     assert status == 1
-    assert "plot: contains no contact" in said
+    assert "plot: the recording does not contain a contact" in said
     RecordingWriter(tmp_path / "nothing.mcap").close()
     status, said = call(tmp_path / "nothing.mcap", "--out", tmp_path / "none")
     assert status == 1
-    assert "plot: contains no hand/state" in said
+    assert "plot: the recording does not contain hand/state" in said
 
 
 def test_without_settings_no_model_is_drawn(path, run):

@@ -67,7 +67,7 @@ def test_plugin_errors_are_part_of_the_report():
         "plugins.pulsing.height: found -1",
         "plugins.pulsing.hight: unknown key; nearest: height",
         "plugins.following: found settings, but following of softfinger-example 1.0 has no ",
-        "plugins.nobody: found settings, but this plugin is not installed",
+        "plugins.nobody: found settings, but no plugin of this name is installed",
     ):
         assert part in report
     with pytest.raises(SettingsError, match="'disc', 'wedge', 'none' or 'hexagon'"):

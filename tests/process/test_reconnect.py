@@ -146,7 +146,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         assert rig.events[-1][:2] != ("info", "tactile")
         assert any("no such port" in text for level, _, text in rig.events if level == "warning")
         rig.until(lambda: loop.state.t - loop.state.contacts[0].t_valid > 0.9)
-        rig.refuses("grasp", "the port is lost; `clear`, or `disarm` and `arm`, opens it again")
+        rig.refuses("grasp", "the port is lost; send `clear`, or `disarm` and `arm`, to reopen it")
         rig.does("disarm")
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)

@@ -95,7 +95,7 @@ def test_states_of_a_recording_are_columns(tmp_path):
     writer = RecordingWriter(tmp_path / "b.mcap")
     writer.add(schema.TACTILE, {**frame(0.0, 0), "timestamp": 1e9})
     writer.close()
-    with pytest.raises(RecordingError, match=r"b\.mcap: contains no hand/state"):
+    with pytest.raises(RecordingError, match=r"b\.mcap: the recording does not contain hand/state"):
         read_recording(str(tmp_path / "b.mcap"))
 
 
@@ -325,7 +325,7 @@ def test_invalid_messages_on_the_stream_are_counted_and_omitted(fake, tmp_path):
     until(lambda: fake.published > before + 1)
     status, out, _ = interrupted(process)
     assert status == 0
-    assert "could not be read and were left out" in out
+    assert "could not be read and were skipped" in out
 
 
 def test_topics_are_selected_by_name(fake, tmp_path):
@@ -336,7 +336,7 @@ def test_topics_are_selected_by_name(fake, tmp_path):
     assert set(Recording(path).counts) == {"hand/tactile/left", "hand/tactile/right"}
     status, _, error = ended(record(tmp_path / "b.mcap", "--topics", "dreams"))
     assert status == 2
-    assert "found topic 'dreams', expected all or one of state, tactile" in error
+    assert "found topic 'dreams', expected 'all' or one of state, tactile" in error
 
 
 def test_repeated_messages_do_not_extend_the_time_range(tmp_path):
@@ -422,7 +422,7 @@ def disk_full(recorder: psutil.Process, path: Path) -> None:
             "ended by SIGKILL; `softfinger record --recover",
             marks=pytest.mark.extended,
         ),
-        (disk_full, "File too large; earlier messages can be read"),
+        (disk_full, "File too large; the messages written so far can be read"),
     ],
     ids=["killed", "disk full"],
 )

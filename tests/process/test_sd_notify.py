@@ -128,7 +128,7 @@ def test_the_daemon_reports_ready_alive_and_stopping_but_not_while_suspended(
     assert all({"timestamp", "level", "kind", "text"} <= set(record) for record in records)
     texts = [record["text"] for record in records]
     assert "running, disarmed" in texts
-    assert "ended, torque off" in texts
+    assert "ended; torque is off" in texts
     times = [record["timestamp"] for record in records]
     assert times == sorted(times)
     running = next(record for record in records if record["text"] == "running, disarmed")

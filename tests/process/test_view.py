@@ -139,7 +139,7 @@ def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
         with connect(address, proxy=None, open_timeout=WAIT) as line:
             line.send(orjson.dumps({"command": "arm", "seen": time.monotonic()}).decode())
             # The viewer waits.
-            assert any("no answer to arm" in line for line in viewed.process.stderr)
+            assert any("no reply to arm" in line for line in viewed.process.stderr)
             viewed.process.send_signal(signal.SIGINT)
             assert viewed.process.wait(WAIT) == 1  # the viewer has displayed nothing
 
@@ -227,7 +227,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
-    assert "the stream has schema 2, this page knows 1" in picture["notes"]
+    assert "the stream has schema 2, this page supports 1" in picture["notes"]
     assert "0 messages could not be read" in said
 
 
@@ -337,7 +337,9 @@ def test_only_the_token_gives_access_to_commands(served):
         assert status == 200
         assert "STOP" not in body
         assert "Watching" in body
-        assert ask(viewed.host, query, stop) == "✗ needs the token that the terminal prints"
+        assert (
+            ask(viewed.host, query, stop) == "✗ commands require the token printed in the terminal"
+        )
     with pytest.raises(InvalidStatus, match="403"):
         ask(viewed.host, token, stop, origin="http://evil.example")
     assert not fake.requests
@@ -373,7 +375,7 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
         for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):
             assert ask(viewed.host, token, odd).startswith("✗ invalid command")
         fake.close()
-        assert "✗ grasp: no answer" in press()
+        assert "✗ grasp: no reply" in press()
         assert len(fake.requests) == 2
 
 
@@ -513,12 +515,12 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
             waiting = f"waiting for a stream from {fake.state_address}"
             assert any(waiting in line for line in viewed.process.stderr)
             fake.silent.clear()
-            assert any("the stream has begun" in line for line in viewed.process.stderr)
+            assert any("the stream has started" in line for line in viewed.process.stderr)
             until(lambda: (page.next()["age"] or 1.0) < 0.1)
             fake.silent.set()
             until(lambda: page.next()["age"] > 1.0)
             viewed.process.send_signal(signal.SIGINT)
-            assert "states seen" in viewed.process.stderr.read()
+            assert "states received" in viewed.process.stderr.read()
             assert viewed.process.wait(300) == 0
 
 

@@ -104,8 +104,8 @@ def test_a_missed_aim_is_not_a_success(monkeypatch, capsys):
     [
         (["tik"], "found 'tik', expected one of estimator"),
         (["faults", "--only", "no such fault"], "no case of faults contains this text"),
-        (["tick", "--full"], "--full: only for reflex"),
-        (["--trials", "3"], "--trials: only for faults or robustness"),
+        (["tick", "--full"], "--full: valid only for reflex"),
+        (["--trials", "3"], "--trials: valid only for faults or robustness"),
     ],
 )
 def test_invalid_options_are_refused_before_measuring(words, text, capsys):
@@ -161,13 +161,13 @@ def test_an_object_that_is_not_held_is_counted_separately():
 
 def test_a_failed_part_does_not_affect_the_others(monkeypatch, capsys):
     def let_go(title: str, **_: object) -> Report:
-        raise RigError("the hand did not grip the object: grasping")
+        raise RigError("the hand failed to grip the object: grasping")
 
     monkeypatch.setattr(tick, "_in_turns", let_go)
     monkeypatch.setattr(tick, "in_the_loop", lambda title, **_: Report(title, [{"name": "x"}]))
     assert cli.main(["bench", "tick", "--brief"]) == 1
     printed = capsys.readouterr()
-    assert "bench: tick: tick: the hand did not grip the object: grasping\n" in printed.err
+    assert "bench: tick: tick: the hand failed to grip the object: grasping\n" in printed.err
     assert "the simulated hand" in printed.out
     assert printed.out.count("hardware in the loop") == 2
 

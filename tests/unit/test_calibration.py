@@ -50,7 +50,7 @@ def test_a_tare_under_load_is_refused():
     frames[:, 2:4, 3] *= 20.0  # the tare ignores two faulty cells
     tare(frames)
     frames[10:, 4:6, 4:7] += 100.0
-    with pytest.raises(CalibrationError, match="the readings of 8 cells change"):
+    with pytest.raises(CalibrationError, match="found changing readings in 8 cells"):
         tare(frames)
 
 
@@ -155,15 +155,18 @@ def test_clipped_noise_far_from_the_contact_is_removed():
         (lambda: tare(np.zeros((1, 4, 4))), "found one frame"),
         (lambda: tare(np.zeros((4, 4))), r"\[n, rows, cols\]"),
         (lambda: tare(np.full((3, 4, 4), np.nan)), "not finite"),
-        (lambda: equilibrate([], np.zeros((4, 4))), "at least one uniform"),
+        (lambda: equilibrate([], np.zeros((4, 4))), "found no uniform pressure"),
         (lambda: equilibrate([np.zeros((2, 4, 4))], np.zeros((4, 4))), "read no pressure"),
         (lambda: fit_curve("cubic", np.ones((2, 4, 4)), [1, 2], 1e-6, 10), "at least 3"),
         (lambda: fit_curve("power", np.ones((2, 4, 4)), [1, -2], 1e-6, 10), "above 0"),
-        (lambda: fit_curve("power", np.zeros((2, 4, 4)), [1, 2], 1e-6, 10), "reads nothing"),
+        (lambda: fit_curve("power", np.zeros((2, 4, 4)), [1, 2], 1e-6, 10), "gives no reading"),
         (lambda: fit_curve("cubic", np.ones((3, 4, 4)), [1, 2, 3], 1e-6, 10), "too similar"),
         (lambda: fit_centre(np.zeros((1, 32, 32)), [0], TIP, LINEAR, GRID, 600), "press 1"),
         (lambda: fit_modulus([0.001, 0.002], [0, 0], [1, 2], TIP), "at least three"),
-        (lambda: fit_modulus([0.001, 0.002, 0.003], [0, 0, 0], [3, 2, 1], TIP), "does not rise"),
+        (
+            lambda: fit_modulus([0.001, 0.002, 0.003], [0, 0, 0], [3, 2, 1], TIP),
+            "does not increase",
+        ),
     ],
 )
 def test_uninformative_data_are_refused(call, told):

@@ -70,12 +70,12 @@ def test_a_plain_req_socket_gets_its_reply(server, addresses):
 @pytest.mark.parametrize(
     ("payload", "error"),
     [
-        (b"", "not msgpack"),
-        (b"\xc1\xff", "not msgpack: invalid format"),
+        (b"", "not valid msgpack"),
+        (b"\xc1\xff", "not valid msgpack: invalid format"),
         (msgpack.packb([1, 2]), "expected a map, found list"),
-        (msgpack.packb({"force": 1.0}), 'expected a string under "command"'),
-        (msgpack.packb({"command": 7}), 'expected a string under "command"'),
-        (msgpack.packb({"command": "arm", 3: 4}), "not msgpack"),
+        (msgpack.packb({"force": 1.0}), 'expected a string under the key "command"'),
+        (msgpack.packb({"command": 7}), 'expected a string under the key "command"'),
+        (msgpack.packb({"command": "arm", 3: 4}), "not valid msgpack"),
         (msgpack.packb({"command": "x" * 300}), "bytes, expected at most 200"),
         (msgpack.packb({"command": "arm", "x": {b"k": 1}}), "numbers or strings as values"),
         (msgpack.packb({"command": "arm", "client": [[[]]]}), "numbers or strings as values"),
@@ -220,7 +220,7 @@ def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered
             assert msgpack.unpackb(reply) == {"ok": True, "heard": "arm"}
         else:
             assert msgpack.unpackb(reply)["reason"] == "request"
-            assert "expected the command in one frame" in msgpack.unpackb(reply)["error"]
+            assert "expected one frame with the command" in msgpack.unpackb(reply)["error"]
 
 
 class Aged:
@@ -399,7 +399,7 @@ def test_stop_is_accepted_with_unknown_fields():
 
 
 def test_a_request_that_is_nested_too_deeply_is_reported():
-    with pytest.raises(Refused, match="not msgpack: nested too deeply"):
+    with pytest.raises(Refused, match="not valid msgpack: nested too deeply"):
         decode(b"\x91" * 2000 + b"\xc0")
 
 
@@ -602,7 +602,7 @@ def test_a_valid_request_is_parsed():
         ),
         ({"command": "rotate", "angle": 0.1}, Mode.ARMED, "accepted in grasping, holding, r"),
         ({"command": "arm", "client": 7}, Mode.DISARMED, "client: expected a string"),
-        ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "at most 64 characters"),
+        ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "up to 64 characters"),
     ],
 )
 def test_an_invalid_request_is_refused_with_found_and_expected_values(request_, mode, text):
@@ -642,7 +642,7 @@ def test_an_outdated_command_has_no_effect(make, name, mode, oldest):
         loop._fail("a fault")
     assert loop.state.mode == mode
     request = {"command": name, **numbers.get(name, {})}
-    with pytest.raises(Refused, match="old when it was handled") as caught:
+    with pytest.raises(Refused, match="old when it was processed") as caught:
         loop.command(request, oldest + 0.01)
     assert caught.value.reason == "late"
     loop.advance(0.05)
@@ -675,7 +675,7 @@ def test_a_refused_command_takes_no_lease():
 def test_only_one_client_commands_at_a_time():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, "a"), 0.0)
-    with pytest.raises(Refused, match=r"grasp: a has the lease for another 1\.0 s"):
+    with pytest.raises(Refused, match=r"grasp: a holds the lease for another 1\.0 s"):
         take(lease, Command("grasp", {}, "b"), 1.0)
     take(lease, Command("disarm", {}, "b"), 1.0)
     take(lease, Command("status", {}, ""), 1.0)
@@ -689,5 +689,5 @@ def test_clients_without_a_name_share_one_lease():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, ""), 0.0)
     take(lease, Command("grasp", {}, ""), 0.1)
-    with pytest.raises(Refused, match="an unnamed client has the lease"):
+    with pytest.raises(Refused, match="an unnamed client holds the lease"):
         take(lease, Command("grasp", {}, "a"), 0.2)

@@ -117,7 +117,7 @@ def test_removing_the_object_ends_the_grip(last):
     ("angle", "then", "told", "end"),
     [
         (ANGLE, "", "", "holding"),
-        (ANGLE, "release", "rotate: dropped, because the grasp ended in mode releasing", "armed"),
+        (ANGLE, "release", "rotate: discarded because the grasp ended in mode releasing", "armed"),
         (1.2, "", "rotate: angle: found 68.8° (1.2 rad), expected", "holding"),
     ],
 )
@@ -195,7 +195,10 @@ def test_a_known_load_raises_the_grip_within_its_bound():
             # Two tips carry 12 N at 80 % of μ = 0.6.
             assert hand.mode == "holding"
             assert seen.force[-200:].mean() == pytest.approx(expected, rel=KNOWN)
-            assert any("up to 6.0 N along the face" in text for _, _, text in hand.events)
+            assert any(
+                "the load may reach 6.0 N along the object's face" in text
+                for _, _, text in hand.events
+            )
 
 
 def test_each_force_increase_is_reported():
@@ -318,7 +321,7 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
 def test_force_and_angle_setpoints_may_be_sent_separately_and_are_bounded():
     with watched({}) as hand:
         grasped(hand, 8.0)
-        with pytest.raises(Refused, match="hold: force or angle is missing"):
+        with pytest.raises(Refused, match="hold: found neither force nor angle"):
             hand.command("hold")
         with pytest.raises(Refused, match="hold: force: found 40 N"):
             hand.command("hold", force=40.0)
@@ -355,7 +358,7 @@ def test_a_hand_whose_commander_is_silent_follows_its_settings(action, mode):
         assert told == (
             []
             if action == "hold"
-            else [f"the commanding client has been silent for 0.5 s: {action}"]
+            else [f"the client in control has not sent a command for 0.5 s: {action}"]
         )
 
 

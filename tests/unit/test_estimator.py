@@ -338,8 +338,8 @@ def test_an_estimate_says_what_it_found():
     )
     assert re.fullmatch(told, pressed)
     air = repr(estimator(np.zeros(GRID.shape)))
-    assert re.fullmatch(r"ContactEstimate: no contact of more than 0\.\d+ mm", air)
+    assert re.fullmatch(r"ContactEstimate: no contact deeper than 0\.\d+ mm", air)
     assert repr(estimator(np.full(GRID.shape, math.nan))).endswith(
         "not valid: readings are not finite"
     )
-    assert repr(ContactEstimate()) == "ContactEstimate: not valid: no frame yet"
+    assert repr(ContactEstimate()) == "ContactEstimate: not valid: no frame has arrived yet"

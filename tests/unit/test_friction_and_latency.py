@@ -135,7 +135,7 @@ def test_a_sweep_avoids_contact():
     inward = load(None, changes=["hand.open_angle=[-0.4,-0.4]"])
     assert _way(inward, "right") == (-0.4, 0.4)
     narrow = load(None, changes=["hand.q_min=[-0.1,-0.1]", "hand.q_max=[0.15,0.15]"])
-    with pytest.raises(CalibrationError, match=r"found 6° from hand\.open_angle"):
+    with pytest.raises(CalibrationError, match=r"found 6° between hand\.open_angle"):
         _way(narrow, "left")
 
 
@@ -176,7 +176,7 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
 @pytest.mark.parametrize(
     ("profile", "due", "hand", "why"),
     [
-        (None, ARM, (), "found a ramp of 0.0 mm by the joints"),
+        (None, ARM, (), "found a d ramp of 0.0 mm computed from the joints"),
         (None, FORCES, ("simulation.object_angle=0.3",), "neither slides nor tilts"),
         (VELOSTAT, GRASP, (), "found a standard deviation of 1"),
     ],

@@ -95,10 +95,12 @@ def test_a_simulated_hand_waits_for_the_machine_and_reports_it_occasionally(
     assert state.timing.behind_s == pytest.approx(0.9 - 2 * 0.002)
     assert state.timing.late_in_row == 0
     told = [text for level, kind, text in events if kind == "late"]
-    assert told == ["this machine is busy: the simulated hand waited 0.40 s, 0.4 s in total"]
+    assert told == ["this machine is busy: the simulated hand paused for 0.40 s, 0.4 s in total"]
     daemon.loop.advance(2.0)
     told = [text for level, kind, text in events if kind == "late"]
-    assert told[1:] == ["this machine is busy: the simulated hand waited 0.50 s, 0.9 s in total"]
+    assert told[1:] == [
+        "this machine is busy: the simulated hand paused for 0.50 s, 0.9 s in total"
+    ]
 
 
 def test_a_duration_uses_the_time_of_the_machine(on_late_machine):

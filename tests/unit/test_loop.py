@@ -235,10 +235,12 @@ def test_a_tare_reports_the_change_of_the_zero(make):
 
     pascal = daemon.settings.tactile.pascal_per_count
     found = tared(0, 0)
-    assert found.startswith(f"left sensor's zero moved by +100.0 counts ({100 * pascal:+.0f} Pa)")
+    assert found.startswith(
+        f"left sensor's zero offsets changed by +100.0 counts ({100 * pascal:+.0f} Pa)"
+    )
     assert tared(30, 50) == (
-        f"left sensor's zero moved by +30.0 counts ({30 * pascal:+.0f} Pa), "
-        "one cell by +80.0 counts"
+        f"left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa), "
+        "in one cell by +80.0 counts"
     )
     # The warning compares with the last zero offset, not with the first.
     assert tared(-10, -60).endswith("one cell by -150.0 counts")

@@ -187,10 +187,12 @@ def test_a_finger_uses_the_curves_of_its_file(law, tmp_path):
         make_models(load(HIL, tmp_path, profile(other)))
     with pytest.raises(SettingsError, match=r'tactile.calibration: found "" for left'):
         load(HIL, tmp_path, ["tip.physics=measured", "safety.d_max=0.006"])
-    with pytest.raises(SettingsError, match="measured curves need the frames of a real board"):
+    with pytest.raises(
+        SettingsError, match="measured curves require the frames of a physical board"
+    ):
         load(None, tmp_path, ["tip.physics=measured"])
     falling = asdict(law) | {"push": [[-value for value in row] for row in law.push]}
     text = json.loads(file.read_text()) | {"law": falling}
     other.write_text(json.dumps(text))
-    with pytest.raises(CalibrationFileError, match="push must rise with d"):
+    with pytest.raises(CalibrationFileError, match="push must increase with d"):
         load_calibration(other)

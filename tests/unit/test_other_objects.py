@@ -100,7 +100,7 @@ def test_without_an_object_between_the_tips_the_hand_opens(force, frames):
         assert rig.state.reading.q == pytest.approx(rig.settings.hand.open_angle, abs=0.03)
         assert rig.warnings() == ["grasp"]
         assert 0.5 < worst < 4.0
-        assert "nothing between the tips" in next(
+        assert "no object between the tips" in next(
             text for *_, text in rig.events if "between" in text
         )
 

@@ -74,7 +74,7 @@ def test_a_plate_lifts_off_before_tilting_and_the_last_press_remains():
         ("depth=40mm", "expected at most 15.00 mm or 212.1 N"),
         ("force=1e5N", "expected at most"),
         ("depth=1mm tilt=90deg", "expected at most 0.00 mm"),
-        ("depth=1mm speed=0mm/s", "expected above 0"),
+        ("depth=1mm speed=0mm/s", "expected a number above 0"),
     ],
 )
 def test_impossible_presses_are_refused(words, told):

@@ -117,7 +117,7 @@ def test_calibrate_law_names_the_tip_model(tmp_path, capsys):
     told = capsys.readouterr().out
     assert told.startswith("law: solid, bonded, frictionless, ν 0.4")
     assert "springs: E = " in told
-    assert "E alone at 1.2, 3.2, 4.2 mm: 0.2" in told
+    assert "E fitted separately at 1.2, 3.2, 4.2 mm: 0.2" in told
     assert "drifts" not in told
     assert "first presses read +10" in told
     assert "the rubber softens" in told

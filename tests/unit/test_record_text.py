@@ -62,7 +62,7 @@ def test_a_frame_is_a_line():
     cells = np.zeros((3, 4))
     cells[1, 2] = 6000
     assert repr(frame(cells)) == "TactileFrame: left, 3 × 4 cells, 12.0 kPa at most"
-    assert repr(frame(cells, valid=False)).endswith("12.0 kPa at most, the board is lost")
+    assert repr(frame(cells, valid=False)).endswith("12.0 kPa at most, the board is disconnected")
 
 
 def test_a_state_is_a_table_in_a_notebook():

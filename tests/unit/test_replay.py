@@ -90,7 +90,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
     ("held", "told"),
     [
         ({"other": FRAMES[0]}, r"no array 'frames', but other \(4, 6\)"),
-        ({"a": FRAMES, "b": FRAMES}, r"but a \(5, 4, 6\), b \(5, 4, 6\): name the array"),
+        ({"a": FRAMES, "b": FRAMES}, r"but a \(5, 4, 6\), b \(5, 4, 6\); rename the array"),
         ({"other": np.array(["x"])}, "no array 'frames'"),
         ({}, "found no array"),
         ({"frames": FRAMES[0]}, r"expected \[n, rows, cols\]"),
@@ -99,7 +99,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
         ({"frames": -FRAMES.astype(float)}, "outside 0 to 65535"),
         ({"frames": FRAMES * np.nan}, "outside 0 to 65535"),
         ({"frames": FRAMES * 1e305}, "outside 0 to 65535"),
-        ({"frames": FRAMES, "t": np.zeros(5)}, "must increase"),
+        ({"frames": FRAMES, "t": np.zeros(5)}, "expected increasing times"),
         ({"frames": FRAMES, "t": np.arange(4)}, "5 numbers"),
         ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: not finite"),
         ({"frames": FRAMES, "live": np.ones(3)}, "live: found shape"),
@@ -121,5 +121,5 @@ def test_unreadable_files_are_reported(tmp_path):
         load_recording(tmp_path / "bad.npz", 1.0, 1.0)
     with pytest.raises(RecordingError, match=r"no \.npy file"):
         load_recording(tmp_path, 1.0, 1.0)
-    with pytest.raises(TactileError, match="found none for the left finger"):
+    with pytest.raises(TactileError, match="found no file for the left finger"):
         replay("", VirtualClock())

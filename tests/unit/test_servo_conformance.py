@@ -225,7 +225,7 @@ def test_a_finger_outside_the_scene_stays_zero(make, mode):
 def test_a_model_without_current_sensing_only_supports_position_mode(make, mode):
     rig = make(mode, servos={"model": "XL430-W250"})
     if mode != "position":
-        with pytest.raises(ServoError, match=f"XL430-W250 has no {mode} mode"):
+        with pytest.raises(ServoError, match=f"XL430-W250 does not support {mode} mode"):
             rig.servos.connect()
         return
     armed(rig)
@@ -247,12 +247,14 @@ def test_position_limits_that_exclude_the_joint_range_are_reported(monkeypatch):
     rig = DynamixelRig(monkeypatch, servos={"mode": "position"})
     table = rig.bus.servos[1].table
     table.set(reg.MAX_POSITION_LIMIT, 2100)
-    with pytest.raises(ServoError, match=r"servo 2 .*max position limit is 2100, the joint needs"):
+    with pytest.raises(
+        ServoError, match=r"servo 2 .*max position limit is 2100, the joint requires"
+    ):
         rig.servos.connect()
     table.set(reg.MAX_POSITION_LIMIT, 4095)
     rig.servos.connect()
     notices = [each.text for each in rig.servos.notices]
-    assert notices.count("position mode does not limit its current") == 2
+    assert notices.count('servos.mode = "position" does not limit the current of the servo') == 2
     rig.close()
 
 

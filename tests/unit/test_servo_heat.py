@@ -149,7 +149,7 @@ def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
     profile = tmp_path / "my.toml"
     profile.write_text("")
     assert main(["calibrate", "heat", str(profile), "--recording", str(RECORDING)]) == 1
-    assert "found 0 °C of warming, expected at least 8 °C" in capsys.readouterr().err
+    assert "found 0 °C of temperature rise, expected at least 8 °C" in capsys.readouterr().err
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
@@ -203,6 +203,8 @@ def test_if_the_load_needs_the_force_the_configured_action_is_reported_and_taken
         hand.run(2.0)
         assert hand.mode == mode
         (text,) = [text for level, text in heat_events(hand) if level == "error"]
-        assert text.endswith(f"and the load does not allow a weaker grip: {action}")
+        assert text.endswith(
+            f"and the load does not allow a lower grip force; safety.heat_action = {action}"
+        )
         if action == "hold":
             assert hand.state.fault_name == "servos.temperature"

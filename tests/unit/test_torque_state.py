@@ -61,7 +61,7 @@ def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
     assert not daemon.loop.state.torque
     told = [text for _, kind, text in events if kind == "torque.off"]
     assert len(told) == 2, "must be reported once at the beginning and once at the end"
-    assert "the bus is kept silent" in told[0]
+    assert "keeps the bus silent" in told[0]
     assert "confirmed torque off" in told[1]
     command(daemon, "clear")
     assert command(daemon, "stop")["torque_off"] == "confirmed"

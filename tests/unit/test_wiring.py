@@ -99,7 +99,7 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
     command(daemon, "grasp", force=6.0)
     assert greatest_force(daemon, 3.0) < 4.0
     assert daemon.loop.state.fault_name == "joint.swapped"
-    assert "stands still: are servos.ids swapped?" in daemon.loop.state.fault
+    assert "is stationary: check whether servos.ids are swapped" in daemon.loop.state.fault
     assert not daemon.hand.torque_on.any()
 
 
@@ -111,7 +111,10 @@ def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
     command(daemon, "rotate", angle=0.2)
     assert greatest_force(daemon, 1.0) < 10.0
     assert daemon.loop.state.fault_name == "joint.swapped"
-    assert "against the commanded direction: are servos.ids swapped?" in daemon.loop.state.fault
+    assert (
+        "opposite to the commanded direction: check whether servos.ids are swapped"
+        in daemon.loop.state.fault
+    )
 
 
 @pytest.mark.parametrize("off", [0.0, *OFF])
@@ -165,7 +168,7 @@ def test_tips_that_meet_have_nothing_to_grasp(make, wiring):
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 3.0)
     assert texts(events, "joint.opens") == []
-    assert texts(events, "grasp")[0].startswith("nothing between the tips")
+    assert texts(events, "grasp")[0].startswith("no object between the tips")
 
 
 def test_fingers_that_stand_in_the_approach_are_reported(make):

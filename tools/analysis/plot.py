@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 pages:
-  angle      force and energy against θ, with the model's curves
-  landscape  the path over U(d, θ), with its local minimum
+  angle      force and energy versus θ, with the model's curves
+  landscape  the path on the energy landscape U(d, θ), with its local minimum
 
-Needs the extra 'plot'. To draw any field over time, open the file in Foxglove or PlotJuggler."""
+Requires the extra 'plot'. To plot a field over time, open the file in Foxglove or PlotJuggler."""
 
 
 FloatArray = NDArray[np.float64]
@@ -132,10 +132,10 @@ class RecordedRun:
     def contacts(self) -> dict[str, ContactTable]:
         """Return the contact table of each finger that touched; raise Missing if none did."""
         if not self.t.size:
-            raise Missing("contains no hand/state")
+            raise Missing("the recording does not contain hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
         if not touched:
-            raise Missing("contains no contact")
+            raise Missing("the recording does not contain a contact")
         if self.models is None:
             raise Missing(self.why_no_model)
         return {name: self.models[FINGERS.index(name)].table for name in touched}
@@ -160,7 +160,7 @@ def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None
     except RecordingError as error:
         return None, str(error).removeprefix(f"{recording.path}: ")
     except (SettingsError, TactileError, ValueError) as error:
-        return None, f"can't build its model: {error}"
+        return None, f"can't build the contact model of its settings: {error}"
 
 
 def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
@@ -198,7 +198,7 @@ def draw_angle(run: RecordedRun) -> Figure:
     reach = max(1.6 * float(np.quantile(np.abs(np.concatenate(gains) - 1.0), 0.98)), 0.01)
     gain.set_ylim(1.0 - reach, 1.0 + reach)
     gain.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.1)
-    _titled(figure, run, "force and energy against θ")
+    _titled(figure, run, "force and energy versus θ")
     return figure
 
 
@@ -262,7 +262,7 @@ def draw_landscape(run: RecordedRun) -> Figure:
         above.plot(run.t, over, label=name, **LINES[name])
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
     above.axhline(0.0, color=style.GREY, linewidth=0.6)
-    above.set_ylabel("U less that at θ = 0\nand the same d [mJ]")
+    above.set_ylabel("U minus its value at θ = 0\nand the same d [mJ]")
     above.set_xlabel("time [s]")
     _titled(figure, run, "path on the energy landscape")
     return figure

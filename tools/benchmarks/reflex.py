@@ -98,7 +98,7 @@ def _table(
         rows.append(told | {"trials": trials, "no grip": trials - len(found)})
     said = [each["reported ms"] for each in rows if each["held %"] < 100.0]
     slowest = max(said, default=0.0)
-    note = f"  loss reported within {slowest:.0f} ms, aim ≤ {_REPORT_AIM:g}"
+    note = f"  loss reported within {slowest:.0f} ms, target ≤ {_REPORT_AIM:g}"
     return Report(f"{name}, answer", rows, notes=(note,) if said else ())
 
 
@@ -130,7 +130,7 @@ def overloaded(
         loop.advance(0.1)
         grip.command("grasp", force=_FORCE)
         if not grip.until("holding", _GRIP_TIMEOUT):
-            raise RigError(f"the hand did not grip the object: {state.mode} {state.fault}")
+            raise RigError(f"the hand failed to grip the object: {state.mode} {state.fault}")
         loop.advance(1.0 + chance.uniform(0.0, 0.02))
         for k in range(_LOAD_STEP_COUNT):
             grip.plant.load(push=standing * (k + 1) / _LOAD_STEP_COUNT)

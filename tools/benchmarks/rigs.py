@@ -87,7 +87,7 @@ def must_hold(daemon: Daemon) -> None:
     """Raise RigError unless the hand is holding."""
     state = daemon.loop.state
     if state.mode != "holding":
-        raise RigError(f"the hand did not grip the object: {state.mode} {state.fault}")
+        raise RigError(f"the hand failed to grip the object: {state.mode} {state.fault}")
 
 
 class _Canned:

@@ -104,7 +104,10 @@ def _spread(given: dict[str, Any], count: int) -> dict[str, Any]:
     """Expand each list to one value per load; a single value applies to all loads."""
     for name, values in given.items():
         if len(values) not in (1, count):
-            raise CalibrationError(f"--{name}: found {len(values)} values for {count} loads")
+            raise CalibrationError(
+                f"--{name}: found {len(values)} values for {count} loads, expected one value or "
+                "one per load"
+            )
     return {name: np.broadcast_to(given[name], count).copy() for name in TRUTHS if name in given}
 
 
@@ -122,7 +125,7 @@ def _live(
             if count > 1 or truths:
                 load = {name: values[k] / _UNITS[name] for name, values in truths.items()}
                 words = ", ".join(f"{name} {value:g}" for name, value in load.items())
-                told = f"load {k + 1} of {count}: {words or 'uniform pressure'}"
+                told = f"apply load {k + 1} of {count}: {words or 'uniform pressure'}"
                 if arguments.step == "relaxation":
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
@@ -157,7 +160,7 @@ def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | s
     if arguments.move:
         _move(arguments.move, load)
     elif not sys.stdin.readline():
-        raise CalibrationError("ended before all loads were applied")
+        raise CalibrationError("the input ended before all loads were applied")
 
 
 def _move(command: str, load: Mapping[str, float | str]) -> None:
@@ -171,7 +174,7 @@ def _move(command: str, load: Mapping[str, float | str]) -> None:
     except (LookupError, ValueError, OSError, subprocess.TimeoutExpired) as error:
         raise CalibrationError(f"--move: {command}: {error}") from None
     if done != 0:
-        raise CalibrationError(f"--move: {command}: ended with status {done}")
+        raise CalibrationError(f"--move: {command}: the program exited with status {done}")
 
 
 @contextlib.contextmanager
@@ -202,11 +205,11 @@ def _fresh(backend: TactileSensor, clock: RealClock, since: float) -> Iterator[F
         if frame is not last and frame is not None:
             last, waited = frame, clock.now()
             if not frame.valid:
-                raise TactileError(f"the sensor stopped: {getattr(backend, 'error', '')}")
+                raise TactileError(f"the sensor stopped sending: {getattr(backend, 'error', '')}")
             if frame.t_sample >= since:
                 yield frame
         elif clock.now() - waited > _PATIENCE:
-            raise TactileError(f"no new frame within {_PATIENCE:g} s")
+            raise TactileError(f"no new frame from the sensor within {_PATIENCE:g} s")
 
 
 def _say(text: str) -> None:

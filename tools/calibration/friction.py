@@ -62,7 +62,7 @@ def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str
     fits = [_fit(columns, name, settings, unit) for name in names]
     found = round(float(np.mean([fit.coulomb for fit in fits])), 4)
     told = [f"{name}: {_told(fit)}" for name, fit in zip(names, fits, strict=True)]
-    told.append(f"one count of the current is {unit:.4f} N·m")
+    told.append(f"one current count corresponds to {unit:.4f} N·m")
     return "\n  ".join([*told, *write_keys(arguments, {"control": {"joint_friction": found}})])
 
 
@@ -109,7 +109,11 @@ def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArr
         f"{name} {math.degrees(start):.0f}° to {math.degrees(start + way):.0f}°"
         for name, (start, way) in ways.items()
     )
-    bring(arguments, f"friction: keep the space around the fingers free; sweeps {told}", {})
+    bring(
+        arguments,
+        f"friction: keep the space around the fingers free; the joints will sweep {told}",
+        {},
+    )
     with LiveHand(arguments) as hand:
         hand.command("move", **{name: start for name, (start, _) in ways.items()})
         hand.until(
@@ -142,8 +146,8 @@ def _way(settings: Settings, name: str) -> tuple[float, float]:
     way = -min(opens, _WIDEST) if opens > 0.5 * _WIDEST else min(closes, _WIDEST)
     if abs(way) < 0.5 * _WIDEST:
         raise CalibrationError(
-            f"friction: {name}: found {math.degrees(abs(way)):.0f}° from hand.open_angle to the "
-            f"ends of its range, expected at least {math.degrees(0.5 * _WIDEST):.0f}°"
+            f"friction: {name}: found {math.degrees(abs(way)):.0f}° between hand.open_angle and "
+            f"the ends of the joint's range, expected at least {math.degrees(0.5 * _WIDEST):.0f}°"
         )
     return start, way
 

@@ -73,20 +73,20 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
     if fit.std > _STD_MAX:
         raise CalibrationError(
             f"latency: found a standard deviation of {fit.std * 1e3:.1f} ms, expected at most "
-            f"{_STD_MAX * 1e3:g} ms: grasp with more force, and change it several times"
+            f"{_STD_MAX * 1e3:g} ms: grasp with more force, and change the force several times"
         )
     if not _SCALE[0] < fit.scale < _SCALE[1] or fit.residual > _MISFIT_MAX:
         raise CalibrationError(
-            f"latency: found d by the frames at {fit.scale:.2f} of d by the joints, with "
-            f"{fit.residual * 1e3:.2f} mm rms between them, expected {_SCALE[0]:g} to "
-            f"{_SCALE[1]:g} and at most {_MISFIT_MAX * 1e3:g} mm: grasp a flat object that "
-            "neither slides nor tilts"
+            f"latency: found a ratio of d from the frames to d from the joints of {fit.scale:.2f} "
+            f"with a difference of {fit.residual * 1e3:.2f} mm rms, expected a ratio of "
+            f"{_SCALE[0]:g} to {_SCALE[1]:g} and at most {_MISFIT_MAX * 1e3:g} mm: grasp a flat "
+            "object that neither slides nor tilts"
         )
     latency = round(max(set_latency + fit.delay, 0.0), 4)
     told = (
-        f"{latency * 1e3:.1f} ± {fit.std * 1e3:.1f} ms (the daemon used {set_latency * 1e3:g} "
-        f"ms) from {fit.ramps} ramps; d by the frames is {fit.scale:.2f} of d by the joints, "
-        f"{fit.residual * 1e3:.2f} mm rms"
+        f"{latency * 1e3:.1f} ± {fit.std * 1e3:.1f} ms (the daemon used {set_latency * 1e3:g} ms) "
+        f"from {fit.ramps} ramps; d from the frames is {fit.scale:.2f} times d from the joints, "
+        f"difference {fit.residual * 1e3:.2f} mm rms"
     )
     return "\n  ".join([told, *write_keys(arguments, {"tactile": {"latency": latency}})])
 
@@ -96,7 +96,9 @@ def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
     first = arguments.force[0] if arguments.force else settings.control.force_default
     forces = [min(step * first, settings.safety.force_max) for step in _STEPS]
     bring(
-        arguments, f"latency: put an object between the fingers; it is grasped with {first:g} N", {}
+        arguments,
+        f"latency: put an object between the fingers; the hand will grasp it with {first:g} N",
+        {},
     )
     with LiveHand(arguments) as hand:
         for force in forces:

@@ -88,14 +88,16 @@ def build_kernels(
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
-        text = f"{folder.path}: compiling {count} damaged files again"
+        text = f"{folder.path}: compiling {count} corrupted files again"
         tell("warning", "compile", text)
     missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
     if not missing:
         return Built(0, False)
     if folder is None:
         tell(
-            "warning", "compile", "kernels are compiled in this process, which takes half a minute"
+            "warning",
+            "compile",
+            "compiling the kernels in this process, which takes about half a minute",
         )
         return Built(0, False)
     if why_plain:
@@ -165,7 +167,7 @@ class _Build:
         reasons: set[str] = set()
         for name, future in built.items():
             if (reason := future.result()) and reason not in reasons:
-                self._tell("warning", "compile", f"{name} was not compiled ahead: {reason}")
+                self._tell("warning", "compile", f"{name} was not compiled ahead of time: {reason}")
             reasons.add(reason)
         self.failed = reasons != {""}
 
@@ -202,7 +204,7 @@ class _Build:
             return rest
         self._own.process = None
         del self._at[part.name]
-        return f"its process ended with status {process.wait()}"
+        return f"the compiling process exited with status {process.wait()}"
 
 
 def _start() -> subprocess.Popen[str]:

@@ -34,17 +34,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
     add_duration(parser)
     parser.add_argument(
-        "--monitor", action="store_true", help="show the live page in this terminal; q ends both"
+        "--monitor",
+        action="store_true",
+        help="show the live page in this terminal; q ends the page and the daemon",
     )
     parser.add_argument(
-        "--log", choices=("plain", "json"), default="plain", help="lines for people, or JSON"
+        "--log", choices=("plain", "json"), default="plain", help="log format: plain lines, or JSON"
     )
     parser.add_argument(
-        "--log-file", type=Path, metavar="FILE", help="append the log to FILE, not to stderr"
+        "--log-file",
+        type=Path,
+        metavar="FILE",
+        help="append the log to FILE instead of writing it to stderr",
     )
     parser.add_argument("--verbose", action="store_true", help="also log the real-time measures")
     parser.add_argument(
-        "--no-task", action="store_true", help="stay disarmed even if the profile names a task"
+        "--no-task", action="store_true", help="stay disarmed even if the profile defines a task"
     )
     parser.add_argument(
         "--record",
@@ -81,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         return _serve(settings, arguments, signals, log)
     except Interrupted:
-        log.line("info", "end", "ended while starting; torque was never on")
+        log.line("info", "end", "ended during startup; torque was never on")
         return 0
     finally:
         log.close()
@@ -155,7 +160,7 @@ def _serve(
     if state.fault:
         log.plain(f"softfinger: ended with a fault: {state.fault}", "error")
     if state.torque:
-        log.plain("softfinger: torque could not be turned off and may still be on", "error")
+        log.plain("softfinger: torque could not be switched off and may still be on", "error")
     unrecorded = recording is not None and recording.failed
     return 1 if state.fault or state.torque or unrecorded else 0
 

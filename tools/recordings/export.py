@@ -25,8 +25,8 @@ _EPILOG = """\
 Writes one table for each topic, e.g. hand-state.csv, with the time t and a column for each field
 (left.force). The frames of a sensor are also written to tactile-left.npz or tactile-right.npz, as
 t [n] and frames [n, rows, cols], for `softfinger analyse` and numpy.load. Parquet tables also
-contain the bytes of the frames. In all files, t is the time since the recording's first message in
-s by the daemon's clock; that of a frame is the time of its scan."""
+contain the bytes of the frames. In all files, t is the time in s since the recording's first
+message, on the daemon's clock; for a frame, t is the time of its scan."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     for each in files:
         print(each)
     if not files:
-        print(f"export: {path}: contains no messages", file=sys.stderr)
+        print(f"export: {path}: the recording does not contain any messages", file=sys.stderr)
     return 0 if files else 1
 
 
@@ -73,7 +73,9 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
     for topic, word in zip(selected, words, strict=True):
         if topic not in recorded:
             known = ", ".join(each.decode() for each in recorded) or "none"
-            raise RecordingError(f"found topic {word!r}, the recording has {known}")
+            raise RecordingError(
+                f"found topic {word!r}, expected one of the recorded topics: {known}"
+            )
     return selected
 
 
@@ -175,7 +177,9 @@ def export(
             if topic not in tables:
                 name = _file_name(topic)
                 if any(each.stem == name for each in files):
-                    raise RecordingError(f"{recording.path}: two topics would be written to {name}")
+                    raise RecordingError(
+                        f"{recording.path}: two topics would be written to the same file {name}"
+                    )
                 files.append(folder / f"{name}{kind.suffix}")
                 tables[topic] = kind(files[-1], _columns(topic, row))
                 opened.callback(tables[topic].close)

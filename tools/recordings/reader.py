@@ -135,8 +135,8 @@ class Recording:
             names = ", ".join([*self.others][:_OTHERS_NAMED_MAX])
             more = ", …" if len(self.others) > _OTHERS_NAMED_MAX else ""
             self._say(
-                f"{path}: {sum(self.others.values())} messages of {len(self.others)} channels of "
-                f"other programs are left out ({names}{more})"
+                f"{path}: {sum(self.others.values())} messages on {len(self.others)} channels "
+                f"from other programs were skipped ({names}{more})"
             )
 
     @property
@@ -282,7 +282,7 @@ class Recording:
     def _count(self, unpacked: int) -> None:
         self._left -= unpacked
         if self._left < 0:
-            raise ValueError("it unpacks to more data than its size allows")
+            raise ValueError("its unpacked data are suspiciously large for the size of the file")
 
     def _learn(self, content: bytes) -> None:
         from mcap.data_stream import ReadDataStream
@@ -307,12 +307,12 @@ class Recording:
 
     def _damaged(self, error: Exception | None) -> None:
         first = not self.damage
-        usual = "its end is missing" if self.truncated else "a chunk can't be read"
+        usual = "the end of the file is missing" if self.truncated else "a chunk can't be read"
         # The MCAP library's messages about lengths and checksums would not help the user.
         self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
         if first and self._say is not None:
             what = "cut short" if self.truncated else "damaged"
-            self._say(f"{self.path}: {what} ({self.damage}); the intact part is read")
+            self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
         """Check the file's end; return the header's profile, or PROFILE if it is unreadable."""

@@ -70,10 +70,12 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
     """
     message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
-        raise RecordingError(f"{recording.path}: contains no hand/settings")
+        raise RecordingError(f"{recording.path}: the recording does not contain hand/settings")
     text, *calibrations = (message.get(name) for name in _SETTINGS)
     if not (isinstance(text, str) and all(isinstance(each, str) for each in calibrations)):
-        raise RecordingError(f"{recording.path}: its hand/settings lacks {' or '.join(_SETTINGS)}")
+        raise RecordingError(
+            f"{recording.path}: its hand/settings message lacks {' or '.join(_SETTINGS)}"
+        )
     try:
         settings = Settings.model_validate_json(text, strict=False)
     except ValidationError as error:
@@ -118,9 +120,9 @@ def counts_of(
     shape, expected = (message["rows"], message["cols"]), settings.tactile
     if shape != (expected.rows, expected.cols):
         raise RecordingError(
-            f"{recording.path}: its frames have {shape[0]} × {shape[1]} cells, the settings' "
-            f"sensors {expected.rows} × {expected.cols}: the recording or the settings belong to "
-            "another hand"
+            f"{recording.path}: its frames have {shape[0]} × {shape[1]} cells, expected the "
+            f"settings' {expected.rows} × {expected.cols}: the recording or the settings belong "
+            "to another hand"
         )
     return np.frombuffer(message["data"], "<u2").reshape(shape)
 
@@ -138,8 +140,8 @@ def recompute(
     own, calibrations = recorded_settings(recording)
     if not recording.count(schema.INPUT):
         raise RecordingError(
-            f"{recording.path}: contains no hand/input, the inputs of each tick: record with "
-            "--topics all, or with `softfinger run --record FILE`"
+            f"{recording.path}: the recording does not contain hand/input, the inputs of each "
+            "tick: record with --topics all, or with `softfinger run --record FILE`"
         )
     result = Comparison()
     try:
@@ -218,8 +220,9 @@ def _ticks(
         if topic == schema.TACTILE:
             if message.get("seq_step") != 1:
                 raise RecordingError(
-                    f"{recording.path}: contains one of {message.get('seq_step')} frames, "
-                    "expected all: record with stream.tactile_rate equal to the sensors' rate"
+                    f"{recording.path}: contains one in {message.get('seq_step')} frames, "
+                    "expected all frames: record with stream.tactile_rate equal to the sensors' "
+                    "rate"
                 )
             finger = FINGERS.index(message["finger"])
             frames[finger, message["seq"]] = counts_of(recording, message, used)

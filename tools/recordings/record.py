@@ -44,10 +44,11 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
 
 _EPILOG = """\
-Recording ends with Ctrl-C or after --duration. The messages written and lost are then printed.
+Recording ends with Ctrl-C or after --duration, and the numbers of written and lost messages are
+printed.
 With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mcap and so on.
-`replay --recompute` needs --topics all; `run --record` records all topics from the first tick on.
-Exit status: 0 everything was written, 1 not everything was written, with the reason."""
+`replay --recompute` requires --topics all; `run --record` records all topics from the first tick.
+Exit status: 0 everything was written, 1 something was not written, with the reason."""
 
 _SILENCE_TIME = 2.0  # s, time without messages before a notice is printed
 # s between socket reads; waking up for each message would take longer than processing it.
@@ -194,15 +195,15 @@ class RecordingWriter:
         with contextlib.suppress(OSError):
             os.truncate(self.path, self.size)  # Only complete records remain.
         return RecordingError(
-            f"{self.path}: {error.strerror}; earlier messages can be read, `softfinger record "
-            f"--recover {self.path}` repairs the file"
+            f"{self.path}: {error.strerror}; the messages written so far can be read; run "
+            f"`softfinger record --recover {self.path}` to repair the file"
         )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument(
-        "file", type=Path, metavar="FILE.mcap", help="output file; must not exist yet"
+        "file", type=Path, metavar="FILE.mcap", help="output file, which must not exist yet"
     )
     add_stream(parser)
     parser.add_argument(
@@ -210,12 +211,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=topic,
         metavar="TOPIC",
-        help="e.g. state or hand/state, or all (default: all but input, each tick's inputs)",
+        help="e.g. state or hand/state, or all (default: all except input, the inputs of each "
+        "tick)",
     )
     add_split(parser)
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when this pipe closes
     parser.add_argument(
-        "--recover", action="store_true", help="repair a FILE that was cut short; record nothing"
+        "--recover", action="store_true", help="repair a truncated FILE instead of recording"
     )
 
 
@@ -223,7 +225,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Record until the end. Return 1 if the recording is incomplete. Raises SoftfingerError."""
     if arguments.recover:
         messages, damage = recover(arguments.file)
-        state = f"was damaged ({damage}), its intact part is kept" if damage else "sound"
+        state = f"was corrupted ({damage}); only the intact part was kept" if damage else "sound"
         print(f"{arguments.file}: {messages} messages; {state}")
         return 0
     with StopCondition(arguments.duration, arguments.lifeline) as ending:
@@ -367,7 +369,7 @@ class _Recorder:
         received = f" of {self._messages} received" if self._messages > written else ""
         print(f"{written} messages written{received}; lost: {lost or 'none'}")
         if self._unreadable:
-            print(f"{self._unreadable} messages could not be read and were left out")
+            print(f"{self._unreadable} messages could not be read and were skipped")
         if failure:
             to_stderr("record")(failure)
         return 1 if failure else 0
@@ -390,8 +392,8 @@ def recover(path: Path) -> tuple[int, str]:
         return recording.total, ""
     if recording.others:
         raise RecordingError(
-            f"{path}: has channels of other programs, which would be lost; "
-            "`mcap recover` keeps them"
+            f"{path}: contains channels from other programs, which would be lost; use `mcap "
+            "recover`, which keeps them"
         )
     closed = path.with_name(path.name + ".recovered")
     closed.unlink(missing_ok=True)

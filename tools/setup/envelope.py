@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shape", choices=SHAPES, action="append", help="only these shapes")
     for name, metavar, kind in (
         ("--size", "MM", _between("a size of 0.2 to 10000 mm", 0.2, 1e4)),
-        ("--friction", "F", _between("a friction of 1e-5 to 1e5", 1e-5, 1e5)),
+        ("--friction", "F", _between("a friction coefficient of 1e-5 to 1e5", 1e-5, 1e5)),
         ("--mass", "KG", _between("a mass of 1e-5 to 1e5 kg", 1e-5, 1e5)),
     ):
         parser.add_argument(name, type=kind, nargs="+", metavar=metavar, help="only these values")
@@ -69,9 +69,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep",
         type=Path,
         metavar="FILE",
-        help="write the map for use by grasp; after Ctrl-C, the same call continues",
+        help="write the map to a file for use by grasp; after Ctrl-C, the same command continues",
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the map (extra 'plot')")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="plot the map (extra 'plot')")
     add_sweep(parser)
 
 

@@ -94,7 +94,7 @@ class HandKeys:
         """Change the force by one step, and apply it to the current grip, if any."""
         present = self.force(now)
         if not math.isfinite(present):
-            self._commander.refuse(now, "grasp: the hand's settings are not known yet")
+            self._commander.refuse(now, "grasp: the hand's settings have not arrived yet")
             return
         step = next(step for limit, step in _STEPS if present + 0.01 * sign <= limit)
         target = round(step * (round(present / step) + sign), 3)
@@ -136,7 +136,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "change the force. If the output is not a terminal, print a plain line every second."
     )
     add_stream(parser, addresses, client=True)
-    parser.add_argument("--plain", action="store_true", help="print plain lines, not the page")
+    parser.add_argument(
+        "--plain", action="store_true", help="print plain lines instead of the page"
+    )
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when this pipe closes
 
 

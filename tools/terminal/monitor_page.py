@@ -63,8 +63,8 @@ _KEYS = {
     "q": "quit",
 }
 _KEYS_EXPLAINED = (
-    ("w", "restarts the profile's task, while disarmed"),
-    ("+ -", "increase or reduce the force, also of a current grip"),
+    ("w", "restarts the profile's task (only while disarmed)"),
+    ("+ -", "increase or reduce the force, including that of the current grip"),
 )
 
 # (label, field, factor, decimals, unit, field of the standard deviation)
@@ -131,7 +131,7 @@ class MonitorPage:
             badge = _BADGES["disarmed"]
         left = Text.assemble((" softfinger ", "bold"), (f" {feed.mode.upper() or '—'} ", badge))
         if status == "waiting":
-            right = Text("○ no stream yet ", WARN)
+            right = Text("○ no stream has arrived yet ", WARN)
         elif status == "live":
             right = Text.assemble(("● live ", GOOD), (f"{format_value(feed.rate, 0)} Hz ", DIM))
         else:
@@ -157,8 +157,8 @@ class MonitorPage:
                 Text(what + " (or it requires --keys)" * (not self.guarded), WARN), width
             )
         if feed.state.schema != SCHEMA:
-            what = f" the stream has schema {feed.state.schema}, this page knows {SCHEMA}"
-            return Text(what + "and shows the fields that it knows", WARN)
+            what = f" the stream has schema {feed.state.schema}, this page supports {SCHEMA}"
+            return Text(what + "and shows only known fields", WARN)
         lately = feed.waited(now)
         if lately > DELAY_MIN:
             what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"

@@ -38,17 +38,17 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-RECENT_TIME = 3.0  # s, time window over which waits for a busy machine are added up
-EVENT_COUNT_MAX = 200  # maximum number of stored events
-GLOSSARY = (  # meanings of the terms shown on the pages
-    ("d", "displacement of the object's face into the tip"),
-    ("θ", "tilt of the object's face against the tip"),
+RECENT_TIME = 3.0  # s, time window for the sum of waits for a busy machine
+EVENT_COUNT_MAX = 200  # number of stored events
+GLOSSARY = (  # meanings of the terms on the pages
+    ("d", "displacement of the tip by the object's face"),
+    ("θ", "tilt of the object's face relative to the tip"),
     ("force", "F(d, θ), contact force on the tip, normal to the face"),
     ("energy", "U(d, θ), elastic energy in the tip"),
     ("±", "one standard deviation"),
-    ("map age", "time since the newest pressure map was measured"),
-    ("joint, goal", "present and requested angle; positive closes"),
-    ("current, bound", "motor current, and the limit that its goal allows"),
+    ("map age", "age of the newest pressure map"),
+    ("joint, goal", "current and goal angle; positive when closing"),
+    ("current, bound", "motor current and its limit in the current goal"),
     ("object", "angle and width of the object between the tips"),
 )
 # Relative force increase above which the page reports that the grip force was raised.
@@ -341,7 +341,7 @@ class Commander:
     def send(self, now: float, label: str, command: str, **fields: float) -> None:
         """Send ``command`` with ``fields``; label its reply with ``label``."""
         if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
-            self.refuse(now, f"{label}: dropped, the daemon doesn't answer")
+            self.refuse(now, f"{label}: discarded because the daemon does not respond")
             return
         if (
             command == "stop"
@@ -380,8 +380,8 @@ class Commander:
                 if overdue or (not each.warned and now - each.sent >= SILENCE_TIME):
                     each.warned = True
                     timeout = f"{REPLY_TIMEOUT:g} s"
-                    so_far = f"within {timeout}" if overdue else f"yet, {timeout} at most"
-                    self.refuse(now, f"{each.label}: no answer from {self._address} {so_far}")
+                    so_far = f"within {timeout}" if overdue else f"yet, waiting up to {timeout}"
+                    self.refuse(now, f"{each.label}: no reply from {self._address} {so_far}")
                 if overdue:
                     self._close(each)
                 continue

@@ -187,7 +187,7 @@ class Site:
             if not self._allows(request):
                 return self._exchange(connection, request)
         if not here or origins not in known:
-            return connection.respond(403, "only for pages of this machine")
+            return connection.respond(403, "only pages served from this machine may connect")
         if upgrade and path in self._routes:
             return None
         if upgrade or path != "/":
@@ -203,7 +203,10 @@ class Site:
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
         """Redirect browsers with the one-time code to the page with the token; refuse others."""
         if not self._code or not _has(request, "code", self._code):
-            said = "This page needs the newest address that softfinger view prints; each works once"
+            said = (
+                "Open this page with the newest address printed by softfinger view; each "
+                "address works only once"
+            )
             return connection.respond(403, said)
         self.announce()
         response = connection.respond(303, "")
@@ -246,7 +249,7 @@ class Site:
         assert page.request is not None
         allowed = self._send is not None and self._allows(page.request)
         async for text in page:
-            answer = "✗ needs the token that the terminal prints"
+            answer = "✗ commands require the token printed in the terminal"
             if allowed:
                 async with self._at_once:
                     answer = await self._in_thread(text)
@@ -286,7 +289,7 @@ class Site:
         if name != "stop" and math.isnan(age):
             return f'✗ {name}: expected "seen", the time of its picture'
         if name != "stop" and not age < self._stale:
-            return f"✗ {name}: dropped, the page is {age:.0f} s behind"
+            return f"✗ {name}: discarded because the page is {age:.0f} s behind"
         try:
             remaining = self._stale if name == "stop" else self._stale - age
             assert self._send is not None
@@ -374,11 +377,11 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
                 secret = f"/?token={token}" if away else ""
                 print(f"view: ws://{address}{secret} for Foxglove; layout: {LAYOUT}")
             if live and not away:
-                print(f"view: http://{address}/?token={token} to see and command the hand")
+                print(f"view: http://{address}/?token={token} to view and command the hand")
             if away:
                 site.announce()
             else:
-                print(f"view: http://{address}/ to see it", flush=True)
+                print(f"view: http://{address}/ to view the hand", flush=True)
             if foxglove is None and not away and not arguments.no_browser:
                 # Omit the token, because other users may be able to see the browser's command line.
                 webbrowser.open(f"http://{address}/")
@@ -388,7 +391,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
             recorder.close()
             site.end()
             serving.join()
-    _say(f"{pictures.seen} states seen, {pictures.unreadable} messages could not be read")
+    _say(f"{pictures.seen} states received, {pictures.unreadable} messages could not be read")
     if pictures.seen == 0:
         raise ViewError(f"{arguments.file or arguments.address}: received nothing to show")
 

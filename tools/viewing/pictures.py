@@ -384,7 +384,9 @@ class Pictures:
             if ratio >= _LIMIT_FRACTION
         ]
         if self.states and state.schema != schema.SCHEMA:
-            notes.append(f"the stream has schema {state.schema}, this page knows {schema.SCHEMA}")
+            notes.append(
+                f"the stream has schema {state.schema}, this page supports {schema.SCHEMA}"
+            )
         return notes
 
     def _force_increase(self) -> str:

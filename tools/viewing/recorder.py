@@ -31,8 +31,8 @@ class PageRecorder:
         """Start a recording, or end the running one, and return a line about the result."""
         try:
             from softfinger.tools.processes.child_processes import RecorderError, RecorderProcess
-        except ImportError:  # This system does not have termios.
-            return "✗ record: only on Linux and macOS; use softfinger record"
+        except ImportError:  # The system has no termios.
+            return "✗ record: available only on Linux and macOS; use softfinger record instead"
         with self._lock:
             if self._process is not None:
                 return f"✓ {self._end()}"

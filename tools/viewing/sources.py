@@ -65,7 +65,7 @@ def follow(
             if silent != (began - last > _SILENCE_TIME):
                 silent = not silent
                 where = waiting(arguments.address, arguments.keys)
-                say(where if silent else "the stream has begun")
+                say(where if silent else "the stream has started")
             pictures.draw()
             # Even on a slow machine, use at most half of the CPU time.
             worked = time.thread_time() - worked

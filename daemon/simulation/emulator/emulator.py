@@ -362,7 +362,7 @@ class Emulator:
             except PlateError as error:
                 return f"error: {error}"
             if missing := presses.keys() - self._sources.keys():
-                return f"error: press: no sensor under the {missing.pop()} tip"
+                return f"error: press: the scene has no sensor under the {missing.pop()} tip"
             for finger, sequence in presses.items():
                 plate = self._plates.setdefault(finger, Plate())
                 plate.go(sequence, now)
@@ -386,9 +386,12 @@ class Emulator:
         turns = [word.partition("=") for word in words]
         for finger, _, pose in turns:
             if finger not in FINGERS or pose not in _TURN_GOALS or self._servos is None:
-                return f"error: turn: expected left or right={'|'.join(_TURN_GOALS)}, and servos"
+                return (
+                    f"error: turn: expected left or right={'|'.join(_TURN_GOALS)}; the scene "
+                    "must have servos"
+                )
             if self._servos.bus.servos[FINGERS.index(finger)].torque_on:
-                return f"error: turn: torque of the {finger} servo is on"
+                return f"error: turn: torque is on in the {finger} servo, expected torque off"
         for finger, _, pose in turns:
             joint = FINGERS.index(finger)
             self.hand.drive(

@@ -58,7 +58,7 @@ class LinkFolder:
             link = path / name
             if link.exists() and not link.is_symlink():
                 self.close()
-                raise FolderError(f"{link}: exists and is not a link; move it elsewhere")
+                raise FolderError(f"{link}: exists but is not a link; move it elsewhere")
 
     def _take(self, path: Path) -> int:
         while True:
@@ -70,7 +70,7 @@ class LinkFolder:
                 os.close(lock)
                 raise FolderError(
                     f"{self.path}: in use by another emulator (process {holder or 'unknown'}); "
-                    "end it or choose another --dir"
+                    "end that emulator or select another --dir"
                 ) from None
             # The previous holder may have removed the file between the open and the lock.
             with contextlib.suppress(FileNotFoundError):

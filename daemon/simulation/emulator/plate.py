@@ -65,7 +65,7 @@ class PlatePress:
         if self.pressure > 0.0:
             return f"{self.pressure / 1e3:g} kPa on all cells"
         if self.d <= 0.0:
-            return "clear of the tip"
+            return "the plate does not touch the tip"
         return f"{self.d * 1e3:.3f} mm at {math.degrees(self.theta):.2f}°, {self.force:.3f} N"
 
 
@@ -110,7 +110,7 @@ def _value(name: str, text: str) -> float:
     if not math.isfinite(value) or (name != "tilt" and value < 0.0):
         raise PlateError(f"press: {name}={text}: expected a number with {' or '.join(units)}")
     if name == "speed" and value == 0.0:
-        raise PlateError("press: speed: expected above 0")
+        raise PlateError("press: speed: expected a number above 0")
     return value
 
 

@@ -388,7 +388,8 @@ class SimulatedHand:
         row = self._rows[number % len(self._rows)]
         if row.number != number:
             raise LookupError(
-                f"sample {number} is no longer stored; {self.sample_count} were taken"
+                f"sample {number} is no longer stored; only the latest of {self.sample_count} "
+                "samples are kept"
             )
         return row
 
