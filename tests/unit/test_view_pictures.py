@@ -2,12 +2,15 @@
 
 import json
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from softfinger.daemon.client.stream import read
+from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.kinematics.contact.closed_form import Fingertip
@@ -15,6 +18,7 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.terminal.heatmap import LEVELS
+from softfinger.tools.viewing import pictures
 from softfinger.tools.viewing.hand_drawing import (
     finger_lines,
     footprint,
@@ -79,6 +83,39 @@ def test_the_grid_is_read_from_the_frame() -> None:
     assert on_picture(GRIDS[1], np.zeros((1, 2)))[0] == pytest.approx(
         [25 + 0.002 / 0.0012, 15 - 0.001 / 0.0019]
     )
+
+
+# Colours
+
+
+def contrast(*colours: str) -> float:
+    """Return the contrast of two colours by WCAG 2."""
+
+    def luminance(colour: str) -> float:
+        parts = (int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
+        linear = [p / 12.92 if p < 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+        return float(np.dot((0.2126, 0.7152, 0.0722), linear))
+
+    low, high = sorted(map(luminance, colours))
+    return (high + 0.05) / (low + 0.05)
+
+
+_TEXTS = ("text", "muted", "warning", "error", "goal", "late", "left", "right", "object")
+
+
+def test_texts_and_mode_strips_have_the_contrast_of_wcag_aa() -> None:
+    css = (Path(pictures.__file__).parent / "web" / "page.css").read_text("utf-8")
+    light, dark = (
+        dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", theme))
+        for theme in re.findall(r"(?ms)^:root.*?\}", css)
+    )
+    for theme in (light, light | dark):
+        for name in _TEXTS:
+            assert contrast(theme[name], theme["card"]) >= 4.5, name
+        for mode in Mode:
+            assert contrast(theme[mode.value], theme["card"]) >= 3.0, mode
+            assert contrast(theme[mode.value], "#ffffff") >= 4.5, mode
+        assert contrast(theme["text"], theme["button"]) >= 4.5
 
 
 # The planar hand

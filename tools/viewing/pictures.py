@@ -31,7 +31,7 @@ from softfinger.daemon.wire.record_text import why_invalid
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.stream_state import StreamState, number, printable, text
-from softfinger.tools.terminal.text_layout import format_microseconds, format_value
+from softfinger.tools.terminal.text_layout import format_value
 from softfinger.tools.viewing import hand_drawing
 from softfinger.tools.viewing.hand_drawing import GOAL, OBJECT, FloatArray, touches
 from softfinger.tools.viewing.landscape import THETA_END, fingers_of, landscape, read_settings
@@ -226,7 +226,7 @@ class Pictures:
             end = 1e3 * energy.d_end  # mm; θ in degrees
             depths = range(0, int(end) + 1, math.ceil(end / 6.0))
             angles = (-40.0, -20.0, 0.0, 20.0, 40.0)
-            texts = [(GOAL, each, -0.06 * end, f"{each:g}°") for each in angles]
+            texts = [(GOAL, each, -0.06 * end, f"{each:g}°".replace("-", "−")) for each in angles]
             texts += [(GOAL, -1.15 * THETA_END, 1.0 * each, f"{each} mm") for each in depths]
             image = _image(energy.levels, -THETA_END, THETA_END, end, 0.0)
             still = {"image": image, "texts": texts}
@@ -415,8 +415,8 @@ class Pictures:
             facts.append(("Loop rate", f"{format_value(times.rates.tick, 0)} Hz"))
             named = {"Loop work": times.compute, "Loop late": times.wake, "Servo bus": times.bus}
             for name, of in named.items():
-                median, tail, most = map(format_microseconds, (of.p50, of.p99, of.max))
-                facts.append((name, f"median {median}, p99 {tail}, max {most} µs"))
+                median, tail, most = (format_value(1e3 * t, 2) for t in (of.p50, of.p99, of.max))
+                facts.append((name, f"median {median}, p99 {tail}, max {most} ms"))
         if who := feed.commander(now):
             facts.append(("Commanded by", who))
         return facts

@@ -73,7 +73,7 @@ class Setting {
     };
   }
 
-  get text() { return `${decimal(this.wanted ?? this.value, 1)} ${this.unit}`; }
+  get text() { return decimal(this.wanted ?? this.value, 1) + this.unit; }
 
   want(value) {
     this.wanted = value;
@@ -145,7 +145,7 @@ function press(command, value) {
 }
 
 function beginControls() {
-  settings.force = new Setting(one("#force"), "N", value => {
+  settings.force = new Setting(one("#force"), " N", value => {
     if (gripping()) pressed.grasp();
     else {
       [settings.force.value, settings.force.wanted] = [value, null];
