@@ -87,6 +87,23 @@ def test_command_line_writes_every_page_in_print_quality(path, inline):
         assert 0.01 < ink < 0.7
 
 
+def test_time_page_shows_every_value_and_its_goal(run):
+    figure = drawn(run, "time")
+    force, angle, d, theta = figure.axes
+    for panel, field, factor in ((force, "force", 1.0), (d, "d", 1e3), (theta, "theta", 57.29578)):
+        for line, name in zip(panel.lines, ("left", "right"), strict=False):
+            assert line.get_label() == name
+            assert np.asarray(line.get_ydata()) == pytest.approx(
+                factor * run.states[f"{name}.{field}"], nan_ok=True
+            )
+    assert np.nanmax(force.lines[2].get_ydata()) == 6.0
+    assert np.nanmax(angle.lines[1].get_ydata()) == pytest.approx(math.degrees(0.1), abs=0.2)
+    assert angle.get_xlim()[1] > 3.0
+    empty = replace(run, states={name: values[:0] for name, values in run.states.items()})
+    with pytest.raises(Missing, match="no hand/state"):
+        plot.PAGES["time"](empty)
+
+
 def test_model_page_has_points_near_the_model_curves(run):
     figure = drawn(run, "angle")
     assert "measured over" in texts(figure)
@@ -119,7 +136,7 @@ def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
     words = ("--format", "svg", "--from", 1, "--to", 2)
     assert call(path, *words, "--out", tmp_path / "a" / "b") == (0, "")
     files = sorted((tmp_path / "a" / "b").iterdir())
-    assert [each.name for each in files] == ["angle.svg", "landscape.svg"]
+    assert [each.name for each in files] == ["angle.svg", "landscape.svg", "time.svg"]
     assert ElementTree.parse(files[0]).getroot().tag.endswith("svg")
     status, said = call(path, "--to", "0.2", "--out", tmp_path / "none")
     assert status == 1
@@ -132,7 +149,7 @@ def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
 
 def test_without_settings_no_model_is_drawn(path, run):
     bare = replace(run, models=None, why_no_model="no reason")
-    for page in plot.PAGES:
+    for page in ("angle", "landscape"):
         with pytest.raises(Missing, match="no reason"):
             plot.PAGES[page](bare)
 

@@ -1,8 +1,7 @@
-"""Run ``softfinger plot FILE.mcap``: plot recorded and modelled forces and energies versus θ.
+"""Run ``softfinger plot FILE.mcap``: plot a recording versus time, and compare it with the model.
 
 The model uses the recorded settings and calibrations. Force and energy are taken from the recorded
-states, which include the modulus factor estimated in grips. To plot values versus time, open the
-file in Foxglove or PlotJuggler.
+states, which include the modulus factor estimated in grips.
 """
 
 from __future__ import annotations
@@ -38,10 +37,12 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 pages:
+  time       force, object angle, displacement and tilt versus time, with the goals
   angle      force and energy versus θ, with the model's curves
   landscape  the path on the energy landscape U(d, θ), with its local minimum
 
-Requires the extra 'plot'. To plot a field over time, open the file in Foxglove or PlotJuggler."""
+Requires the extra 'plot'. To plot other fields over time, open the file in Foxglove or
+PlotJuggler."""
 
 
 FloatArray = NDArray[np.float64]
@@ -52,6 +53,13 @@ LINES: dict[str, dict[str, Any]] = {
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
 _POINTS = 700  # maximum number of points per finger and panel; more points would overlap
+# label, factor, field of the fingers or the object, field of the goal
+_AGAINST_TIME = (
+    ("force F [N]", 1.0, "force", "goal_force"),
+    ("object angle [°]", DEGREES, "angle", "goal_angle"),
+    ("displacement d [mm]", 1e3, "d", ""),
+    ("tilt θ [°]", DEGREES, "theta", ""),
+)
 _CURVES = 5
 _GRID = 241  # landscape nodes per axis
 
@@ -166,6 +174,36 @@ def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None
 def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
     """Add a title with the recording's name and ``text``."""
     figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
+
+
+def draw_time(run: RecordedRun) -> Figure:
+    """Plot each tip's force, displacement and tilt, and the object's angle, versus time.
+
+    The bands are one standard deviation. Grey lines are the goals.
+    """
+    if not run.t.size:
+        raise Missing("contains no hand/state")
+    figure = style.new_figure(7.2, 8.0)
+    panels = figure.subplots(len(_AGAINST_TIME), 1, sharex=True)
+    for panel, (label, factor, field, goal) in zip(panels, _AGAINST_TIME, strict=True):
+        names = [f"{finger}.{field}" for finger in run.fingers]
+        if field == "angle":
+            names = ["object.angle"]
+        for name in names:
+            look = LINES.get(name.partition(".")[0], {"color": style.KINDS[2]})
+            value, spread = (
+                factor * run.states.get(key, np.zeros(len(run.t))) for key in (name, f"{name}_std")
+            )
+            panel.plot(run.t, value, label=name.partition(".")[0], **look)
+            band = {"color": look["color"], "alpha": 0.2, "linewidth": 0.0}
+            panel.fill_between(run.t, value - spread, value + spread, **band)
+        if goal:
+            panel.plot(run.t, factor * run.states[goal], color=style.GREY, label="goal", zorder=1)
+        panel.set_ylabel(label)
+        panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1)
+    panels[-1].set_xlabel("time [s]")
+    _titled(figure, run, "force, angle and displacement against time")
+    return figure
 
 
 def draw_angle(run: RecordedRun) -> Figure:
@@ -310,4 +348,4 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     panel.grid(visible=False)
 
 
-PAGES = {"angle": draw_angle, "landscape": draw_landscape}
+PAGES = {"time": draw_time, "angle": draw_angle, "landscape": draw_landscape}
