@@ -2,8 +2,10 @@
 
 import argparse
 import base64
+import gzip
 import http.client
 import math
+import re
 import select
 import signal
 import socket
@@ -13,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import msgpack
 import numpy as np
@@ -27,9 +30,11 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.record import RecordingWriter
 from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.viewing.page import listen
 from softfinger.tools.viewing.pictures import TOPICS, Pictures, Row
+from softfinger.tools.viewing.saved import save
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
 from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
@@ -454,6 +459,57 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
         finally:
             ending.end()
             thread.join()
+
+
+def stored_in(page: str) -> list[Any]:
+    """Return the scenes, pictures and rows that a saved page contains."""
+    (packed,) = re.findall('id="stored">(.*?)</script>', page)
+    return [orjson.loads(line) for line in gzip.decompress(base64.b64decode(packed)).splitlines()]
+
+
+def test_a_recording_is_saved_as_a_page(recorded, tmp_path):
+    recording, path = Recording(recorded), tmp_path / "run.html"
+    save(path, recording, 0.1, print)
+    page = path.read_text("utf-8")
+    assert "://" not in re.sub("ws://|xmlns=.[^ ]*", "", page)  # loads nothing
+    assert 'name="stop"' not in page
+    scene, *pictures, rows = stored_in(page)
+    assert [mark[3] for mark in scene["marks"]][:2] == ["disarmed → armed", "armed → grasping"]
+    places = [each["place"]["position"] for each in pictures]
+    assert places == pytest.approx([*np.arange(0.0, recording.duration, 0.1), recording.duration])
+    for place, picture in zip(places[1:], pictures[1:], strict=True):
+        assert recording.start + place - picture["time"] == pytest.approx(0.0, abs=0.02)
+    assert {"disarmed", "holding", "rotating"} <= {each["mode"] for each in pictures}
+    assert [row[0] for row in rows] == [*range(len(rows))]
+    assert rows[-1][1] == pytest.approx(recording.end, abs=0.2)
+
+
+def test_a_recording_is_saved_as_a_moving_picture(recorded, tmp_path):
+    path = tmp_path / "run.svg"
+    save(path, Recording(recorded), 0.1, print)
+    assert path.stat().st_size < 100_000
+    lines = [each for each in ElementTree.parse(path).getroot().iter() if "values" in each.attrib]
+    counts = {len(each.attrib["values"].split(";")) for each in lines}
+    assert counts == {1 + math.ceil(Recording(recorded).duration / 0.1)}
+    assert len(lines) >= 6 + 5  # fingers and tips; contacts, arrows and object
+
+
+def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline):
+    with pytest.raises(ViewError, match="pictures, expected at most 6000; choose a lower --rate"):
+        save(tmp_path / "a.html", Recording(recorded), 1e-4, print)
+    with pytest.raises(ViewError, match="No such file or directory"):
+        save(tmp_path / "none" / "a.svg", Recording(recorded), 0.1, print)
+    RecordingWriter(tmp_path / "empty.mcap").close()
+    with pytest.raises(ViewError, match="received nothing to show"):
+        save(tmp_path / "a.html", Recording(tmp_path / "empty.mcap"), 0.1, print)
+    assert not (tmp_path / "a.html").exists()
+    for words, message in (
+        ((recorded, "--save", "a.gif"), "expected a name ending in .html or .svg, found 'a.gif'"),
+        (("--save", "a.html"), "--save needs a recording"),
+    ):
+        done = inline("view", *words)
+        assert done.returncode == 2
+        assert message in done.stderr
 
 
 # Errors

@@ -15,7 +15,7 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.terminal.stream_state import GLOSSARY
 from softfinger.tools.viewing.hand_drawing import COLOURS
 from tests.conftest import until
-from tests.harness.daemon_process import PATIENCE
+from tests.harness.daemon_process import PATIENCE, softfinger
 from tests.harness.daemon_process import ask as command
 from tests.harness.fake_daemon import FakeDaemon
 from tests.harness.headless_browser import Browser, browser_path
@@ -28,6 +28,7 @@ pytestmark = [
 ]
 
 LEASE = 10.0  # s
+SHIM = Path(__file__).parents[2] / "docs" / "iframe-worker.js"
 PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
 # Fraction of a canvas's pixels that have nearly the given colour.
 FRACTION = """((selector, colour) => {
@@ -61,6 +62,14 @@ PALE = """(() => {
     if (contrast < (large ? 3 : 4.5)) found.push(`${element.textContent}: ${contrast.toFixed(2)}`);
   }
   return found;
+})()"""
+# Numbers of the headline that its age covers.
+OVER_NUMBERS = """(() => {
+  const age = document.querySelector(".headline .age").getBoundingClientRect();
+  return [...document.querySelectorAll(".headline :is(h2, span, small):not(.age)")].filter(each => {
+    const { left, right, top, bottom } = each.getBoundingClientRect();
+    return left < age.right && right > age.left && top < age.bottom && bottom > age.top;
+  }).map(each => each.textContent);
 })()"""
 # Buttons and fields that are covered or outside the window.
 COVERED = """[...document.querySelectorAll("button, input, select")].filter(each => {
@@ -246,6 +255,7 @@ def test_stale_data_are_marked(page, fake):
         until(lambda: page.text(".mode") == "No stream")
         everything = {"left", "right", "hand", "plot", "headline", "landscape"}
         assert old() == everything
+        assert page(OVER_NUMBERS) == []
         assert page("[...document.querySelectorAll('.old .age')].every(each => each.textContent)")
         assert page("getComputedStyle(document.querySelector('.mode')).backgroundColor") == (
             "rgb(198, 40, 40)"
@@ -528,7 +538,7 @@ def test_a_recording_is_played(page, tmp_path):
         assert page("document.querySelector('[name=stop]')") is None
         assert page.text(".mode") == "holding"
         until(lambda: page("scene.marks.length") == 3)
-        for colour in ((90, 98, 112), (149, 87, 0), (0, 117, 86)):  # disarmed, grasping, holding
+        for colour in ((100, 109, 124), (158, 93, 0), (0, 122, 90)):  # disarmed, grasping, holding
             until(lambda: page.fraction(".track", colour) > 0.001)  # noqa: B023
         page.focus("#place")
         page.key("Home", "Home", windowsVirtualKeyCode=36)
@@ -550,3 +560,46 @@ def test_a_recording_is_played(page, tmp_path):
         until(lambda: page("document.documentElement?.scrollWidth ?? 1e9") <= 390)
         assert page(COVERED) == []
         viewed.end()
+
+
+def test_a_saved_recording_is_played_from_its_file(page, tmp_path):
+    recorded, path = tmp_path / "a.mcap", tmp_path / "a.html"
+    record_hand(recorded, {30: {"command": "arm"}, 60: {"command": "grasp", "force": 8.0}}, 2.0)
+    assert softfinger("view", recorded, "--save", path).returncode == 0
+    page.open(path.as_uri())
+    until(lambda: page.text("#clock") == "2.0 of 2.0 s")
+    until(lambda: page.text("#playing") == "Play")
+    assert page.text(".mode") == "holding"
+    assert page("past.rows.length") == pytest.approx(19, abs=1)
+    page.focus("#place")
+    page.key("Home", "Home", windowsVirtualKeyCode=36)
+    until(lambda: page.text(".mode") == "disarmed")
+    until(lambda: page.text(".headline p span") == "0.0")  # also while paused
+    assert page("past.rows.every(row => row[1] - view.start < 0.5)")
+    page("document.activeElement.blur()")
+    page.key("Period", ".", text=".")
+    until(lambda: page.text("#mark") == "disarmed → armed")
+    page.key("Space", " ", text=" ")
+    until(lambda: page("picture.place.playing"))
+    until(lambda: page.text(".mode") == "holding")
+    assert page(PALE) == []
+    assert page.browser.requests == [path.as_uri()]
+    page.browser.ask(
+        "Emulation.setEmulatedMedia",
+        features=[{"name": "prefers-reduced-motion", "value": "reduce"}],
+    )
+    page.open(path.as_uri() + "?")
+    assert page("[picture.place.playing, picture.place.position]") == [False, 0]
+
+
+def test_the_search_of_the_site_works_on_pages_opened_as_files(page, tmp_path):
+    (tmp_path / "worker.js").write_text(
+        "addEventListener('message', ({ data }) => postMessage(data + ' found'));"
+    )
+    (tmp_path / "a.html").write_text(f"<body><script>{SHIM.read_text('utf-8')}</script>")
+    page.browser.open((tmp_path / "a.html").as_uri())
+    until(lambda: page("!!document.body"))
+    page("window.worker = new Worker(new URL('worker.js', location))")
+    page("worker.addEventListener('message', ({ data }) => window.came = data)")
+    page("worker.postMessage('grip')")
+    until(lambda: page("window.came") == "grip found")

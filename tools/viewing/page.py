@@ -15,7 +15,6 @@ import json
 import logging
 import math
 import os
-import re
 import secrets
 import socket
 import threading
@@ -23,7 +22,6 @@ import time
 import webbrowser
 from collections.abc import Awaitable, Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
@@ -38,14 +36,14 @@ from softfinger.tools.arguments import client_keys, to_stderr
 from softfinger.tools.processes.compile import build_kernels
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
-from softfinger.tools.terminal.stream_state import GLOSSARY, judge
+from softfinger.tools.terminal.stream_state import judge
+from softfinger.tools.viewing.document import document
 from softfinger.tools.viewing.foxglove_server import LAYOUT, ORIGINS, PROTOCOLS, Foxglove
 from softfinger.tools.viewing.pictures import Pictures, Row
 from softfinger.tools.viewing.recorder import PageRecorder
+from softfinger.tools.viewing.saved import save
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
-_HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in GLOSSARY)
-_WEB = Path(__file__).with_name("web")
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
 _NICENESS = 5  # lower than the priority of any real-time thread
@@ -62,19 +60,6 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 _say = to_stderr("view")
-
-
-def _page() -> str:
-    """Return the page as a single document that includes the style and scripts."""
-    html, style, *scripts = (
-        (_WEB / name).read_text("utf-8")
-        for name in ("page.html", "page.css", "charts.js", "controls.js", "page.js")
-    )
-    parts = {"GLOSSARY": _HELP, "STYLE": style, "SCRIPTS": "".join(scripts)}
-    return re.sub("GLOSSARY|STYLE|SCRIPTS", lambda word: parts[word[0]], html)
-
-
-_PAGE = _page()
 
 
 class _Published(NamedTuple):
@@ -194,8 +179,7 @@ class Site:
             return connection.respond(404, "not found")
         watched = "command" if self._allows(request) else "watch"
         shown = "play" if self._send is None else watched
-        others = rf'<section class="(?!{shown}).*?</section>'
-        response = connection.respond(200, re.sub(others, "", _PAGE, flags=re.S))
+        response = connection.respond(200, document(shown))
         del response.headers["Content-Type"]
         response.headers["Content-Type"] = "text/html; charset=utf-8"
         return response
@@ -332,6 +316,9 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
     os.nice(_NICENESS)
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
+    if recording is not None and arguments.save is not None:
+        save(arguments.save, recording, 1.0 / arguments.rate, _say)
+        return
     keys = client_keys(arguments.keys)
     loop = asyncio.new_event_loop()
     foxglove = Foxglove(loop) if arguments.foxglove is not None else None

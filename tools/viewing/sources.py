@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 from typing import Any
@@ -95,7 +95,7 @@ def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
 
 
 class Playback:
-    """Playback of a recording; ``run`` is executed in a separate thread."""
+    """Playback of a recording, in real time with ``run`` or at any ``position`` with ``show``."""
 
     def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
         self._recording = recording
@@ -105,6 +105,11 @@ class Playback:
         self.playing = True
         self.speed = 1.0
         self.position = 0.0  # s, time since the first message
+        self._messages: Iterator[tuple[bytes, dict[str, Any]]] = iter(())
+        self._ahead: tuple[bytes, dict[str, Any]] | None = None  # next message
+        # Read the settings first, because a recording may contain them only once.
+        for message in islice(recording.messages([schema.SETTINGS]), 1):
+            pictures.take(*message)
 
     def ask(self, wish: str) -> None:
         """Handle a page's request: ``play``, ``pause``, ``speed N`` or a position [s]."""
@@ -128,36 +133,39 @@ class Playback:
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
-        # Read the settings first, because a recording may contain them only once.
-        for message in islice(recording.messages([schema.SETTINGS]), 1):
-            pictures.take(*message)
         while not ending.is_met:
             begun = time.monotonic()
-            if (target := self._target) is not None:
-                self._target, self.position = None, target
-                pictures.clear()
-                messages = recording.messages(TOPICS, target - SECONDS)  # including plot history
-                ahead = next(messages, None)
-            while ahead is not None and (self._is_past(ahead[1]) or not pictures.states):
-                pictures.take(*ahead)
-                ahead = next(messages, None)
-            self.playing &= ahead is not None
             if marks is not None and marks.done():
                 pictures.mark(marks.result())
                 marks = None
-            pictures.draw(
-                {
-                    "position": self.position,
-                    "start": recording.start,
-                    "duration": recording.duration,
-                    "playing": self.playing,
-                    "speed": self.speed,
-                }
-            )
+            self.show()
             ending.wait(self._period)
             if self.playing:
                 elapsed = self.speed * (time.monotonic() - begun)
                 self.position = min(self.position + elapsed, recording.duration)
+
+    def show(self) -> None:
+        """Read the messages up to the position, and draw a picture."""
+        recording, pictures = self._recording, self._pictures
+        if (target := self._target) is not None:
+            self._target, self.position = None, target
+            pictures.clear()
+            # including plot history
+            self._messages = recording.messages(TOPICS, target - SECONDS)
+            self._ahead = next(self._messages, None)
+        while self._ahead is not None and (self._is_past(self._ahead[1]) or not pictures.states):
+            pictures.take(*self._ahead)
+            self._ahead = next(self._messages, None)
+        self.playing &= self._ahead is not None
+        pictures.draw(
+            {
+                "position": self.position,
+                "start": recording.start,
+                "duration": recording.duration,
+                "playing": self.playing,
+                "speed": self.speed,
+            }
+        )
 
     def _is_past(self, message: dict[str, Any]) -> bool:
         at = number(message, "timestamp") - self._recording.start

@@ -30,6 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.mcap",
         help="show a recording instead of the stream",
     )
+    parser.add_argument(
+        "--save",
+        type=_saved,
+        metavar="OUT",
+        help="save the recording and end: OUT.html is a page that plays without softfinger, "
+        "OUT.svg a moving picture of the hand",
+    )
     add_stream(parser, addresses)
     parser.add_argument(
         "--foxglove",
@@ -74,6 +81,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _saved(text: str) -> Path:
+    if not text.endswith((".html", ".svg")):
+        raise argparse.ArgumentTypeError(f"expected a name ending in .html or .svg, found {text!r}")
+    return Path(text)
+
+
 def _any_port(text: str) -> int:
     return int(number(text, "a port, 0 to 65535", 0.0, 65535.0, includes_low=True))
 
@@ -90,6 +103,9 @@ def run(arguments: argparse.Namespace) -> int:
             "the file directly in Foxglove",
             file=sys.stderr,
         )
+        return 2
+    if arguments.save is not None and arguments.file is None:
+        print("view: --save needs a recording, found no FILE.mcap", file=sys.stderr)
         return 2
     arguments.address, arguments.commands = arguments.address
     require("view")

@@ -204,7 +204,7 @@ function plotKey({ key }) {
 }
 
 // The colours follow the system's theme or the user's choice on the page.
-const dark = matchMedia("(prefers-color-scheme: dark)");
+const dark = matchMedia("(prefers-color-scheme: dark)"), still = matchMedia("(prefers-reduced-motion: reduce)");
 const stored = () => { try { return localStorage.getItem("theme") ?? "auto"; } catch { return theme; } };
 let theme = "auto";
 
@@ -245,7 +245,14 @@ function begin() {
     make(one(".keys"), "dd", "", meaning);
   }
   beginKeys();
-  connect();
+  const recorded = one("#stored").textContent;
+  recorded ? play(recorded) : connect();
+}
+
+function take(given) {
+  [picture, arrived] = [given, performance.now()];
+  view.newest = given.row;
+  view.start = given.place?.start ?? null;
 }
 
 function connect() {
@@ -257,10 +264,8 @@ function connect() {
   stream.onmessage = message => {
     const given = JSON.parse(message.data);
     if (given.palette) return layOut(given);
-    [picture, arrived] = [given, performance.now()];
+    take(given);
     past.add(given.rows, given.first);
-    view.newest = given.row;
-    view.start = given.place?.start ?? null;
     if (drawing) return more = true;
     drawing = true;
     next();  // Request the next picture while drawing this one. A hidden page requests only one more.
@@ -271,6 +276,39 @@ function connect() {
       more = false;
     });
   };
+}
+
+// Play a recording that is stored in the page: JSON lines with scenes, their pictures and, last, all rows.
+async function play(text) {
+  const packed = new Blob([Uint8Array.from(atob(text), each => each.charCodeAt(0))]);
+  const lines = (await new Response(packed.stream().pipeThrough(new DecompressionStream("gzip"))).text()).split("\n");
+  const pictures = [], all = new History();
+  all.rows = JSON.parse(lines.pop());
+  let layout = "", shown = null, last = performance.now(), changed = last;
+  for (const line of lines) line.startsWith('{"live"') ? layout = line : pictures.push([layout, line]);
+  const { period } = JSON.parse(layout), place = { ...JSON.parse(pictures[0][1]).place, playing: !still.matches };
+  const ask = wish => {
+    const [name, value] = wish.split(" ");
+    if (name === "speed") place.speed = +value;
+    else if (name !== "play" && name !== "pause") place.position = +wish;
+    else if (place.playing = name === "play") place.position %= place.duration;
+  };
+  const step = () => {
+    const now = performance.now(), elapsed = (now - last) / 1000;
+    last = now;
+    if (place.playing) place.position = Math.min(place.position + place.speed * elapsed, place.duration);
+    if (place.playing || player.wishes.length) changed = now;
+    player.wishes.splice(0).forEach(ask);
+    if (now > changed + 3 * READABLE) return;  // The numbers have reached their last values.
+    place.playing &&= place.position < place.duration;
+    const [above, line] = pictures[Math.min(Math.round(place.position / period), pictures.length - 1)];
+    if (above !== shown) layOut(JSON.parse(shown = above));
+    take({ ...JSON.parse(line), place });
+    past.rows = all.rows.slice(0, all.from(picture.time)).filter(row => row[0] >= picture.first);
+    show();
+  };
+  step();
+  setInterval(step, 1000 * period);
 }
 
 begin();

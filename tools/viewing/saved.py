@@ -1,0 +1,120 @@
+"""Save a recording as a page that plays without a server, or as a moving picture of the hand."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+from collections.abc import Callable
+from itertools import chain
+from pathlib import Path
+
+from softfinger.daemon.own_files import write_text
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.viewing.document import document
+from softfinger.tools.viewing.hand_drawing import COLOURS
+from softfinger.tools.viewing.pictures import Pictures, Row
+from softfinger.tools.viewing.sources import Playback, ViewError, marks_of
+
+_PICTURE_COUNT_MAX = 6000  # The page keeps all pictures in memory, about 10 kB each.
+_SCALE = 3000.0  # units of the moving picture per m
+_ARC = 30  # points; of longer lines, every second point is enough for a small picture
+
+
+def save(path: Path, recording: Recording, period: float, say: Callable[[str], None]) -> None:
+    """Save pictures at intervals of ``period`` [s]. The suffix of ``path`` selects the format.
+
+    Raises
+    ------
+    ViewError
+        If the recording is too long or has no states, or if the file cannot be written.
+    """
+    count = 1 + math.ceil(recording.duration / period)
+    if count > _PICTURE_COUNT_MAX:
+        raise ViewError(
+            f"{recording.path}: found {recording.duration:.0f} s, which is {count} pictures, "
+            f"expected at most {_PICTURE_COUNT_MAX}; choose a lower --rate"
+        )
+    scenes, rows, seen = _pictures(recording, period, count, say)
+    if seen == 0:
+        raise ViewError(f"{recording.path}: received nothing to show")
+    if path.suffix == ".svg":
+        text = _moving(scenes, period)
+    else:
+        lines = [*chain.from_iterable((scene, *shown) for scene, shown in scenes), rows]
+        text = document("play", gzip.compress("\n".join(lines).encode(), mtime=0))
+    try:
+        with write_text(path) as file:
+            file.write(text)
+    except OSError as error:
+        raise ViewError(f"{path}: {error.strerror}") from None
+
+
+def _pictures(
+    recording: Recording, period: float, count: int, say: Callable[[str], None]
+) -> tuple[list[tuple[str, list[str]]], str, int]:
+    """Return each scene with its pictures, all plot rows, and the number of states.
+
+    All of them are JSON, as the server sends them to a page.
+    """
+    scenes: list[tuple[str, list[str]]] = []
+    kept: dict[int, str] = {}
+
+    def keep(scene: str, picture: str, rows: list[Row]) -> None:
+        if not scenes or scene != scenes[-1][0]:
+            scenes.append((scene, []))
+        scenes[-1][1].append(picture)
+        kept.update((row.number, row.text) for row in rows)
+
+    pictures = Pictures(keep, lambda: True, say, live=False, period=period)
+    pictures.mark(marks_of(recording))
+    playback = Playback(recording, pictures, period)
+    for k in range(count):
+        playback.position = min(k * period, recording.duration)
+        playback.show()
+    return scenes, f"[{','.join(kept.values())}]", pictures.seen
+
+
+def _moving(scenes: list[tuple[str, list[str]]], period: float) -> str:
+    """Draw the hand as an animated SVG, which needs no scripts."""
+    (box,) = (
+        panel["box"] for panel in json.loads(scenes[0][0])["panels"] if panel["name"] == "hand"
+    )
+    shown = [json.loads(each)["panels"]["hand"]["lines"] for _, kept in scenes for each in kept]
+    left, right, top, bottom = (_SCALE * side for side in box)
+    # Each line is identified by its colour and its place among the lines of this colour.
+    lines: dict[tuple[str, int], tuple[float, list[str]]] = {}
+    for k, drawn in enumerate(shown):
+        places: dict[str, int] = {}
+        for colour, thick, flat in drawn:
+            place = places[colour] = places.get(colour, -1) + 1
+            _, points = lines.setdefault((colour, place), (thick, len(shown) * ["0,0"]))
+            points[k] = _points(flat, left, top)
+    seconds = f"{period * len(shown):.3g}"
+    wide, tall = f"{right - left:.0f}", f"{top - bottom:.0f}"
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" '
+        f'height="{tall}" color="{_hex("goal")}" fill="none" stroke-linejoin="round">'
+    ]
+    for (colour, _), (thick, points) in lines.items():
+        stroke = "currentColor" if colour == "goal" else _hex(colour)
+        look = f'stroke="{stroke}" stroke-width="{_SCALE * thick:.3g}"'
+        parts.append(f'<polyline {look} points="{points[-1]}">')
+        if len(set(points)) > 1:
+            parts.append(
+                f'<animate attributeName="points" calcMode="discrete" dur="{seconds}s" '
+                f'repeatCount="indefinite" values="{";".join(points)}"/>'
+            )
+        parts.append("</polyline>")
+    return "\n".join([*parts, "</svg>\n"])
+
+
+def _points(flat: list[float], left: float, top: float) -> str:
+    pairs = list(zip(flat[::2], flat[1::2], strict=True))
+    if len(pairs) > _ARC:
+        pairs = pairs[::2]
+    return " ".join(f"{_SCALE * x - left:.0f},{top - _SCALE * y:.0f}" for x, y in pairs)
+
+
+def _hex(colour: str) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*COLOURS[colour])
