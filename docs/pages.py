@@ -2,6 +2,7 @@
 
 MkDocs calls the ``on_…`` functions (``hooks`` in mkdocs.yml). `PAGES` contains complete pages, and
 `TABLES` contains tables within pages. All numbers that the code can compute are generated here.
+``python docs/pages.py`` draws docs/pictures/hand.svg, the moving picture of the first page.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ import os
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -687,7 +689,52 @@ def published() -> str:
     return _table(heads, rows)
 
 
+def save_grasp(path: Path) -> None:
+    """Record a simulated grasp in virtual time, and save it as ``softfinger view --save`` does."""
+    from softfinger.daemon.loop.warm_up import LANDSCAPE
+    from softfinger.daemon.profile.settings import Settings
+    from softfinger.testing import VirtualHand
+    from softfinger.tools.processes.compile import build_kernels, print_event
+    from softfinger.tools.recordings.reader import Recording
+    from softfinger.tools.viewing.saved import save
+
+    with TemporaryDirectory() as folder:
+        recorded = Path(folder) / "grasp.mcap"
+        with VirtualHand() as hand, hand.record(recorded):
+            hand.run(0.3)
+            hand.arm()
+            hand.grasp(force=8.0)
+            hand.run(1.7)
+            for angle in (12.0, -12.0, 0.0):
+                hand.rotate(math.radians(angle))
+                hand.run(1.4)
+            hand.release()
+            hand.run(1.0)
+        build_kernels(Settings(), print_event, LANDSCAPE)
+        save(path, Recording(recorded), 0.1, print)
+
+
+@cache  # `mkdocs serve` builds the site after each change
+def grasp_page() -> str:
+    """Return the page that plays the recorded grasp."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "grasp.html"
+        save_grasp(path)
+        return path.read_text(encoding="utf-8")
+
+
+def recorded_grasp() -> str:
+    """Embed the page that plays the recorded grasp."""
+    return (
+        "This is a simulated grasp, saved with `--save`. It plays in your browser:\n\n"
+        '<iframe class="recorded" src="grasp.html" title="A recorded grasp" loading="lazy">'
+        "</iframe>\n\n"
+        '<a href="grasp.html">Open it in the whole window</a>\n'
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "recorded_grasp": recorded_grasp,
     "published": published,
     "checkpoints": checkpoints,
     "rates": rates,
@@ -748,9 +795,12 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add all generated pages."""
+    """Add all generated pages, the icon and the recorded grasp."""
     from mkdocs.structure.files import File
 
+    files.append(File.generated(config, "grasp.html", content=grasp_page()))
+    icon = (ROOT / "tools/viewing/web/icon.svg").read_text("utf-8")
+    files.append(File.generated(config, "icon.svg", content=icon))
     for name, make in PAGES.items():
         files.append(File.generated(config, name, content=make()))
     return files
@@ -805,3 +855,7 @@ def _drawing(found: re.Match[str]) -> str:
 
     text = re.sub(r"<style>.*?</style>", style, text, flags=re.S)
     return text.replace("<svg ", f'<svg class="{name}" ', 1)
+
+
+if __name__ == "__main__":
+    save_grasp(ROOT / "docs" / "pictures" / "hand.svg")
