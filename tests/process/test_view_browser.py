@@ -363,6 +363,10 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         until(lambda: forces(fake)[-1] == 7.3)
         fake.changes = {"goal_force": 7.3}
         until(lambda: page("settings.force.wanted") is None)
+        fake.changes = {"goal_force": 11.0}  # set by another client
+        until(lambda: page.text("#force output") == "" and shows(11.0))
+        fake.changes = {"goal_force": 7.3}
+        until(lambda: page("settings.force.value") == 7.3)
         page.type(number, "99")
         until(lambda: "bad" in page("document.querySelector('#force output').className"))
         assert forces(fake)[-1] == 7.3

@@ -51,6 +51,7 @@ function transmit(lane, { message, answered }) {
 // shows the new value until the hand has reached or refused this value.
 class Setting {
   wanted = null;
+  accepted = NaN;
   value = NaN;
   typing = false;
 
@@ -86,7 +87,7 @@ class Setting {
     send(command, numbers, (done, answer) => {
       this.tell(done ? `✓ ${text} accepted` : answer.startsWith("✗") ? answer : `✗ ${text} was not sent: ${answer}`, !done);
       if (this.wanted !== wanted) return;  // A newer value is in transit.
-      if (done) this.until = Date.now() + 2000; else this.wanted = null;
+      if (done) [this.until, this.accepted] = [Date.now() + 2000, wanted]; else this.wanted = null;
       this.show();
     });
   }
@@ -94,6 +95,10 @@ class Setting {
   // Show the hand's value, which is NaN if it is unknown.
   follow(value) {
     if (!Number.isNaN(value)) this.value = value;
+    if (this.wanted === null && Math.abs(value - this.accepted) > 0.05) {  // Another client has changed it.
+      this.accepted = NaN;
+      this.tell("");
+    }
     const reached = Math.abs(value - this.wanted) < 0.05;
     if (this.wanted !== null && this.until && (reached || Date.now() > this.until)) this.wanted = this.until = null;
     this.show();
