@@ -41,6 +41,7 @@ from softfinger.daemon.perception.hand_state import (
     HistoryRow,
     correct,
     interpolate,
+    is_held,
     predicted_variance,
     reset,
     reset_all,
@@ -226,8 +227,11 @@ def update(
     angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - rotation_since
     angle_innovation = face - (angle_at_scan + h.mean[ANGLE_BIAS + finger])
     d_innovation = d - (d_at_scan + h.mean[D_BIAS + finger])
-    is_held = tip.in_contact and other.in_contact and not cells_respond
-    if is_held and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN:
+    if (
+        is_held(h)
+        and not cells_respond
+        and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN
+    ):
         _set_angle_slopes(h, finger, sense, theta_rate)
         angle_variance = predicted_variance(h) + theta_noise
         h.slopes[:] = 0.0

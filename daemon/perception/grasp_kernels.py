@@ -36,6 +36,7 @@ from softfinger.daemon.perception.hand_state import (
     TrackedTip,
     correct,
     interpolate,
+    is_held,
     motion_of,
     predicted_variance,
 )
@@ -235,7 +236,7 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     grasp.torque_residual[1] = modulus2 * residual2
     grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
     _write_shear(h)
-    if (left.has_new_frame or right.has_new_frame) and left.in_contact and right.in_contact:
+    if (left.has_new_frame or right.has_new_frame) and is_held(h) and not h.is_single:
         left.has_new_frame = right.has_new_frame = False
         if grasp.load_arm > 0.0 and dt > 0.0:
             _update_by_torques(h, dt)

@@ -152,6 +152,7 @@ class HandEstimator:
             (dq1, dq2),
             (current1, current2),
             commanded,
+            goal is not None,
         )
 
     def update(

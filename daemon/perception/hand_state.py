@@ -48,7 +48,7 @@ LAW_POINTS = 17  # nodes in d from 0 to the radius
 _WALK_CLOSING = 2e-5  # m, for d1 + d2; small because the object width is constant
 _WALK_SIDEWAYS = 3e-4  # m, for d1 − d2; the object can move between the tips
 _WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # m, for d1 − d2 if frames do not measure d independently
-_WALK_LOOSE_D = 5e-3  # m, object in contact with only one of two fingers
+_WALK_LOOSE_D = 5e-3  # m, contact without a grip
 _WALK_LOOSE_ANGLE = 2e-2  # rad, same case
 _WALK_ANGLE = 2e-4  # rad, tip creep
 _WALK_D_BIAS = 1e-4  # m, zero drift during sensor warm-up
@@ -131,6 +131,7 @@ class HandFilter(Record):
     inertia: float  # joint inertia [kg·m²]
     load_held: float  # fraction of the tip moment held by the gears when torque decreases
     is_single: bool  # one-finger hand
+    is_gripping: bool  # a grip sets the joint torques
     gain_is_known: bool  # `estimator.free_gain` is false
     t: float  # time of the last reading [s]
     newest_row: int  # index in the history
@@ -243,12 +244,15 @@ def predict(
     dq: FloatPair,
     current: FloatPair,
     goal: FloatPair,
+    is_gripping: bool,
 ) -> None:
     """Predict the state at time ``t`` from a joint reading [rad, rad/s, A].
 
-    ``goal`` is the current commanded by a grip [A], or 0 without a grip.
+    ``goal`` is the current commanded by a grip [A], or 0 if it does not apply. ``is_gripping`` is
+    True while a grip sets the joint torques.
     """
     h = hands[0]
+    h.is_gripping = is_gripping
     dt = t - h.t
     last_speed = h.tip[0].speed, h.tip[1].speed
     for k in range(2):
@@ -359,9 +363,19 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
 
 
 @inner_kernel
+def is_held(h: HandFilter) -> bool:
+    """Return True if all fingers grip an object, whose width then stays constant.
+
+    Without a grip, something else may press on the tips and move freely.
+    """
+    both: bool = h.tip[0].in_contact and h.tip[1].in_contact
+    return h.is_gripping and (both or h.is_single)
+
+
+@inner_kernel
 def _add_process_noise(h: HandFilter, dt: float) -> None:
     """Add ``dt`` seconds of random walk during a contact."""
-    if h.is_single or (h.tip[0].in_contact and h.tip[1].in_contact):
+    if is_held(h):
         sideways = _WALK_SIDEWAYS
         if h.is_single:
             sideways = 0.0
