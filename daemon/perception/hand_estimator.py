@@ -46,7 +46,6 @@ FloatArray = NDArray[np.float64]
 # Standard deviations of the settings.
 _TAPER_ERROR = 0.1  # rad, `object.taper`
 _LATENCY_ERROR = 0.03  # s, `tactile.latency`
-_FRICTION_ERROR = 0.05  # N·m, `control.joint_friction`
 _GOAL_DISTANCE = 0.25  # rad; a joint farther than this from its goal draws the full goal current
 
 
@@ -83,6 +82,8 @@ class HandEstimator:
         state.relaxation_time[:] = settings.tip.relaxation_times
         control = settings.control
         state.torque_constant = control.torque_constant / control.driving
+        current_noise = states.CURRENT_NOISE * state.torque_constant
+        state.torque_noise = max(control.joint_friction, current_noise)
         state.inertia = control.joint_inertia
         state.load_held = control.load_held
         state.is_single = len(self._fingers) == 1
@@ -125,7 +126,7 @@ class HandEstimator:
             (states.ANGLE, 0.0, 1.0),
             (states.TAPER, settings.object.taper, _TAPER_ERROR),
             (states.LATENCY, 0.0, _LATENCY_ERROR),
-            (states.FRICTION, settings.control.joint_friction, _FRICTION_ERROR),
+            (states.FRICTION, settings.control.joint_friction, state.torque_noise),
         ):
             state.prior_mean[at], state.prior_variance[at] = mean, error**2
         state.mean[:] = state.prior_mean

@@ -44,6 +44,11 @@ HISTORY_TIME = 0.5  # s of stored joint motion; older frames are treated as this
 CURRENT_OFF_TIME_MAX = 0.1  # s, maximum time for which a current may differ from its goal
 LAW_POINTS = 17  # nodes in d from 0 to the radius
 
+GATE = 3.0  # standard deviations at which an innovation is clipped
+OUTLIER_GATE = 5.0  # standard deviations beyond which a deviation is a fault
+MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
+MODEL_ERROR_TIME = 0.1  # s, correlation time of these errors
+
 # Random walks during a grip, per √s. docs/estimation.md gives the sources.
 _WALK_CLOSING = 2e-5  # m, for d1 + d2; small because the object width is constant
 _WALK_SIDEWAYS = 3e-4  # m, for d1 − d2; the object can move between the tips
@@ -55,19 +60,12 @@ _WALK_D_BIAS = 1e-4  # m, zero drift during sensor warm-up
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
 _WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times gain
-_WALK_FRICTION = 0.05  # N·m
-_MOTION_ERROR = 0.05  # relative error of the predicted rotation and closing
 _SIDEWAYS_ERROR = 0.1  # fraction of sideways finger motion that shifts the object in the grip
-_MOTION_TIME = 0.1  # s, correlation time of these two errors
 _VELOCITY_TIME = 0.02  # s, correlation time of velocity rounding
 _VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to that before it
-_TORQUE_ERROR_MAX = 0.3  # bound of |TORQUE|
-_LATENCY_MAX = 0.15  # s, bound of LATENCY
-_ROTATION_MAX = 1.0  # rad between two readings; larger predictions are discarded as impossible
-_FREE_TORQUE_TIME = 0.02  # s, averaging time for the torque of a free joint
 _TOUCH_DELAY = 0.1  # s, delay from a touch until a frame shows it
 _CURRENT_ERROR = 0.25  # allowed relative deviation of a current from its goal
-_CURRENT_NOISE = 0.02  # A, additional allowed deviation
+CURRENT_NOISE = 0.02  # A, additional allowed deviation
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
 _NIS_SAMPLES = 100.0  # number of measurements averaged for squared innovations
 
@@ -128,6 +126,7 @@ class HandFilter(Record):
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
     relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
     torque_constant: float  # output torque of a closing joint per current [N·m/A]
+    torque_noise: float  # noise of a moving joint's torque, mainly from its friction [N·m]
     inertia: float  # joint inertia [kg·m²]
     load_held: float  # fraction of the tip moment held by the gears when torque decreases
     is_single: bool  # one-finger hand
@@ -182,11 +181,11 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
             h.mean[i] += gain * innovation
             for j in range(STATES):
                 h.covariance[i, j] -= gain * h.scratch[j]
-        for k in range(TORQUE, TORQUE + 2):
+        for k in (TORQUE, TORQUE + 1, LATENCY):  # These are hardly observable.
+            bound = OUTLIER_GATE * math.sqrt(h.prior_variance[k])
             error = h.mean[k] - h.prior_mean[k]
-            error = min(max(error, -_TORQUE_ERROR_MAX), _TORQUE_ERROR_MAX)
-            h.mean[k] = h.prior_mean[k] + error
-        h.mean[LATENCY] = min(max(h.mean[LATENCY], -h.latency), _LATENCY_MAX)
+            h.mean[k] = h.prior_mean[k] + min(max(error, -bound), bound)
+        h.mean[LATENCY] = max(h.mean[LATENCY], -h.latency)
     h.slopes[:] = 0.0
 
 
@@ -225,7 +224,7 @@ def _walk(h: HandFilter, state: int, per_root_second: float, dt: float) -> None:
 
 
 @inner_kernel
-def _walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: float) -> None:
+def walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: float) -> None:
     """Add process noise to a pair: ``common`` to its mean, ``opposite`` to its difference."""
     alike = common * common * dt
     other = opposite * opposite * dt
@@ -330,7 +329,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left.travel[1] += step1
     right.travel[1] += step2
     # An impossible step, for example due to a taper of 180°, would stay in the state forever.
-    if not (abs(d_step1) + abs(d_step2) < h.radius and abs(rotation) < _ROTATION_MAX):
+    if not abs(d_step1) + abs(d_step2) + abs(rotation) * h.radius < h.radius:
         return
     left.travel[0] += d_step1
     right.travel[0] += d_step2
@@ -341,12 +340,12 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
         h.mean[D + 1] += d_step2
     h.mean[ANGLE] += rotation
     if dt > 0.0:
-        rotation_error = _MOTION_ERROR * rotation
-        closing_error = _MOTION_ERROR * d_step1
+        rotation_error = MODEL_ERROR * rotation
+        closing_error = MODEL_ERROR * d_step1
         sideways_error = 0.5 * _SIDEWAYS_ERROR * (arm1 * step1 - arm2 * step2)
-        samples = _MOTION_TIME / dt
+        samples = MODEL_ERROR_TIME / dt
         h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples
-        _walk_pair(h, D, closing_error, sideways_error, samples)
+        walk_pair(h, D, closing_error, sideways_error, samples)
     for k in range(2):
         # Velocity rounding affects encoder, tips and object together.
         variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
@@ -381,15 +380,15 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
             sideways = 0.0
         elif h.tip[0].gain_is_fixed and h.tip[1].gain_is_fixed:
             sideways = _WALK_SIDEWAYS_FIXED_GAIN
-        _walk_pair(h, D, _WALK_CLOSING, sideways, dt)
+        walk_pair(h, D, _WALK_CLOSING, sideways, dt)
         _walk(h, ANGLE, _WALK_ANGLE, dt)
         for k in range(2):
             _walk(h, D_BIAS + k, _WALK_D_BIAS, dt)
             _walk(h, ANGLE_BIAS + k, _WALK_ANGLE_BIAS, dt)
     else:
-        _walk_pair(h, D, _WALK_LOOSE_D, _WALK_LOOSE_D, dt)
+        walk_pair(h, D, _WALK_LOOSE_D, _WALK_LOOSE_D, dt)
         _walk(h, ANGLE, _WALK_LOOSE_ANGLE, dt)
-    _walk(h, FRICTION, _WALK_FRICTION, dt)
+    _walk(h, FRICTION, h.torque_noise, dt)
     for k in range(2):
         _walk(h, GAIN + k, _WALK_GAIN_FIXED_GAIN if h.tip[k].gain_is_fixed else _WALK_GAIN, dt)
 
@@ -437,7 +436,7 @@ def _measure_free_torque(
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
-    weight = min(dt / _FREE_TORQUE_TIME, 1.0)
+    weight = min(dt / _VELOCITY_TIME, 1.0)
     tip.free_torque += (tip.torque - accelerating - tip.free_torque) * weight
     tip.free_torque_max[0] = max(tip.free_torque_max[0], abs(tip.free_torque))
     if t - tip.window_start > _TOUCH_DELAY:
@@ -453,14 +452,9 @@ def _check_current(grasp: GraspState, finger: int, current: float, goal: float, 
 
     Also measures how long the two have differed by more than a servo's current controller allows.
     """
-    if goal <= 0.0:
-        grasp.current_off_time[finger] = 0.0
-        return current
-    if abs(current - goal) <= _CURRENT_ERROR * goal + _CURRENT_NOISE:
-        grasp.current_off_time[finger] = 0.0
-    else:
-        grasp.current_off_time[finger] += dt
-    return goal
+    is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + CURRENT_NOISE
+    grasp.current_off_time[finger] = grasp.current_off_time[finger] + dt if is_off else 0.0
+    return goal if goal > 0.0 else current
 
 
 @inner_kernel

@@ -31,6 +31,7 @@ def some_hand(rng: np.random.Generator) -> HandFilter:
     root = 1e-2 * rng.normal(size=(STATES, STATES))
     hand.covariance[:] = root @ root.T
     hand.mean[:] = 1e-3 * rng.normal(size=STATES)
+    hand.prior_variance[:] = 1.0
     hand.latency = 1.0
     return hand
 
