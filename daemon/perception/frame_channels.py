@@ -38,6 +38,7 @@ from softfinger.daemon.perception.hand_state import (
     STATES,
     TAPER,
     TORQUE,
+    TORQUE_NOISE,
     D,
     HandFilter,
     HistoryRow,
@@ -304,7 +305,7 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
             h.mean[FRICTION] += 0.5 * (measured - h.prior_mean[FRICTION])
             h.covariance[FRICTION, FRICTION] *= 0.5
     # A load may already act on the object.
-    h.covariance[FRICTION, FRICTION] += h.torque_noise * h.torque_noise
+    h.covariance[FRICTION, FRICTION] += TORQUE_NOISE * TORQUE_NOISE
 
 
 @inner_kernel

@@ -34,6 +34,7 @@ from softfinger.daemon.perception.hand_state import (
     OUTLIER_GATE,
     TAPER,
     TORQUE,
+    TORQUE_NOISE,
     TORQUES,
     D,
     HandFilter,
@@ -119,7 +120,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
         h.slopes[FRICTION] = 1.0
         # After a decrease in torque, the gears may hold any part of the decrease.
         held_torque = min(h.torque_max - torque, h.load_held * torque)
-        variance = h.torque_noise * h.torque_noise + held_torque * held_torque
+        variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
         if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
             h.covariance[FRICTION, FRICTION] += innovation * innovation  # A load has been removed.
         correct(h, TORQUES, innovation, variance, GATE)

@@ -82,8 +82,6 @@ class HandEstimator:
         state.relaxation_time[:] = settings.tip.relaxation_times
         control = settings.control
         state.torque_constant = control.torque_constant / control.driving
-        current_noise = states.CURRENT_NOISE * state.torque_constant
-        state.torque_noise = max(control.joint_friction, current_noise)
         state.inertia = control.joint_inertia
         state.load_held = control.load_held
         state.is_single = len(self._fingers) == 1
@@ -126,7 +124,7 @@ class HandEstimator:
             (states.ANGLE, 0.0, 1.0),
             (states.TAPER, settings.object.taper, _TAPER_ERROR),
             (states.LATENCY, 0.0, _LATENCY_ERROR),
-            (states.FRICTION, settings.control.joint_friction, state.torque_noise),
+            (states.FRICTION, settings.control.joint_friction, states.TORQUE_NOISE),
         ):
             state.prior_mean[at], state.prior_variance[at] = mean, error**2
         state.mean[:] = state.prior_mean

@@ -48,6 +48,7 @@ GATE = 3.0  # standard deviations at which an innovation is clipped
 OUTLIER_GATE = 5.0  # standard deviations beyond which a deviation is a fault
 MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
 MODEL_ERROR_TIME = 0.1  # s, correlation time of these errors
+TORQUE_NOISE = 0.05  # N·m, of a moving joint: its friction changes with place and time
 
 # Random walks during a grip, per √s. docs/estimation.md gives the sources.
 _WALK_CLOSING = 2e-5  # m, for d1 + d2; small because the object width is constant
@@ -65,7 +66,7 @@ _VELOCITY_TIME = 0.02  # s, correlation time of velocity rounding
 _VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to that before it
 _TOUCH_DELAY = 0.1  # s, delay from a touch until a frame shows it
 _CURRENT_ERROR = 0.25  # allowed relative deviation of a current from its goal
-CURRENT_NOISE = 0.02  # A, additional allowed deviation
+_CURRENT_NOISE = 0.02  # A, additional allowed deviation
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
 _NIS_SAMPLES = 100.0  # number of measurements averaged for squared innovations
 
@@ -126,7 +127,6 @@ class HandFilter(Record):
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
     relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
     torque_constant: float  # output torque of a closing joint per current [N·m/A]
-    torque_noise: float  # noise of a moving joint's torque, mainly from its friction [N·m]
     inertia: float  # joint inertia [kg·m²]
     load_held: float  # fraction of the tip moment held by the gears when torque decreases
     is_single: bool  # one-finger hand
@@ -388,7 +388,7 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
     else:
         walk_pair(h, D, _WALK_LOOSE_D, _WALK_LOOSE_D, dt)
         _walk(h, ANGLE, _WALK_LOOSE_ANGLE, dt)
-    _walk(h, FRICTION, h.torque_noise, dt)
+    _walk(h, FRICTION, TORQUE_NOISE, dt)
     for k in range(2):
         _walk(h, GAIN + k, _WALK_GAIN_FIXED_GAIN if h.tip[k].gain_is_fixed else _WALK_GAIN, dt)
 
@@ -452,7 +452,7 @@ def _check_current(grasp: GraspState, finger: int, current: float, goal: float, 
 
     Also measures how long the two have differed by more than a servo's current controller allows.
     """
-    is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + CURRENT_NOISE
+    is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + _CURRENT_NOISE
     grasp.current_off_time[finger] = grasp.current_off_time[finger] + dt if is_off else 0.0
     return goal if goal > 0.0 else current
 
