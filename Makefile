@@ -2,13 +2,13 @@
 # make test: run the first test tier on all processors.  make test-extended: run the second tier (tests marked
 # `extended`).  make test-all: run both tiers.  ARGS selects tests (ARGS=tests/unit) or adds pytest options (ARGS=-n0
 # uses one process). Test files named in ARGS run with their extended tests.
-# make test-arithmetic: run the tests that compare computed numbers, with different arithmetic.
-# make lowest: run servo, settings and wire tests with the oldest packages that pyproject.toml allows.
+# make test-arithmetic: repeat the numerical tests with different floating-point arithmetic.
+# make lowest: run the tests of servos, settings and messages with the oldest packages that pyproject.toml allows.
 # make docs: build the documentation site in build/site.
 # make newest: run a fast subset of the tests with the newest Python on this machine.
 # make release VERSION=1.2.3: set version and changelog, run all checks, build the packages, and print the publishing
 # commands.
-# Each target installs only its own requirements in .venv. PYTHON=python3.13 selects an interpreter (3.11 or later) with
+# Each target installs only its own requirements into .venv. PYTHON=python3.13 selects an interpreter (3.11 or later) with
 # a separate environment, e.g. .venv-3.13.
 
 PYTHON ?= python3
@@ -18,16 +18,16 @@ else
 VENV := .venv
 endif
 BIN := $(VENV)/bin
-# Without this, pip compiles all modules, although most are never imported.
+# With --no-compile, pip does not compile all modules, most of which are never imported.
 PIP_INSTALL := -m pip --disable-pip-version-check install --no-compile
-# CONSTRAINTS= selects the newest dependencies instead of the tested ones.
+# `make CONSTRAINTS=` installs the newest dependencies instead of the tested versions.
 CONSTRAINTS := --constraint constraints.txt
 INSTALL := $(BIN)/python $(PIP_INSTALL) $(CONSTRAINTS)
-WORKERS := $(shell expr $$(nproc) + 2) # some tests wait while others compute
-# Coverage is measured on Python 3.12 and later, where it is nearly free.
+WORKERS := $(shell expr $$(nproc) + 2) # more than processors, because some tests only wait
+# Coverage is measured on Python 3.12 and later, where its overhead is small.
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
 PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
-# Otherwise, all test processes compile the kernels for both kinds of tips at the same time.
+# Compile the kernels for both kinds of tips in advance, so that the test processes do not all compile them.
 COMPILE = $(BIN)/softfinger compile --all && $(BIN)/softfinger compile --all --config solid
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 NEWEST_PIP := build/newest/bin/python $(PIP_INSTALL) --quiet $(CONSTRAINTS)
@@ -47,7 +47,7 @@ TO_TEST := $(VENV)/.ready-test
 TO_DOCUMENT := $(VENV)/.ready-docs
 TO_RELEASE := $(VENV)/.ready-release
 
-# Always write byte code, because a test run starts hundreds of processes.
+# Always write bytecode files, because a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: run test test-extended test-all test-arithmetic warm docs lowest newest lint format release clean
@@ -72,7 +72,7 @@ test-arithmetic: $(TO_TEST)
 	$(BIN)/python -m tests.harness.arithmetic pytest --numprocesses $$(nproc) --dist worksteal \
 		-m 'not extended' $(NUMERICAL_TESTS) $(ARGS)
 
-# Otherwise, all test processes compile byte code at the same time.
+# Compile bytecode in advance, so that the test processes do not all compile it.
 warm: $(TO_TEST)
 	-@$(BIN)/python -m pytest --collect-only --quiet >/dev/null
 
@@ -114,7 +114,7 @@ $(TO_RUN): pyproject.toml constraints.txt
 		|| { echo "softfinger needs Python 3.11 or later; say which with PYTHON=…"; exit 1; }
 	@echo "Setting up $(VENV) once: numpy, numba and seven small packages, about 100 MB to fetch."
 	@$(PYTHON) -m venv $(VENV)
-	@$(INSTALL) --quiet 'pip>=25.1' # first version that installs dependency groups
+	@$(INSTALL) --quiet 'pip>=25.1' # first version with support for dependency groups
 	@$(INSTALL) --editable .
 	@$(BIN)/softfinger compile --config demo
 	@touch $@

@@ -1,6 +1,6 @@
-"""The four links in softfinger/: an unpacked sdist gets them, a clone without links is refused.
+"""Check the four symbolic links in softfinger/, and create them in an unpacked sdist.
 
-All else about the package stands in pyproject.toml.
+A clone without symbolic links is rejected. All other package settings are in pyproject.toml.
 """
 
 from pathlib import Path

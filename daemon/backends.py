@@ -2,8 +2,8 @@
 
 Built-in backends are listed in `BUILT_IN`. Plugins are entry points of installed packages, in the
 groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A plugin is a class,
-or for a shape a function, with the same arguments as the built-in backends. It may define these
-attributes:
+or for a shape a function, with the same arguments as the built-in backends. A plugin may define
+these attributes:
 
 - ``metal``: True (default) if the backend is real hardware.
 - ``hand``: True if the plugin needs the simulated hand, which is then passed to it in the same way
@@ -35,7 +35,7 @@ class Backend(NamedTuple):
 
     load: Callable[[], Any]
     metal: bool = True  # True for real hardware
-    hand: Any = False  # True or, for servos, a hand class if it needs a simulated hand
+    hand: Any = False  # True if it needs a simulated hand; servos may give a hand class instead
     source: str = ""  # plugin name, package and version
     section: type[BaseModel] | None = None  # plugin's settings model
 
@@ -45,7 +45,7 @@ class Backend(NamedTuple):
         return self.source.partition(" ")[0]
 
     def options(self, tables: Mapping[str, Any]) -> tuple[BaseModel, ...]:
-        """Return a plugin's validated settings in a tuple, which is empty if it has no settings."""
+        """Return a tuple with the plugin's validated settings, or an empty tuple if it has none."""
         if self.section is None:
             return ()
         return (self.section.model_validate(tables.get(self.name, {})),)
@@ -91,12 +91,12 @@ def backend(kind: Kind, name: str) -> Backend:
 
 
 def needs_hand(servos: str, tactile: str) -> bool:
-    """Return True if the named servo backend or tactile backend needs the simulated hand."""
+    """Return True if the named servo or tactile backend needs the simulated hand."""
     return bool(backend("servos", servos).hand or backend("tactile", tactile).hand)
 
 
 def known(kind: Kind) -> list[str]:
-    """Return the names of all backends of one kind, beginning with the built-in ones."""
+    """Return the names of all backends of one kind, built-in backends first."""
     return list(dict.fromkeys([*BUILT_IN[kind], *(entry.name for entry in plugins(kind))]))
 
 
@@ -119,7 +119,9 @@ def _plugin(kind: Kind, name: str) -> Backend:
     if not entries:
         raise KeyError(name)
     if len(entries) > 1:
-        raise PluginError(f"{' and '.join(map(source, entries))} have the same name: uninstall one")
+        raise PluginError(
+            f"{' and '.join(map(source, entries))} have the same name: uninstall one of them"
+        )
     (entry,) = entries
     try:
         made = entry.load()
@@ -131,7 +133,10 @@ def _plugin(kind: Kind, name: str) -> Backend:
 
 
 def servo_model(name: str) -> Any:
-    """Return the `ServoModel` of this name. Raises KeyError with the names of all models."""
+    """Return the `ServoModel` of this name.
+
+    If the name is unknown, raises KeyError with a list of all model names.
+    """
     table = import_module("softfinger.daemon.servos.control_table")
     try:
         return table.by_name(name)

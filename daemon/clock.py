@@ -35,9 +35,9 @@ class Clock(Protocol):
 
 
 class LoopClock(Clock, Protocol):
-    """The loop's clock, which also measures the machine's own time."""
+    """The loop's clock, which also provides the machine's real time."""
 
-    behind: float  # s, lag of `now` behind the machine's time since the clock was created
+    behind: float  # s, total delay of `now` relative to the machine's time
 
     def host(self) -> float:
         """Return the machine's monotonic time [s], used to measure computing time and delay."""
@@ -87,7 +87,7 @@ class Deadline:
 
     @classmethod
     def of(cls, port: str) -> Deadline | None:
-        """Return the deadline of the emulator that owns ``port``, or None if there is none."""
+        """Return the deadline of the emulator that owns ``port``, or None if it is a real port."""
         try:
             return cls(Path(port).with_name(cls.NAME))
         except OSError:
@@ -135,8 +135,8 @@ class HandClock:
 
     The time is constant between two sleeps. After a sleep it equals the sleep's deadline, even if
     the machine woke up late. If the machine is late by less than the time to the next deadline, it
-    catches up. Any additional delay is hidden from the hand and added to ``behind``. An emulated
-    hand reads from ``due`` how far its time may advance.
+    catches up. Any additional delay is hidden from the hand and added to ``behind``. For an
+    emulated hand, ``due`` limits how far its time may advance.
     """
 
     pauses_when_late = True
@@ -148,7 +148,7 @@ class HandClock:
         self.behind = 0.0
 
     def now(self) -> float:
-        """Return the hand's time [s], which is the last sleep's deadline."""
+        """Return the hand's time [s], which is the deadline of the last sleep."""
         return self._now
 
     def wall(self) -> float:
@@ -192,7 +192,7 @@ class VirtualClock:
     host = now  # Computations take zero virtual time.
 
     def sleep_until(self, t: float) -> float:
-        """Advance the time to ``t`` unless ``t`` has passed; return 0, since it is never late."""
+        """Advance the time to ``t`` unless ``t`` has passed; return a wake-up delay of 0."""
         if t > self._now:
             self._now = t
         return 0.0

@@ -32,17 +32,20 @@ __all__ = [
 ]
 
 
-_SIMILAR = 0.75  # smallest similarity of a suggested word: about one wrong letter in four
+_SIMILAR = 0.75  # minimum similarity of a suggested word: about one wrong letter in four
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a hint with the most similar known word, or an empty text if none is similar."""
+    """Return a hint with the most similar known word, or an empty string if none is similar."""
     found = difflib.get_close_matches(word[:80], list(known), n=1, cutoff=_SIMILAR)
     return f"; nearest: {found[0]}" if found else ""
 
 
 class SettingsError(SoftfingerError):
-    """Unusable settings. For each error, the message gives file, key, found and expected value."""
+    """Unusable settings.
+
+    For each error, the message gives the file, the key, the value found and the value expected.
+    """
 
 
 class PluginError(SoftfingerError):
@@ -58,7 +61,7 @@ class KeyFileError(SoftfingerError):
 
 
 class NoDescriptor(KeyFileError):
-    """Failure to read keys because the limit of open files has been reached.
+    """Failure to read keys because too many files are open.
 
     The keys themselves may be valid.
     """
@@ -72,7 +75,7 @@ class ServoError(SoftfingerError):
 
 
 class ServosSilent(ServoError):
-    """Servos that have not replied, without any other problem. They may still be starting."""
+    """Servos that have not replied, without any other problem. The servos may still be starting."""
 
 
 class TactileError(SoftfingerError):
@@ -104,19 +107,28 @@ class Reason(StrEnum):
 
 
 _MEANINGS = {
-    Reason.LATE: "The command was too old when it was handled, or a servo's reply was late. It "
-    "has no effect. Send it again if you still want it.",
-    Reason.STOPPED: "The command was received before the last `stop`, or too soon after it. Do "
-    "not repeat it automatically.",
+    Reason.LATE: (
+        "The command was too old when it was processed, or a servo's reply was late. The "
+        "command had no effect. Send it again if it is still needed."
+    ),
+    Reason.STOPPED: (
+        "The command was received before the last `stop`, or too soon after it. Programs must "
+        "not repeat it automatically."
+    ),
     Reason.SUPERSEDED: "A newer `hold` of the same connection replaced this one, or another "
     "command was carried out before this one was repeated.",
-    Reason.BUSY: "Too many commands are waiting, or this client sends too many. Send fewer.",
+    Reason.BUSY: (
+        "Too many commands are waiting, or this client exceeds the command rate. Send fewer "
+        "commands."
+    ),
     Reason.LEASE: "Another client has the lease (`commands.lease`).",
-    Reason.MODE: "The hand does not accept this command in its present mode.",
-    Reason.BOUNDS: "A number is outside the range that the hand accepts.",
-    Reason.SCENE: "The profile lacks something that the command needs: a sensor, servos, a task.",
-    Reason.STATE: "The present state prevents the command: a limit is exceeded, a tip is in "
-    "contact, a tare is in progress, or the servos do not answer.",
+    Reason.MODE: "The hand does not accept this command in its current mode.",
+    Reason.BOUNDS: "A number is out of range.",
+    Reason.SCENE: "The profile lacks a sensor, servos or a task that the command requires.",
+    Reason.STATE: (
+        "The current state prevents the command: a limit is exceeded, a tip is in contact, a "
+        "tare is in progress, or the servos do not reply."
+    ),
     Reason.REQUEST: "The request is malformed: unknown command, or a missing or unknown parameter.",
 }
 
@@ -131,11 +143,11 @@ class Refused(SoftfingerError):
 
 
 class NoStream(SoftfingerError):
-    """Timeout without any stream message. The error text names the address."""
+    """No stream message arrived before the timeout. The error text names the address."""
 
 
 class NotInTime(SoftfingerError, TimeoutError):
-    """Timeout while waiting for a condition. The error text contains the last state."""
+    """The condition was not met before the timeout. The error text contains the last state."""
 
 
 class HandClosed(SoftfingerError):
@@ -147,4 +159,4 @@ class WrongThread(SoftfingerError):
 
 
 class HandFault(SoftfingerError):
-    """Fault that the hand latched during a wait. The error text describes the fault."""
+    """The hand latched a fault while a client was waiting. The error text describes the fault."""

@@ -1,8 +1,8 @@
 """Read user-specified files within size limits, and write files safely in shared folders.
 
-A path from a user or another file may lead to a device, a pipe without a writer, or a file that is
-larger than memory. In a shared folder such as /tmp, another user may have placed a file or a link
-at the output path. Writing through the link would overwrite its target.
+A path given by a user or in another file may lead to a device, a pipe without a writer, or a file
+that is larger than the memory. In a shared folder such as /tmp, another user may have placed a file
+or a link at the output path. Writing through the link would overwrite its target.
 """
 
 from __future__ import annotations
@@ -21,34 +21,37 @@ from softfinger.kinematics.compiled.own_folder import (
     user_cache,
 )
 
-SIZE_MAX = 16 << 20  # bytes, limit for reading a whole file and for an unpacked part of a file
+SIZE_MAX = 16 << 20  # bytes, maximum size of a file read at once, or of an unpacked part
 
 _WORLD_WRITABLE = stat.S_IWOTH
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading. Raises OSError, including for a device or a pipe."""
+    """Open a regular file for reading.
+
+    Raises OSError on failure, and if the path is a device or a pipe.
+    """
     mode = path.stat().st_mode  # Check before opening, because opening can affect a device.
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise OSError(errno.EINVAL, "a device or a pipe, expected a file", str(path))
+        raise OSError(errno.EINVAL, "found a device or a pipe, expected a regular file", str(path))
     no_wait = getattr(os, "O_NONBLOCK", 0)
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | no_wait))
 
 
 def read_file(path: Path, most: int = SIZE_MAX) -> bytes:
-    """Read a file. Raises OSError like `open_regular`, or if it exceeds ``most`` bytes."""
+    """Read a file. Raises OSError like `open_regular`, and if the file exceeds ``most`` bytes."""
     with open_regular(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
-        raise OSError(errno.EFBIG, f"more than {most >> 10} kB", str(path))
+        raise OSError(errno.EFBIG, f"larger than {most >> 10} kB", str(path))
     return data
 
 
 def unpacked_size_max(file: BinaryIO) -> int:
-    """Return the limit for a file's unpacked size: 32 times its size on disk, at least 8 MiB.
+    """Return the maximum unpacked size of a file: 32 times its size on disk, but at least 8 MiB.
 
-    Recordings compress to between a third and a tenth of their size. Holes in a sparse file do not
-    count towards its size.
+    Compression reduces recordings to between a third and a tenth of their size. Holes in a sparse
+    file do not count towards its size.
     """
     found = os.fstat(file.fileno())
     room = 512 * found.st_blocks if HAS_OWNERS else found.st_size
@@ -88,7 +91,7 @@ def runtime_fault() -> str:
 
 
 def shared_folder() -> Path:
-    """Return the user's folder in the temporary folder, where another user may have created it."""
+    """Return the user's folder in the temporary folder; another user may have created it."""
     return Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
 
 
@@ -137,5 +140,5 @@ def _refuse_foreign(path: str, found: os.stat_result) -> None:
     strange = HAS_OWNERS and found.st_uid not in (os.geteuid(), 0)
     link = stat.S_ISLNK(found.st_mode)
     if strange and (link or Path(path).parent.stat().st_mode & _WORLD_WRITABLE):
-        what = "a link" if link else "a file in a folder that all users may write to"
-        raise PermissionError(errno.EPERM, f"{what} that belongs to another user", path)
+        what = "a link" if link else "a file in a world-writable folder"
+        raise PermissionError(errno.EPERM, f"{what} owned by another user", path)

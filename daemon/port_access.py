@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join merely to open a port
+_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join just to open a port
 
 
 def port_group_remedy(path: str) -> str:
     """Return advice for a missing port. A port outside /dev belongs to an emulated hand."""
-    return "plug the adapter in" if path.startswith("/dev/") else "start `softfinger emulate`"
+    return "connect the adapter" if path.startswith("/dev/") else "start `softfinger emulate`"
 
 
 def serial_group() -> str:
@@ -31,7 +31,7 @@ def grant(path: str) -> str:
     except (OSError, KeyError):
         return f"sudo chmod a+rw {path}"
     if group.gr_name in _SYSTEM_GROUPS or not status.st_mode & 0o020:
-        return f"sudo chmod a+rw {path} until it is unplugged; permanently, add a udev rule"
+        return f"sudo chmod a+rw {path} as a temporary fix; for a permanent fix, add a udev rule"
     user = os.environ.get("USER", "")
     if user in group.gr_mem and status.st_gid not in os.getgroups():
         return f"log in again: {user} was added to {group.gr_name} after this login"

@@ -21,7 +21,8 @@ if TYPE_CHECKING:  # Clients that only send commands do not need NumPy.
 FINGERS = ("left", "right")
 STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # default addresses
 COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
-NO_LEASE_COMMANDS = frozenset({"stop", "disarm", "status"})  # can only make the hand safer
+# commands that can only make the hand safer
+NO_LEASE_COMMANDS = frozenset({"stop", "disarm", "status"})
 GRIP_FRACTION = 0.9  # maximum grip force as a fraction of `safety.force_max`
 Event = tuple[str, str, str]  # level, kind, text
 
@@ -50,7 +51,7 @@ class Reading:
 
 @dataclass(slots=True)
 class Frame:
-    """One tactile frame. Its ``data`` is not modified after delivery by the sensor."""
+    """One tactile frame. The sensor does not modify ``data`` after delivery."""
 
     seq: int
     t_sample: float  # estimated mid-scan time of the board [s]
@@ -67,31 +68,32 @@ class Contact:
     t: float = 0.0  # sample time of that frame [s]
     t_arrival: float = 0.0  # arrival time of that frame [s]
     t_valid: float = 0.0  # arrival time of the last frame with a valid estimate [s]
-    invalid: Invalid = Invalid.NO_FRAME  # why the estimate is invalid
-    contact: bool = False  # the tip is in contact
+    invalid: Invalid = Invalid.NO_FRAME  # reason why the estimate is invalid
+    contact: bool = False  # True if the tip is in contact
     d: float = 0.0  # maximum displacement [m]
     theta: float = 0.0  # object angle relative to the tip, in the hand plane [rad]
     tilt_y: float = 0.0  # object angle perpendicular to the hand plane [rad]
     d_std: float = 0.0  # standard deviation of d [m]; see `ContactEstimate`
     theta_std: float = 0.0  # standard deviation of theta [rad]
     gain: float = 1.0  # ratio of measured to modelled pressure
-    modulus_scale: float = 1.0  # ratio of tip modulus to the setting
+    modulus_scale: float = 1.0  # ratio of the tip modulus to its setting
     modulus_scale_std: float = 0.0
     sensor_gain: float = 1.0  # `gain` is modulus_scale · sensor_gain
     sensor_gain_std: float = 0.0
     torque_scale: float = 1.0  # ratio of the torque constant setting to the true value
     torque_scale_std: float = 0.0
-    # Average normalised innovation squared of each sensor channel, about 1 if consistent.
+    # Average normalised innovation squared of each sensor channel; consistent channels give about
+    # 1.
     nis_angle: float = 1.0
     nis_footprint: float = 1.0
     nis_amplitude: float = 1.0
-    misfit: bool = False  # no model contact fits the frame; d and theta may be biased
+    misfit: bool = False  # True if no model contact fits the frame; d and theta may then be biased
     force: float = 0.0  # normal force from the table, modulus_scale · F(d, total tilt) [N]
     energy: float = 0.0  # modulus_scale · U(d, total tilt) [J]
     force_std: float = 0.0  # [N], including table and material-law errors
     shear_x: float = 0.0  # shear force from the newest frame of a solid tip [N]
     shear_y: float = 0.0
-    inside: bool = True  # (d, θ) is inside the model's domain
+    inside: bool = True  # True if (d, θ) is inside the model's domain
 
     @property
     def valid(self) -> bool:
@@ -106,8 +108,8 @@ class ObjectPose:
     valid: bool = False
     angle: float = 0.0
     width: float = 0.0
-    nis_torque: float = 1.0  # average normalised innovation squared, joint torques
-    nis_balance: float = 1.0  # average normalised innovation squared, tip force balance
+    nis_torque: float = 1.0  # average normalised innovation squared of the joint torques
+    nis_balance: float = 1.0  # average normalised innovation squared of the tip force balance
 
 
 @dataclass(slots=True)
@@ -132,19 +134,19 @@ class ServoHeatEstimate:
     case: float = 0.0  # case temperature without the thermometer's quantisation [°C]
     case_std: float = 0.0
     ambient: float = 0.0  # [°C]
-    time_to_limit: float = 3600.0  # time to `safety.temperature_max` at this current, capped [s]
+    time_to_limit: float = 3600.0  # capped time to `safety.temperature_max` at this current [s]
 
 
 @dataclass(slots=True)
 class Timing:
     """Loop timing [s] on this machine's clock."""
 
-    tick_s: float = 0.0  # interval between the starts of the previous and this tick
+    tick_s: float = 0.0  # interval between the starts of the previous tick and this one
     compute_s: float = 0.0  # computing time of the previous tick
     wake_late_s: float = 0.0  # delay of this tick's start relative to its deadline
-    overruns: int = 0  # ticks that took longer than the period
-    late_in_row: int = 0  # consecutive late ticks; 0 if the hand's clock pauses
-    behind_s: float = 0.0  # total time a simulated hand has waited for this machine
+    overruns: int = 0  # number of ticks that took longer than the period
+    late_in_row: int = 0  # number of consecutive late ticks; 0 if the hand's clock pauses
+    behind_s: float = 0.0  # total time for which a simulated hand has waited for this machine
     busy_s: float = 0.0  # duration of a recent stall of this machine, otherwise 0
 
 
@@ -158,9 +160,9 @@ class State:
     mode: str = "disarmed"
     fault: str = ""
     fault_name: str = ""  # limit name in `safety.limits`
-    torque: bool = False  # on, or not confirmed off
-    torque_off: bool = False  # servos confirmed torque off on this tick
-    read_error: str = ""  # servo bus read error on this tick
+    torque: bool = False  # True if torque is on, or if torque off is not confirmed
+    torque_off: bool = False  # True if the servos confirmed torque off on this tick
+    read_error: str = ""  # error of this tick's servo bus read
     write_error: str = ""
     reading: Reading = field(default_factory=Reading)
     contacts: list[Contact] = field(default_factory=lambda: [Contact(), Contact()])
@@ -173,7 +175,7 @@ class State:
 
 
 class SceneParts(NamedTuple):
-    """Fingers in the scene, and presence of servos and sensors."""
+    """Components of the scene: fingers, servos and sensors."""
 
     fingers: tuple[bool, bool]
     has_servos: bool
@@ -200,7 +202,7 @@ class SensorInfo(NamedTuple):
     unit: str  # unit of the published data: "count" or "Pa"
     scale: float  # pressure per data step [Pa]
     calibrated: bool
-    calibration: str  # name and date, empty if uncalibrated
+    calibration: str  # name and date of the calibration, empty if uncalibrated
 
 
 class HandInfo(NamedTuple):

@@ -55,23 +55,24 @@ def _signed(value: float, form: str) -> str:
 _SETTINGS = """\
 # Settings
 
-A profile is a TOML file with the settings that differ from the defaults below, which describe the
-built-in simulated hand. To change a setting for one run, add an option such as
+A profile is a TOML file. It contains only the settings that differ from the defaults below, which
+describe the built-in simulated hand. To change a setting for one run, add an option such as
 `--set loop.rate=1000`. Units are SI unless stated otherwise, and pairs are [left, right]. A hand
 can have one or two fingers, and servos or sensors can be omitted.
 
-To check a profile without starting the daemon or touching hardware, run
-`softfinger config check FILE`. It prints all errors: unknown keys, wrong types, numbers out of
-range, keys that contradict each other, and calibration files that do not match. It also warns of
-settings that are probably wrong: a sensor smaller than the footprint at the set force, and forces
-beyond the servos. The exit status is 1 if there are errors, and 0 if there are only warnings.
-`softfinger run` reports the same errors and warnings at startup.
+To check a profile without starting the daemon or accessing hardware, run
+`softfinger config check FILE`. The command prints all errors: unknown keys, wrong types, numbers
+out of range, contradictory keys, and calibration files that do not match the profile. It also warns
+about settings that are probably wrong, for example a sensor that is smaller than the footprint at
+the configured force, or a force that the servos cannot reach. The exit status is 1 if there are
+errors, and 0 if there are only warnings. `softfinger run` reports the same errors and warnings at
+startup.
 
 To print a section in the terminal, run `softfinger config reference SECTION`.
 
-Editors can complete and check keys with a JSON schema (Even Better TOML in VS Code, Taplo in other
-editors). The first line of each packaged profile names the schema file. To start your own profile,
-create both files:
+With a JSON schema, editors can complete and check keys (Even Better TOML in VS Code, Taplo in other
+editors). The first line of each packaged profile refers to the schema file. To start your own
+profile, create the profile and the schema file:
 
 ```sh
 softfinger config show hil > my.toml
@@ -80,8 +81,8 @@ softfinger config schema > schema.json
 
 ## Profiles
 
-These profiles are installed with softfinger. Select one by its name, for example `--config hil`, or
-select your own profile by its path.
+These profiles are installed with softfinger. Select one of them by name, for example
+`--config hil`. Select your own profile by its path.
 
 """
 
@@ -134,16 +135,17 @@ REQ socket ([the stream](stream.md#commands)). All three use the same names:
 softfinger send grasp force=10N   # {"ok": true, "mode": "grasping"}
 ```
 
-Numbers are in SI units. With `send` they can carry a unit, as in `force=10N` and `angle=8deg`.
+Numbers are in SI units. `softfinger send` also accepts units, as in `force=10N` and `angle=8deg`.
 
-Each command is accepted only in certain modes. Most commands need the lease: after a command, its
-client has the lease for `commands.lease` seconds, and other clients cannot command the hand.
+Each command is accepted only in certain modes. Most commands need the lease. A client that sends
+such a command holds the lease for `commands.lease` seconds. During this time, commands from other
+clients are rejected if they need the lease.
 
-Every reply contains `ok`, and `mode` if the command was carried out. A refusal contains `error`, a
-message for people, and `reason`. Any command except `stop` can be refused with the reasons `mode`,
-`lease`, `late`, `stopped`, `superseded`, `busy` and `request`
-([explanations](stream.md#commands)). The sections below list the further causes. Ranges in numbers
-are those of the built-in hand.
+Every reply contains `ok`, and `mode` if the command was carried out. The reply to a rejected
+command contains `error`, a message for the user, and `reason`. Any command except `stop` can be
+rejected with the reasons `mode`, `lease`, `late`, `stopped`, `superseded`, `busy` and `request`
+([explanations](stream.md#commands)). The sections below list additional causes for each command.
+Numerical ranges are those of the built-in hand.
 
 """
 
@@ -178,10 +180,10 @@ def commands() -> str:
             cells = parameter.unit, allowed or parameter.range or numbers, parameter.meaning
             parts.append(_row(f"`{key}`", *cells))
         if each.reply:
-            parts += ["\n" + _head("field of the reply", "meaning")]
+            parts += ["\n" + _head("reply field", "meaning")]
             parts += [_row(f"`{field}`", REPLY[field]) for field in each.reply]
         if each.refusals:
-            parts += ["\n" + _head("refused as", "if")]
+            parts += ["\n" + _head("reason of the rejection", "cause")]
             parts += [_row(f"`{reason}`", cause) for reason, cause in each.refusals.items()]
     return "".join(parts)
 
@@ -224,8 +226,8 @@ Each limit has one of three levels:
 - `limit`: the daemon restricts the goal.
 - `fault`: the daemon turns torque off until `clear`.
 
-The reaction time starts with the first reading or frame that exceeds the limit. If the setting is
-an age, add it to the reaction time.
+The reaction time starts with the first reading or frame that exceeds the limit. If the setting of a
+limit is an age, add this age to the reaction time.
 
 """
 
@@ -250,9 +252,9 @@ def limits() -> str:
             turns = 2 if lasts else 1  # one to detect the violation, one to confirm it
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
         elif row.check:
-            when = f"{after}a tick ({tick:g} ms)"
+            when = f"{after}one tick ({tick:g} ms)"
         else:
-            when = "at once"
+            when = "immediate"
         keys = ", ".join(_values(settings, row))
         rows.append(_row(f"`{row.name}`", row.quantity, row.level, when, keys and f"`{keys}`"))
     return "".join(rows)
@@ -264,12 +266,12 @@ def limits() -> str:
 _EVENTS = """\
 # Events
 
-The daemon publishes events on the topic [`hand/event`](stream.md). They also appear in its log and
-in `softfinger monitor` and `view`. Each event has a level, a kind and a text. The text gives the
-details, and this table explains the kinds.
+The daemon publishes events on the topic [`hand/event`](stream.md), and writes them to its log.
+`softfinger monitor` and `softfinger view` also show them. Each event has a level, a kind and a text
+with details. The table lists the cause and remedy of each kind.
 
-If [Limits](limits.md) lists the kind of an error as a `fault`, the error turns torque off. Remove
-its cause, then send `clear`.
+If the page [Limits](limits.md) lists the kind of an error with the level `fault`, the error turns
+torque off. Remove the cause of the error, then send `clear`.
 
 """
 
@@ -298,39 +300,40 @@ m, forces in N, pressures in Pa, angles in rad and times in s, unless another un
 _SECTIONS = (
     (
         "Control a hand",
-        "The commands of `AsyncHand` and its methods that wait are awaited; its other methods are "
-        "those of `Hand`.",
+        "`AsyncHand` has the same methods as `Hand`. Commands and methods that wait are coroutines "
+        "and must be awaited.",
         "Hand AsyncHand Subscription AsyncSubscription to_columns",
     ),
     (
         "States, frames and events",
-        "The records that a `Hand` returns.",
+        "`Hand` returns these records.",
         "HandState FingerState ObjectState TactileFrame Event",
     ),
     (
         "Other records of the stream",
-        "The records of the topics that programs rarely need; [the stream](stream.md) lists all "
-        "topics.",
+        "Most programs do not need these records. [The stream](stream.md) lists all topics and "
+        "their fields.",
         "LoopStatistics Spread Rates HandSettings AnsweredCommand TickInput InputReading "
         "InputFinger TrueState TrueFinger TrueObject",
     ),
     (
         "Errors",
-        "Every exception derives from `SoftfingerError`.",
+        "All exceptions derive from `SoftfingerError`.",
         "SoftfingerError Refused Reason NoAnswer NoStream NotInTime HandFault HandClosed "
         "WrongThread SettingsError KeyFileError RecordingError TableError MaterialError",
     ),
     ("Recordings", "", "read_recording"),
     (
         "Contact model and estimator",
-        "These need no daemon. Numbers give numbers, and arrays give arrays.",
+        "These classes work without a daemon. For numbers they return numbers, and for arrays they "
+        "return arrays.",
         "Fingertip Material ContactTable ContactForces Certificate SensorGrid ContactEstimator "
         "ContactEstimate Invalid Readings Uncertainty",
     ),
     (
         "Test kit",
-        "[Test your own controller](test-your-controller.md) shows how to use it. Import these "
-        "names from `softfinger.testing`.",
+        "[Test your own controller](test-your-controller.md) shows how to use these classes. "
+        "Import them from `softfinger.testing`.",
         "testing.virtual.VirtualHand testing.virtual.RecordedHand testing.emulated.EmulatedHand "
         "testing.emulated.EmulatedBus",
     ),

@@ -1,1 +1,1 @@
-"""Programs that computed the package's data files. They can be run only from the source tree."""
+"""Programs for computing the package's data files; they run only from the source tree."""

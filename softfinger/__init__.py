@@ -1,7 +1,7 @@
 """Real-time control of two rotational fingers with soft hemispherical tips.
 
-This module exports the public API. Each name is imported on first access. A client program that
-uses only `Hand` or `AsyncHand` therefore does not load Numba or the control loop.
+This module exports the public API. Each name is imported on first access. Therefore, client
+programs that use only `Hand` or `AsyncHand` do not load Numba or the control loop.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ __all__ = [
     "to_columns",
 ]
 
-# Module of each public name. The imports above are the same, for type checkers.
+# Module of each public name. For type checkers, the imports above declare the same names.
 _PUBLIC = {
     "daemon.client.asynchronous": "AsyncHand AsyncSubscription",
     "daemon.client.command_client": "NoAnswer",

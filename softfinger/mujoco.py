@@ -5,10 +5,10 @@
 pressure under each tip. :class:`MujocoHand` is a profile's hand; the daemon uses it if
 ``servos.backend = "mujoco"``.
 
-The contact law is the kernel that the simulated hand uses (`simulation.physics.tip`). In 3D the
-shear is a vector in the face. Its component along the tilt is d_t. Its component across the tilt
-enters as a variance, because U contains ρ(ζ² + v). The forces f are computed for the end of the
-step (docs/mujoco.md). They are linearly implicit in d, θ and both shears, whose Jacobian rows
+The contact law is the kernel that the simulated hand uses (`simulation.physics.tip`). In 3D, the
+shear is a vector in the face. The component along the tilt is d_t. The component across the tilt is
+treated as a variance, because U contains ρ(ζ² + v). The forces f are computed for the end of the
+step (docs/mujoco.md). The forces are linearly implicit in d, θ and both shears, whose Jacobian rows
 are R:
 
     (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
@@ -56,7 +56,7 @@ __all__ = ["MujocoHand", "SoftTips"]
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
 _ROWS = 4  # rows per tip: d, θ, shear along and across the tilt
-_GAP_MAX = 0.005  # m, largest gap that can close within the next step
+_GAP_MAX = 0.005  # m, maximum gap that can close within the next step
 _VALUE_MIN = 1e-9  # smallest nonzero contact depth [m], friction force [N] and sin θ
 _SHEAR = 2  # row index of the shear along the tilt
 _UNSUPPORTED = (
@@ -66,12 +66,12 @@ _UNSUPPORTED = (
     "joint_load_friction",
     "joint_stribeck",
 )
-# Impedance of joint friction; with MuJoCo's default of 0.9, the joints creep by mrad/s.
+# Impedance of joint friction; with MuJoCo's default of 0.9, the joints creep at several mrad/s.
 _IMPEDANCE = 0.9999
 
 
 class Touch(Record):
-    """One tip on a face in 3D, with vectors in world coordinates."""
+    """Contact of one tip with a face in 3D; vectors are in world coordinates."""
 
     contact: TipContact
     normal: FloatTriple  # m, unit vector from the tip's centre into the face
@@ -101,7 +101,7 @@ def _set_frame(touch: Touch, geometry: FloatArray) -> None:
 
 @inner_kernel
 def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -> float:
-    """Evaluate the contact law for a 2D shear; return the force across, including damping."""
+    """Evaluate the contact law for a 2D shear; return the force across the tilt, with damping."""
     tip = touch.contact
     stiffness = limit = 0.0
     for _ in range(2):
@@ -112,7 +112,8 @@ def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -
         total = math.hypot(tip.tangential, stiffness * touch.shear_across)
         if total <= limit * (1.0 + 1e-9):
             break
-        # The tip slips: scale both shears so that the force returns to the friction cone.
+        # The tip slips, so scale both shear components so that the force returns to the friction
+        # cone.
         tip.shear += (limit / total - 1.0) * tip.tangential / stiffness
         touch.shear_across *= limit / total
     touch.shear[:] = tip.shear * touch.along + touch.shear_across * touch.across
@@ -126,7 +127,7 @@ def press(
     touches: Records[Touch], parameters: Records[Parameters], tables: Records[Table],
     geometry: FloatArray, jacobians: FloatArray, velocity: FloatArray, dt: float, work: Work,
 ) -> None:  # fmt: skip
-    """Evaluate all tips and store rows R [4n, nv], the force along each row, and B in ``work``.
+    """Evaluate all tips; store the rows R [4n, nv], the force along each row, and B in ``work``.
 
     ``geometry`` [n, 10] contains d, centre, axis and foremost point of each tip. ``jacobians``
     [n, 4, 3, nv] contains the tip's position and rotation Jacobians, followed by those of the
@@ -195,7 +196,8 @@ def solve(
         push = p.step * implicit[i] * rows[i]
         matrix[i, :n] += (push * inertial).sum(axis=1)
         matrix[i, n] = force[i] + (push * (acceleration - own)).sum()
-    # Pivoting is unnecessary: B ≥ 0 is diagonal and A is positive, so all leading minors are > 0.
+    # Pivoting is unnecessary: B ≥ 0 is diagonal and A is positive semidefinite, so all leading
+    # minors are > 0.
     for i in range(n):
         matrix[i] /= matrix[i, i]
         for k in range(n):
@@ -233,7 +235,7 @@ class SoftTips:
         represented by its tangent plane. Disable MuJoCo's own collisions for these geoms and for
         the tips.
     table
-        The tip's contact table. If None, it is built from the settings.
+        The tip's contact table. If None, the table is built from the settings.
 
     Raises
     ------
@@ -250,7 +252,7 @@ class SoftTips:
             raise SettingsError("integrator: found RK4, expected Euler, implicit or implicitfast")
         simulation = settings.simulation
         if found := [name for name in _UNSUPPORTED if np.any(getattr(simulation, name))]:
-            raise SettingsError(f"{found[0]}: not in MuJoCo")
+            raise SettingsError(f"{found[0]}: not supported with MuJoCo")
         self._tips = [model.geom(name).id for name in tips]
         self._touching = [model.geom(name).id for name in touching]
         for name, geom in zip(tips, self._tips, strict=True):
@@ -294,7 +296,7 @@ class SoftTips:
         return self._grids[k].pressure(*self._law, d, x, y, self._scale * tip.gain, out)
 
     def add_forces(self, model: Any, data: Any) -> None:
-        """Add the tip forces to ``qfrc_passive``. This is the `mjcb_passive` callback."""
+        """Add the tip forces to ``qfrc_passive``. This method is the `mjcb_passive` callback."""
         if data is not self.data:
             return
         geometry, touching, fromto = self._geometry, self._touching, np.zeros(6)
@@ -317,7 +319,7 @@ class SoftTips:
         solve(*law, work, self._inertial, data.qacc, data.qfrc_passive, self._own)
 
     def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
-        """Set the pressure sensors in each step, because MuJoCo clears them (`mjcb_sensor`)."""
+        """Set the pressure sensors on each step, since MuJoCo clears them (`mjcb_sensor`)."""
         if data is self.data and stage == mujoco.mjtStage.mjSTAGE_VEL:
             is_due = data.time >= self._due
             self._due = data.time + self._period - 1e-9 if is_due else self._due
@@ -370,7 +372,7 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
 
 @kernel
 def set_currents(plants: Records[Plant], control: FloatArray) -> None:
-    """Set both servos' current references [A], which the motor currents follow with a lag."""
+    """Set the current references [A] of both servos; the motor currents follow with a lag."""
     state = plants[0].state
     for j in range(2):
         control[j] = current_reference(plants[0], j, state.position[j], state.velocity[j])
@@ -378,7 +380,7 @@ def set_currents(plants: Records[Plant], control: FloatArray) -> None:
 
 @kernel
 def feel(plants: Records[Plant], touches: Records[Touch], ring: Records[Sample]) -> None:
-    """Copy the MuJoCo tip contacts into the plant and record the samples that are due."""
+    """Copy the tip contacts from MuJoCo to the plant, and record the samples that are due."""
     plant = plants[0]
     for k in range(2):
         plant.stages[0].on_object[k] = touches[k].contact

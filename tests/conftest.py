@@ -1,7 +1,7 @@
-"""Provide shared fixtures: private addresses, complete daemons, and waiting for conditions.
+"""Provide shared fixtures: private addresses, complete daemons and polling of conditions.
 
 Each test process has its own loopback addresses and folders, so that tests can run in parallel. All
-processes that a test starts, directly or indirectly, are ended with the test.
+processes that a test starts, directly or indirectly, are killed when the test ends.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
 from tests.harness.perturbed import Perturbation
 
-# All machines test the same examples, without a deadline. --hypothesis-profile=search tries others.
+# All machines test the same examples, without a deadline; --hypothesis-profile=search tries others.
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("same")
 
 _PORTS = itertools.count(9872)
-_OUR_OWN: set[int] = set()  # child processes not started by a test
+_OUR_OWN: set[int] = set()  # child processes that no test started
 PERTURBATION = pytest.StashKey[Perturbation]()
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
@@ -50,15 +50,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_report_header() -> str:
-    """Show the arithmetic in the header, to help diagnose tests that fail on only one machine."""
+    """Print the floating-point environment in the header, to diagnose machine-specific failures."""
     return f"arithmetic: {arithmetic.described()}"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Handle SIGTERM like Ctrl-C, and adopt orphaned descendants of tests."""
+    """Treat SIGTERM like Ctrl-C, and adopt orphaned descendants of tests."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     descendants.adopt_orphans()
-    # If a test started the tracker, semaphores would be lost at the end of that test.
+    # Start the resource tracker here: one started by a test would be killed with that test.
     resource_tracker.ensure_running()
     _OUR_OWN.update(descendants.running())
     if not hasattr(config, "workerinput"):
@@ -70,7 +70,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip extended tests, unless ``-m`` selects tests or the command line names their file.
+    """Skip extended tests unless ``-m`` selects tests or the command line names their file.
 
     Tests that mostly wait run first, in parallel with tests that compute.
     """
@@ -85,7 +85,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Exclude the modules' million permanent objects from garbage collection."""
+    """Exclude the million permanent objects of the imported modules from garbage collection."""
     if session.config.stash.get(PERTURBATION, None) is not None:
         session.config.stash[PERTURBATION].enter_modules()
     gc.collect()
@@ -93,19 +93,19 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_unconfigure() -> None:
-    """End processes that a crashed test process left and this process has adopted."""
+    """Kill processes that a crashed test process left behind and this process adopted."""
     descendants.end(descendants.running() - _OUR_OWN)
 
 
 @pytest.fixture(autouse=True)
 def ended_with_the_test() -> Iterator[None]:
-    """End the test's remaining child processes; restore signal handlers and garbage collection."""
+    """Kill the test's remaining child processes; restore signal handlers and garbage collection."""
     before = descendants.running()
     handlers = {each: signal.getsignal(each) for each in _SIGNALS}
     yield
     for each, handler in handlers.items():
         signal.signal(each, handler)
-    gc.enable()  # disabled by daemons that run in this process
+    gc.enable()  # daemons in this process disable it
     descendants.end(descendants.running() - before)
 
 
@@ -154,7 +154,7 @@ def profile(tmp_path: Path, addresses: tuple[str, str]) -> Profile:
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Return a function that starts daemons; when the test ends, running daemons are killed."""
+    """Return a function that starts daemons, which are killed when the test ends."""
 
     def run(*words: str) -> Running:
         running = Running(*words)
@@ -181,8 +181,8 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Inline:
-    """Return a function that runs a subcommand in this process."""
-    monkeypatch.setattr(os, "nice", lambda _: 0)  # keep the test process priority
+    """Return a function that runs a subcommand in the test process."""
+    monkeypatch.setattr(os, "nice", lambda _: 0)  # keep the test process's priority
     # Suppress messages about kernel compilation, which only the first test on a machine prints.
     monkeypatch.setattr(kernels, "print_event", lambda *_: None)
 
@@ -204,15 +204,15 @@ def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
         waited = time.monotonic() - begin
         if waited > seconds:
             raise TimeoutError(f"not within {seconds:g} s: {condition}")
-        # Sleep to leave the processor to the awaited process.
+        # Sleep so that the awaited process gets the processor.
         select.select([], [], [], min(0.002 + 0.01 * waited, 0.02))
 
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Return a function that builds daemons on virtual time without sockets.
+    """Return a function that builds daemons in virtual time, without sockets.
 
-    Keyword arguments are sections of the settings.
+    Each keyword argument is a section of the settings.
     """
 
     def build(**sections: Any) -> Daemon:
@@ -228,7 +228,7 @@ def make() -> Iterator[Make]:
 
 @pytest.fixture
 def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set the solid tip's data errors to zero, for frames that are generated from the same data."""
+    """Set the solid tip's data errors to zero, for frames generated from the same data."""
     from softfinger.kinematics.estimation import error_budget, estimator
 
     data = estimator.solid_data

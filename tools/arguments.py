@@ -1,7 +1,7 @@
 """Command-line arguments shared by several subcommands.
 
-Settings are imported only when a profile is loaded, because clients of a running hand do not need
-them.
+The settings module is imported only when a profile is loaded, because clients of a running hand do
+not need it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         "--config",
         type=Path,
         metavar="PROFILE",
-        help="the settings: a TOML file, or a profile name from `softfinger config list`",
+        help="settings: a TOML file, or a profile name listed by `softfinger config list`",
     )
     add_changes(parser)
 
@@ -57,7 +57,7 @@ def add_changes(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="override a setting, e.g. loop.rate=1000; may be repeated",
+        help="override a setting, e.g. loop.rate=1000; can be given several times",
     )
 
 
@@ -147,18 +147,21 @@ def addresses(text: str) -> tuple[str, str]:
 def waiting(address: str, folder: Path | None) -> str:
     """Return the message shown while waiting for the stream, with a hint if there are no keys.
 
-    A daemon that requires keys appears unreachable to a client without keys.
+    To a client without keys, a daemon that requires keys appears unreachable.
     """
     return f"waiting for a stream from {address}{_hint(folder)}"
 
 
 def no_stream(address: str, folder: Path | None) -> str:
     """Return the error message for a stream that has not arrived in time."""
-    return f"no stream from {address} within {WAIT_MAX:g} s; is softfinger running?{_hint(folder)}"
+    return (
+        f"no stream from {address} within {WAIT_MAX:g} s; check that softfinger is "
+        f"running{_hint(folder)}"
+    )
 
 
 def _hint(folder: Path | None) -> str:
-    return " (with access.keys, give --keys FOLDER)" if folder is None else ""
+    return " (if access.keys is set, pass --keys FOLDER)" if folder is None else ""
 
 
 def to_stderr(subcommand: str) -> Callable[[str], None]:
@@ -219,13 +222,16 @@ def add_daemon(
     parser: argparse.ArgumentParser, kind: Callable[[str], Any], client: bool = False
 ) -> None:
     """Add ``--address`` and ``--keys``, and ``--client`` to a program that sends commands."""
-    where = "the daemon's address: tcp://HOST, STREAM,COMMANDS, or one socket"
+    where = "daemon address: tcp://HOST, STREAM,COMMANDS, or a single socket"
     parser.add_argument("--address", type=kind, default="", help=where)
     parser.add_argument(
-        "--keys", type=Path, metavar="FOLDER", help="this client's keys, from `softfinger keys`"
+        "--keys",
+        type=Path,
+        metavar="FOLDER",
+        help="folder with this client's keys, created by `softfinger keys`",
     )
     if client:
-        name = "client name; the lease is bound to it"
+        name = "client name, to which the lease is bound"
         parser.add_argument("--client", default="", help=name)
 
 
@@ -239,8 +245,8 @@ def add_stream(
     parser.add_argument(
         "--no-wait",
         action="store_true",
-        help=f"exit with an error if nothing arrives for {WAIT_MAX:g} s (monitor: also when the "
-        "stream ends)",
+        help=f"exit with an error if nothing arrives for {WAIT_MAX:g} s; `monitor` also exits "
+        "when the stream ends",
     )
     add_duration(parser)
 
@@ -253,7 +259,10 @@ def add_duration(parser: argparse.ArgumentParser) -> None:
 def add_split(parser: argparse.ArgumentParser) -> None:
     """Add ``--split-size`` and ``--split-time``; a recorder's memory use grows with its file."""
     parser.add_argument(
-        "--split-size", type=megabytes, metavar="MB", help="start a new file after this size"
+        "--split-size",
+        type=megabytes,
+        metavar="MB",
+        help="start a new file when this size is reached",
     )
     parser.add_argument(
         "--split-time", type=seconds, metavar="S", help="start a new file after S seconds"
@@ -278,5 +287,5 @@ def topic(text: str) -> bytes:
     name = (text if text.startswith("hand/") else f"hand/{text}").encode()
     if name not in schema.TOPICS:
         known = ", ".join(each.decode().removeprefix("hand/") for each in schema.TOPICS)
-        raise argparse.ArgumentTypeError(f"found topic {text!r}, expected all or one of {known}")
+        raise argparse.ArgumentTypeError(f"found topic {text!r}, expected 'all' or one of {known}")
     return name

@@ -1,8 +1,8 @@
 """Parse the command line and run the selected subcommand.
 
-Each subcommand is a module in a ``tools/`` package and is imported only when called. It defines
-``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user can
-correct, it raises SettingsError (exit status 2), another SoftfingerError, or OSError for a file
+Each subcommand is a module in a ``tools/`` package and is imported only when called. The module
+defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user
+can correct, it raises SettingsError (exit status 2), another SoftfingerError, or OSError for a file
 (exit status 1).
 """
 
@@ -26,7 +26,7 @@ _UNKNOWN = re.compile(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)"
 
 GROUPS = {  # package in tools/ and description of each subcommand
     "run": {
-        "run": ("processes", "run the daemon; without --config, on the built-in simulated hand"),
+        "run": ("processes", "run the daemon; without --config, for the built-in simulated hand"),
         "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),
     },
     "hand": {
@@ -38,15 +38,18 @@ GROUPS = {  # package in tools/ and description of each subcommand
     "data": {
         "record": ("recordings", "record the running daemon's stream into an MCAP file"),
         "replay": ("recordings", "publish a recording again, or recompute it with this version"),
-        "analyse": ("analysis", "compute contact, force and energy over time from frames"),
-        "plot": ("analysis", "draw a recording with the model: forces, energy landscape, errors"),
+        "analyse": ("analysis", "compute contact, force and energy versus time from frames"),
+        "plot": ("analysis", "plot a recording with the model: forces, energy landscape, errors"),
         "export": ("recordings", "export a recording's topics as CSV or Parquet"),
     },
     "machine": {
         "doctor": ("setup", "check ports, servos, boards and this machine, and suggest fixes"),
         "scan": ("setup", "find the servos on a port, at any baud rate"),
         "calibrate": ("calibration", "calibrate joints, sensors and tips, step by step"),
-        "envelope": ("setup", "simulate which shapes, sizes, frictions and masses a hand holds"),
+        "envelope": (
+            "setup",
+            "simulate which shapes, sizes, friction coefficients and masses a hand holds",
+        ),
         "limits": ("setup", "list every limit: condition, consequence, setting"),
         "config": ("setup", "list and show the profiles, and every setting with its default"),
         "compile": ("processes", "compile a hand's kernels before its first start"),
@@ -55,9 +58,9 @@ GROUPS = {  # package in tools/ and description of each subcommand
         "completion": ("setup", "print a completion script for bash, zsh or fish"),
     },
     "develop": {
-        "figures": ("paper", "draw the paper's figures from this model, as CSV and PNG"),
-        "validate": ("paper", "compare this model with published figures"),
-        "bench": ("benchmarks", "measure run time and the simulated hand's behaviour"),
+        "figures": ("paper", "plot the paper's figures with this model, as CSV and PNG"),
+        "validate": ("paper", "compare this model with published results"),
+        "bench": ("benchmarks", "measure run times and the simulated hand's behaviour"),
     },
 }
 SUBCOMMANDS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
@@ -66,25 +69,25 @@ _LINUX = (*GROUPS["run"], "doctor", "scan", "calibrate", "compile", "install-ser
 _FIRST_STEPS = """\
 softfinger {version}: two rotational fingers with soft tips. To start:
   softfinger run --monitor          run a simulated hand with its live page; q ends both
-  softfinger send arm               in another terminal: torque on; then grasp force=10
-  softfinger run --config PROFILE   run another hand; softfinger config list names profiles
-  softfinger doctor --config FILE   check a physical hand and name the missing steps
-  softfinger help                   list all subcommands; help SUBCOMMAND: its arguments"""
+  softfinger send arm               in another terminal: switch torque on; then send grasp force=10
+  softfinger run --config PROFILE   run another hand; softfinger config list prints the profiles
+  softfinger doctor --config FILE   check a physical hand and list the missing steps
+  softfinger help                   list all subcommands; help SUBCOMMAND lists its arguments"""
 _EPILOG = """\
-softfinger help SUBCOMMAND: its arguments. To start: softfinger run --monitor
-Exit status: 0 done; 1 failed, with the reason; 2 wrong arguments or settings; 130 ended by Ctrl-C.
-The help of a subcommand lists its additional exit statuses."""
+Arguments of a subcommand: softfinger help SUBCOMMAND. To start: softfinger run --monitor
+Exit status: 0 success; 1 failure, with the reason; 2 invalid arguments or settings; 130 interrupted
+by Ctrl-C. The help of a subcommand lists its additional exit statuses."""
 
 
 def _open_standard_streams() -> None:
-    """Open /dev/null for closed standard streams, so that no other file gets their descriptors.
+    """Open /dev/null for closed standard streams, so that other files cannot get their descriptors.
 
     Also replace characters that a terminal or pipe cannot encode, such as θ.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
-            os.set_inheritable(descriptor, True)  # let child processes inherit it
+            os.set_inheritable(descriptor, True)  # let child processes inherit the descriptor
             setattr(sys, name, os.fdopen(descriptor, mode))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -148,7 +151,7 @@ def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any,
     return parser, made
 
 
-# Parts of the shared-library loader's messages when memory is exhausted.
+# Parts of the messages that the shared-library loader prints when memory is exhausted.
 _NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "libllvmlite")
 
 
@@ -168,15 +171,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not _lacks_memory(error):
             raise
         print(
-            "softfinger: not enough memory for this process, which needs about 1 GB of address "
-            "space: raise `ulimit -v`, or end other programs",
+            "softfinger: not enough memory for this process, which requires about 1 GB of "
+            "address space: raise `ulimit -v`, or close other programs",
             file=sys.stderr,
         )
         return 1
 
 
 def _main(argv: Sequence[str] | None) -> int:
-    # Let Ctrl-C end the process without a traceback until the subcommand installs its own handler.
+    # Until the subcommand installs its own handler, Ctrl-C ends the process without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _open_standard_streams()
     words = list(sys.argv[1:] if argv is None else argv)
@@ -189,8 +192,9 @@ def _main(argv: Sequence[str] | None) -> int:
     called = next((word for word in words if word in SUBCOMMANDS), "")
     if called in _LINUX and sys.platform != "linux":
         print(
-            f"{called}: found {sys.platform}, expected Linux: the daemon needs its scheduler and "
-            "serial ports; the client, gym, recordings and `softfinger view` work here",
+            f"{called}: found {sys.platform}, expected Linux: the daemon requires the Linux "
+            "scheduler and serial ports; the client, gym, recordings and `softfinger view` work "
+            "on this platform",
             file=sys.stderr,
         )
         return 1
@@ -201,7 +205,7 @@ def _main(argv: Sequence[str] | None) -> int:
         return 1
     if not called and words[0] not in _OPTIONS:
         near = nearest(words[0], [*SUBCOMMANDS, *_OPTIONS])
-        hint = near or "; `softfinger help` lists them"
+        hint = near or "; run `softfinger help` to list them"
         parser.error(f"found {words[0]!r}, expected a subcommand{hint}")
     arguments, unknown = parser.parse_known_args(words)
     module, subparser = made[called]

@@ -10,12 +10,12 @@ from pathlib import Path
 from softfinger.daemon.errors import SoftfingerError
 
 _EXTRAS = {  # extra: (reason in the error message, modules)
-    "plot": ("pictures need matplotlib", ("matplotlib",)),
-    "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
-    "view": ("the page needs websockets and orjson", ("websockets", "orjson")),
-    "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
-    "cluster": ("a cluster's workers need dask and distributed", ("distributed",)),
-    "gym": ("the environments need gymnasium", ("gymnasium",)),
+    "plot": ("plots require matplotlib", ("matplotlib",)),
+    "record": ("recordings require mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
+    "view": ("the web page requires websockets and orjson", ("websockets", "orjson")),
+    "parquet": ("Parquet files require pyarrow", ("pyarrow",)),
+    "cluster": ("cluster workers require dask and distributed", ("distributed",)),
+    "gym": ("the environments require gymnasium", ("gymnasium",)),
 }
 
 

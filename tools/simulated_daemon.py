@@ -21,7 +21,7 @@ __all__ = ["SimulatedDaemon"]
 
 @dataclass(frozen=True)
 class TrueStates:
-    """True states of the simulated hand, one per tick."""
+    """True state of the simulated hand at each tick."""
 
     t: NDArray[np.float64]  # s
     force: NDArray[np.float64]  # N, [n, 2]
@@ -33,13 +33,13 @@ class TrueStates:
         return TrueStates(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
 
     def settled(self, off: NDArray[np.bool_]) -> float:
-        """Return the time [s] of the last tick for which ``off`` is True."""
+        """Return the time [s] of the last tick at which ``off`` is True."""
         where = np.flatnonzero(off)
         return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
 
 
 class SimulatedDaemon:
-    """Daemon on virtual time with an observable simulated hand; raises SettingsError."""
+    """Daemon on virtual time whose simulated hand can be observed; may raise SettingsError."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class SimulatedDaemon:
         self.loop.advance(seconds)
 
     def watch(self, seconds: float) -> TrueStates:
-        """Advance by ``seconds`` and return the true state for each tick."""
+        """Advance by ``seconds`` and return the true state at each tick."""
         return TrueStates(*(np.array(column) for column in zip(*self._ticks(seconds), strict=True)))
 
     def _ticks(self, seconds: float) -> Iterator[tuple[float, tuple[float, ...], float, float]]:

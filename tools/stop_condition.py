@@ -25,7 +25,7 @@ class StopCondition:
     duration
         Time limit [s], counted from `begin`.
     lifeline
-        Read end of a pipe from the parent process. When the pipe closes, the end is requested.
+        Read end of a pipe from the parent process. When the pipe closes, the subcommand should end.
     """
 
     signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
@@ -58,7 +58,7 @@ class StopCondition:
     def wait_readable(self, seconds: float, *others: int) -> list[int]:
         """Wait up to ``seconds`` and return the readable descriptors among ``others``.
 
-        An end request or any other signal also interrupts the wait.
+        The wait is also interrupted by a request to end or by any other signal.
         """
         left = min(seconds, self._deadline - time.monotonic())
         watched = [self._wakes.fileno(), *self._lifeline, *others]
@@ -75,12 +75,12 @@ class StopCondition:
 
     def wake(self, *_: object) -> None:
         """Interrupt a wait."""
-        # Do not use an Event: the interrupted thread may hold its lock.
-        with contextlib.suppress(BlockingIOError):  # a full buffer wakes the thread as well
+        # Do not use an Event here, because the interrupted thread may hold its lock.
+        with contextlib.suppress(BlockingIOError):  # a full buffer also wakes the thread
             self._wake.send(b"!")
 
     def __enter__(self) -> Self:
-        self._wakes, self._wake = socket.socketpair()  # select needs sockets on Windows
+        self._wakes, self._wake = socket.socketpair()  # on Windows, select requires sockets
         self._wake.setblocking(False)
         self._before = {number: signal.signal(number, self.end) for number in self.signals}
         return self
@@ -93,7 +93,7 @@ class StopCondition:
 
 
 class Interrupted(BaseException):
-    """A signal requested the end before the daemon was running; not an `Exception` subclass."""
+    """A signal arrived before the daemon was running; deliberately not an `Exception` subclass."""
 
 
 # The default action of these signals ends the process immediately, so that only the servo watchdog

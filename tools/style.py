@@ -69,7 +69,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write the figure in the format that the path suffix gives."""
+    """Write the figure in the format given by the path suffix."""
     picture = io.BytesIO()
     figure.savefig(picture, dpi=DPI, format=path.suffix.removeprefix(".") or None)
     with write_bytes(path) as file:

@@ -32,13 +32,13 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-_CONNECT_TIMEOUT = 10.0  # s, time limit for the scheduler connection
-_REDRAW_INTERVAL = 0.1  # s, between two redraws of a bar
+_CONNECT_TIMEOUT = 10.0  # s, time limit for connecting to the scheduler
+_REDRAW_INTERVAL = 0.1  # s, time between two redraws of a bar
 _BAR_WIDTH = 20  # columns
 
 
 class SweepError(SoftfingerError):
-    """The sweep cannot continue; the message gives the reason."""
+    """Error raised if a sweep cannot continue; the message gives the reason."""
 
 
 class Progress:
@@ -51,7 +51,7 @@ class Progress:
         self.on = on and sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
-        """Show ``done`` of the total, with ``note`` instead of the percentage."""
+        """Show the completed amount ``done``, with ``note`` instead of the percentage if given."""
         if not self.on or time.monotonic() - self._shown < _REDRAW_INTERVAL:
             return
         self._shown = time.monotonic()
@@ -92,7 +92,7 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
 
 
 class Sweep(Generic[Case, Result]):
-    """Run ``work`` once for each of ``cases``; iterating yields the results in the same order.
+    """Run ``work`` once for each of ``cases``; iteration yields the results in this order.
 
     ``work``, cases and results must be picklable. With a ``journal``, results must also be
     JSON-serialisable; the caller removes the journal after storing the results. ``name`` labels the
@@ -150,11 +150,12 @@ class Sweep(Generic[Case, Result]):
                 if len(self._results) > before:
                     before, workers = len(self._results), processes
                 elif workers > 1:
-                    workers = 1  # one case at a time, to identify the case that crashes its worker
+                    # Run one case at a time, to identify the case that crashes its worker.
+                    workers = 1
                 else:
                     case = self._cases[self._left()[0]]
                     raise SweepError(
-                        f"{self._name}: all worker processes ended at {case}"
+                        f"{self._name}: all worker processes ended during {case}"
                     ) from None
 
     def _by(self, executor: Executor) -> Iterator[int]:
@@ -194,7 +195,7 @@ class Sweep(Generic[Case, Result]):
             lines = file.read().decode("utf-8", "replace").splitlines()
         if not lines or lines[0] != json.dumps(self._digest):
             raise SweepError(
-                f"{self._journal}: belongs to another sweep; remove it or choose another file"
+                f"{self._journal}: belongs to another sweep; remove the file or choose another one"
             )
         for line in lines[1:]:
             try:
@@ -227,7 +228,7 @@ def _cluster(address: str) -> Iterator[Executor]:
     try:
         client = connect(address, timeout=_CONNECT_TIMEOUT)
     except (OSError, ValueError) as error:
-        raise SweepError(f"--scheduler {address}: no Dask scheduler answers: {error}") from None
+        raise SweepError(f"--scheduler {address}: no Dask scheduler responds: {error}") from None
     with client:
         yield client.get_executor()
 

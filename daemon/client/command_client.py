@@ -105,7 +105,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
         stopped = stop_locally(address, min(remaining, LOCAL_STOP_TIMEOUT))
         if stopped is not None:
             return stopped
-    answer = f"answer to {request['command']} from {address}"
+    answer = f"reply to {request['command']} from {address}"
     context: zmq.Context[Any] = zmq.Context()
     socket = context.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
@@ -123,7 +123,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
             _log.warning(still_waiting(answer, timeout))
             answered = socket.poll(math.ceil((remaining - silence) * 1e3))
         if not answered:
-            hint = " (with access.keys, give --keys or keys=)" if keys is None else ""
+            hint = " (if access.keys is set, pass --keys or keys=)" if keys is None else ""
             raise NoAnswer(
                 f"no {answer} within {timeout:g} s; is softfinger running, or still starting?{hint}"
             )
@@ -153,12 +153,12 @@ def _number(what: str, value: Any) -> float:
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """Return the reply without ``ok``. Raises Refused, with the reason, if it is a refusal.
+    """Return the reply without ``ok``. Raises Refused, with the reason, if the reply is a refusal.
 
     A warning is logged if the servos have not confirmed that torque is off.
     """
     if reply.get("ok") is not True:
-        text = str(reply.get("error", "refused without a reason"))
+        text = str(reply.get("error", "refused; the reply contains no reason"))
         raise Refused(text, str(reply.get("reason", "")))
     if reply.get("torque_off") == "unconfirmed":
         _log.warning(UNCONFIRMED_TEXT)
@@ -166,7 +166,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_done(command: str, status: dict[str, Any]) -> bool:
-    """Return True if a refused command's goal has already been reached, according to the status."""
+    """Return True if the status shows that a refused command's goal is already reached."""
     mode = status.get("mode", "fault")
     if command == "arm":
         return mode not in ("disarmed", "fault")
@@ -244,7 +244,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("disarm")
 
     def tare(self) -> _Done:
-        """Use the present readings of the unloaded sensors as zero offsets."""
+        """Use the current readings of the unloaded sensors as zero offsets."""
         return self._carry_out("tare")
 
     def move(self, left: float | None = None, right: float | None = None) -> _Done:
@@ -252,7 +252,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("move", left=left, right=right)
 
     def grasp(self, force: float | None = None) -> _Done:
-        """Close and grip with ``force`` [N] per tip, by default the force from the settings."""
+        """Close and grip with ``force`` [N] per tip; the default comes from the settings."""
         return self._carry_out("grasp", force=force)
 
     def rotate(self, angle: float) -> _Done:
@@ -260,7 +260,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("rotate", angle=angle)
 
     def hold(self, force: float | None = None, angle: float | None = None) -> _Done:
-        """Send one of a stream of setpoints, for example at 50 to 100 Hz.
+        """Send one setpoint of a continuous stream, for example at 50 to 100 Hz.
 
         Pass the ``force`` [N] per tip, the object ``angle`` [rad], or both. If the hand is not
         gripping yet, it grasps first. The angle is limited to the grip's range, and the angular

@@ -18,11 +18,11 @@ REPLY_TIMEOUT = 5.0  # s, default timeout for a reply or a first message
 SILENCE_TIME = 1.0  # s, waiting time before a warning is logged
 
 _QUEUE_LENGTH = 100_000  # maximum number of messages queued for a slow program
-_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid has 131 kB
+_MESSAGE_SIZE_MAX = 4_000_000  # bytes; a frame of the largest grid has 131 kB
 
 
 def default_addresses() -> tuple[str, str]:
-    """Return the stream and command addresses from SOFTFINGER_ADDRESS, by default this machine's.
+    """Return the stream and command addresses from SOFTFINGER_ADDRESS; the default is this machine.
 
     Raises SettingsError like :func:`both_addresses`.
     """
@@ -46,7 +46,7 @@ def both_addresses(named: str, where: str) -> tuple[str, str]:
         return stream, commands
     if len(addresses) != 2 or not all("://" in address for address in addresses):
         raise SettingsError(
-            f"{where}: found {named!r}, expected tcp://HOST, or STREAM,COMMANDS as in "
+            f"{where}: found {named!r}, expected tcp://HOST or STREAM,COMMANDS, for example "
             f"{STREAM_ADDRESS},{COMMAND_ADDRESS}"
         )
     return addresses[0], addresses[1]
@@ -61,7 +61,7 @@ def is_host(named: str) -> bool:
 def require_host(address: str) -> None:
     """Raise SettingsError if this machine cannot resolve the host of a TCP address.
 
-    ZeroMQ does not report an unknown host; it tries again without end.
+    ZeroMQ does not report an unknown host; it retries forever.
     """
     if not address.startswith("tcp://"):
         return
@@ -71,8 +71,8 @@ def require_host(address: str) -> None:
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or "not a host name"
         raise SettingsError(
-            f"{address}: found the unknown host {host!r} ({why}), expected a name that this "
-            "machine can resolve, or an IP address"
+            f"{address}: found unknown host {host!r} ({why}), expected an IP address or a host "
+            "name that this machine can resolve"
         ) from None
 
 
@@ -87,7 +87,7 @@ class OneThread:
         self._owner: threading.Thread | None = None
 
     def claim(self) -> None:
-        """Make this thread the owner. Raises WrongThread while the owner is another one."""
+        """Make this thread the owner. Raises WrongThread if another thread is the owner."""
         thread = threading.current_thread()
         with self._lock:
             if self._owner is None or not self._owner.is_alive():
@@ -95,8 +95,8 @@ class OneThread:
             owner = self._owner
         if owner is not thread:
             raise WrongThread(
-                f"thread {thread.name}: found a Hand whose stream thread {owner.name} uses, "
-                "expected one thread for each Hand; make another Hand in this thread"
+                f"thread {thread.name}: found a Hand whose stream is used by thread {owner.name}, "
+                "expected each Hand to be used by one thread; create another Hand in this thread"
             )
 
 
@@ -132,7 +132,7 @@ def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
 
 
 def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
-    """Return a message's topic and map. Raises ValueError if it is not a stream message."""
+    """Return a message's topic and map. Raises ValueError if the bytes are not a stream message."""
     try:
         topic, packed = frames
         message = msgpack.unpackb(packed)

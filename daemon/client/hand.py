@@ -117,7 +117,7 @@ class Hand(HandClient[None]):
         return Subscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     def collect(self, seconds: float) -> list[HandState]:
-        """Collect all states for ``seconds`` s of the daemon's clock. Raises NoStream."""
+        """Collect all states for ``seconds`` s, measured by the daemon's clock. Raises NoStream."""
         with self.stream(self.timeout) as states:
             collected = [next(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)

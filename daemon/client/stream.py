@@ -1,8 +1,7 @@
 """Read the stream: decode messages into records, count lost messages, and wait for a state.
 
 Messages are untrusted input. Fields that are missing or have the wrong type become NaN, 0, False or
-empty. Unknown fields are ignored, so that a program also works with a daemon that has a newer
-schema.
+empty. Unknown fields are ignored, so a program also works with a daemon that has a newer schema.
 """
 
 from __future__ import annotations
@@ -85,9 +84,9 @@ class Gaps:
     """Counter for lost messages of one topic.
 
     Messages are identified by their ``number`` or, if they have none, by ``seq`` divided by
-    ``seq_step``. A decreasing number does not count as a loss, because the daemon was restarted or
-    a second daemon is running. A repeated message (``again``) that was not received before fills a
-    gap.
+    ``seq_step``. A decrease does not count as a loss: it means that the daemon was restarted or
+    that a second daemon is running. If a repeated message (``again``) was not received the first
+    time, it fills a gap.
     """
 
     def __init__(self) -> None:
@@ -114,7 +113,7 @@ class Gaps:
             return True
         if again is not None:
             if last is not None and place <= last:
-                self._received.clear()  # The old numbers belong to another daemon.
+                self._received.clear()  # The stored numbers belong to another daemon.
             self._received.append(place)
         if last is not None and place > last:
             self.lost += place - last - 1
@@ -187,8 +186,8 @@ class Subscriber(Generic[_Record]):
         if found != SCHEMA and not self._warned:
             self._warned = True
             warnings.warn(
-                f"the stream has schema {found!r}, this client supports {SCHEMA}; it ignores "
-                "fields that it does not know",
+                f"the stream has schema {found!r}, this client supports {SCHEMA}; unknown fields "
+                "are ignored",
                 stacklevel=3,
             )
         return record
@@ -231,7 +230,10 @@ class Wait:
         self._last: HandState | None = None
 
     def left(self) -> float:
-        """Return the remaining time [s]. Raises NotInTime if it is over and a state has arrived."""
+        """Return the remaining time [s].
+
+        Raises NotInTime if no time remains and at least one state has arrived.
+        """
         left = self._end - self._now()
         if left <= 0.0 and self._last is not None:
             raise self.over("")

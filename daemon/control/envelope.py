@@ -21,8 +21,8 @@ HELD, TURNED, LOST, REFUSED = "htlr"
 OUTCOME_TEXTS = {
     HELD: "held",
     TURNED: "held, but turned by more than 5°",
-    LOST: "slips out",
-    REFUSED: "is not gripped",
+    LOST: "the object slips out",
+    REFUSED: "the hand cannot grip it",
 }
 _GRAVITY = 9.81  # m/s²
 _SECTIONS = ("hand", "tip", "material")
@@ -78,8 +78,8 @@ class Envelope:
             self._force_limit = found["raised"]
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
             raise SettingsError(
-                f"control.envelope: {own}: can't read a map of `softfinger envelope --keep`: "
-                f"{error!r}"
+                f"control.envelope: {own}: can't read this map; create it with `softfinger "
+                f"envelope --keep`: {error!r}"
             ) from None
         if own and other:
             raise SettingsError(f"control.envelope: {own} belongs to another hand: {other}")

@@ -59,33 +59,33 @@ class CommandKind(NamedTuple):
 # Meanings of the fields in replies.
 REPLY = {
     "mode": "mode after the command",
-    "torque_off": "`confirmed`, or `unconfirmed` while a servo has not answered yet",
-    "warning": "what may fail, for example an object outside of the [envelope](envelope.md)",
-    "angle": "angle that the object will reach [rad], limited to the range of the grip",
-    "queued": "name of the command, if the hand has to reach the mode in `until` first",
-    "until": "mode in which the queued command begins",
+    "torque_off": "`confirmed`, or `unconfirmed` if a servo has not replied yet",
+    "warning": "warning, for example if the object is outside the [envelope](envelope.md)",
+    "angle": "target angle of the object [rad], limited to the range of this grip",
+    "queued": "name of the command if it must wait for the mode in `until`",
+    "until": "mode in which the queued command starts",
     "fault": "reason of the latched fault, or empty",
     "fault_name": "name of the fault in [Limits](limits.md), or empty",
-    "torque": "torque is on, or not confirmed to be off",
-    "seq": "number of the present tick",
+    "torque": "torque is on, or torque off is not confirmed",
+    "seq": "number of the current tick",
     "overruns": "number of ticks that took longer than the period",
     "counters": "counters of the servos and of each sensor",
-    "limited": "number of ticks in which each limit has changed the goal",
+    "limited": "number of ticks in which the goal was limited, for each limit",
 }
 
-_JOINT = Parameter(False, "rad", "`hand.q_min` to `hand.q_max`", "target of this joint")
+_JOINT = Parameter(False, "rad", "`hand.q_min` to `hand.q_max`", "target angle of this joint")
 _FORCE = Parameter(
     False,
     "N",
     "above `control.contact_force`, up to 0.9 × `safety.force_max`",
-    "normal force of each tip; `control.force_default` if it is not given",
+    "normal force of each tip; default: `control.force_default`",
 )
 _QUEUED = ("queued", "until")
 _GRIP_REFUSALS = {
-    Reason.BOUNDS: "The force or the angle is outside its range.",
+    Reason.BOUNDS: "The force or the angle is out of range.",
     Reason.SCENE: "The scene lacks tactile sensors, `servos.mode` is `position`, or an angle is "
     "given without two fingers and the object model.",
-    Reason.STATE: "A limit is broken, a tare is in progress, or the object's angle is not known.",
+    Reason.STATE: "A limit is exceeded, a tare is in progress, or the object's angle is unknown.",
 }
 
 COMMANDS: dict[str, CommandKind] = {
@@ -94,8 +94,8 @@ COMMANDS: dict[str, CommandKind] = {
         "Switches torque on. The joints hold their positions.",
         refusals={
             Reason.SCENE: "The scene has no servos.",
-            Reason.STATE: "A limit is broken, or the servos have not confirmed torque off.",
-            Reason.LATE: "The servos did not answer in this tick.",
+            Reason.STATE: "A limit is exceeded, or the servos have not confirmed torque off.",
+            Reason.LATE: "The servos did not reply within this tick.",
         },
     ),
     "disarm": CommandKind(
@@ -105,10 +105,11 @@ COMMANDS: dict[str, CommandKind] = {
     ),
     "tare": CommandKind(
         frozenset({Mode.DISARMED, Mode.ARMED}),
-        "Sets the zero of the sensors to the mean of their next frames. The tips must be free.",
+        "Sets the zero offset of each cell to the mean of its next readings. The tips must be "
+        "free.",
         refusals={
             Reason.SCENE: "The scene has no tactile sensors.",
-            Reason.STATE: "Something touches a tip.",
+            Reason.STATE: "A tip is in contact.",
         },
     ),
     "move": CommandKind(
@@ -117,85 +118,87 @@ COMMANDS: dict[str, CommandKind] = {
         {"left": _JOINT, "right": _JOINT},
         refusals={
             Reason.REQUEST: "Neither joint is given.",
-            Reason.BOUNDS: "An angle is outside its range.",
+            Reason.BOUNDS: "An angle is out of range.",
             Reason.SCENE: "The scene lacks this finger.",
         },
     ),
     "grasp": CommandKind(
         frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING_MODES,
-        "Closes the fingers until both tips touch, then presses with the force. A hand that grips "
-        "changes its force.",
+        "Closes the fingers until both tips are in contact, then presses with the given force. "
+        "If the hand already grips, only the force changes.",
         {"force": _FORCE},
         ("warning",),
         {
-            Reason.BOUNDS: "The force is outside its range.",
+            Reason.BOUNDS: "The force is out of range.",
             Reason.SCENE: "The scene lacks tactile sensors, or `servos.mode` is `position`.",
-            Reason.STATE: "A limit is broken, or a tare is in progress.",
+            Reason.STATE: "A limit is exceeded, or a tare is in progress.",
         },
     ),
     "rotate": CommandKind(
         GRIPPING_MODES,
-        "Turns the grasped object at `control.rotate_speed`. A hand that is still grasping turns "
-        "it as soon as it holds.",
+        "Rotates the grasped object at `control.rotate_speed`. If the hand is still grasping, "
+        "the rotation starts when the grip has settled.",
         {"angle": Parameter(True, "rad", "range of the grip", "angle in the hand's frame")},
         _QUEUED,
         {
-            Reason.BOUNDS: "The angle is outside the range of this grip, which the error names.",
+            Reason.BOUNDS: "The angle is outside this grip's range, which the error text gives.",
             Reason.SCENE: "The scene lacks a finger or the object model.",
-            Reason.STATE: "The object's angle is not known.",
+            Reason.STATE: "The object's angle is unknown.",
         },
     ),
     "hold": CommandKind(
         frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING_MODES,
-        "Follows setpoints that a program streams at 50 to 100 Hz. The first one grasps; a hand "
-        "that grips keeps its mode.",
+        "Follows setpoints that a program streams at 50 to 100 Hz. The first setpoint starts a "
+        "grasp, unless the hand already grips.",
         {
             "force": _FORCE._replace(
-                meaning="normal force of each tip; without it, a hand that grips keeps its force"
+                meaning="normal force of each tip; if it is omitted during a grip, the force does "
+                "not change"
             ),
             "angle": Parameter(
-                False, "rad", "limited to the range of the grip", "angle in the hand's frame"
+                False, "rad", "limited to the range of this grip", "angle in the hand's frame"
             ),
         },
         ("angle", *_QUEUED, "warning"),
-        _GRIP_REFUSALS | {Reason.REQUEST: "Neither force nor angle is given."},
+        _GRIP_REFUSALS | {Reason.REQUEST: "Both force and angle are missing."},
     ),
     "release": CommandKind(_TORQUE_MODES, "Opens the fingers to `hand.open_angle`."),
     "set": CommandKind(
         _TORQUE_MODES,
-        "Sets a property of the grip until the daemon ends.",
+        "Sets a property of the grip until the daemon exits.",
         {
             "compliance": Parameter(
                 True,
                 "rad/(N·m)",
                 "",
-                "rotation per torque on the object, 1 / `control.joint_stiffness`",
+                "rotation per unit torque on the object, 1 / `control.joint_stiffness`",
             )
         },
-        refusals={Reason.BOUNDS: "The compliance is outside its range."},
+        refusals={Reason.BOUNDS: "The compliance is out of range."},
     ),
     "demo": CommandKind(
         frozenset({Mode.DISARMED}),
-        "Arms the hand and starts the task of the profile again (`task.name`).",
-        refusals={Reason.SCENE: "The profile names no task."},
+        "Arms the hand and restarts the profile's task (`task.name`).",
+        refusals={Reason.SCENE: "The profile does not define a task."},
     ),
     "stop": CommandKind(
         _ALL_MODES,
-        "Switches torque off at once. All commands that arrived before it are refused as "
-        "`stopped`. It is never refused, and accepted with any further fields.",
+        "Switches torque off immediately. Commands that are still waiting are refused as "
+        "`stopped`. `stop` itself is always accepted, even if the message contains unknown "
+        "fields.",
         reply=("torque_off",),
     ),
     "clear": CommandKind(
         frozenset({Mode.FAULT}),
-        "Ends a fault whose cause is gone, and reconnects servos and sensors. The hand is then "
-        "disarmed.",
+        "Clears a fault after its cause was removed, and reconnects the servos and sensors. The "
+        "hand is then disarmed.",
         refusals={
-            Reason.STATE: "The cause persists, or servos or a sensor cannot be reached.",
+            Reason.STATE: "The cause persists, or the servos or a sensor do not respond.",
         },
     ),
     "status": CommandKind(
         _ALL_MODES,
-        "Returns the state of the daemon.",
+        "Returns the daemon's state.",
         reply=("fault", "fault_name", "torque", "seq", "overruns", "counters", "limited"),
     ),
 }

@@ -212,7 +212,7 @@ class Control:
         waits = isinstance(last, Approaching | Pressing) and last.command.angle is not None
         if waits and not isinstance(state, Approaching | Gripping):
             self._warn(
-                "rotate", f"rotate: dropped, because the grasp ended in mode {state.mode.value}"
+                "rotate", f"rotate: discarded because the grasp ended in mode {state.mode.value}"
             )
 
     def _enter_armed(self) -> None:
@@ -393,7 +393,7 @@ class Control:
         if off < _ARRIVAL_DISTANCE:
             self._enter_armed()
         elif state.arrived_for > _ARRIVAL_TIMEOUT:
-            text = f"{state.mode.value} ended {math.degrees(off):.1f}° short of its goal"
+            text = f"{state.mode.value} ended {math.degrees(off):.1f}° before the goal"
             self._warn("short", text)
             self._enter_armed()
 
@@ -408,7 +408,9 @@ class Control:
         elif self.fingers.advance_setpoints(self._settings.control.approach_speed):
             state.arrived_for += dt
             if state.arrived_for > _ARRIVAL_TIMEOUT:
-                self._warn("grasp", "no object within the joint limits")
+                self._warn(
+                    "grasp", "the fingers reached their joint limits without finding an object"
+                )
                 self.fingers.hold_here()
                 self._enter_armed()
 
@@ -423,8 +425,8 @@ class Control:
             return 0.0
         if before + dt > _EMPTY_TIME:
             text = (
-                f"nothing between the tips: {pose.width * 1e3:.1f} mm apart, expected at least "
-                f"object.width_min = {width_min * 1e3:g} mm; opening"
+                f"no object between the tips: their distance is {pose.width * 1e3:.1f} mm, "
+                f"expected at least object.width_min = {width_min * 1e3:g} mm; opening"
             )
             self._warn("grasp", text)
             self.release()
@@ -457,7 +459,7 @@ class Control:
         self.fingers.follow_setpoints(goal, loss.current)
         loss.lost_for += dt
         if loss.lost_for > _CONTACT_LOSS_TIME:
-            self._warn("lost", "contact lost; the joints hold their position")
+            self._warn("lost", "contact was lost; the joints hold their positions")
             self._enter(Armed(loss.current))
 
     def _check_settled(self, state: Gripping, dt: float) -> None:
@@ -506,7 +508,10 @@ class Control:
         shear_max = law.tip_friction * (1.0 - law.slip_margin)
         if self.fingers.grasp.shear * self.grip.stopping_ratio > shear_max:
             if not history.turn_end_reported:
-                text = f"rotation stopped at {math.degrees(angle):.1f}°: the tips would slip"
+                text = (
+                    f"rotation stopped at {math.degrees(angle):.1f}° because the tips would "
+                    "slip beyond this angle"
+                )
                 self._warn("slip", text)
             history.turn_end_reported = True
             self.grip.steer(angle, angle)
@@ -522,5 +527,8 @@ class Control:
             history.increase_reported = True
             why = "the object is turning" if grip.has_slipped else "sudden load"
             if grip.slip.assumed_load > 0.0:
-                why = f"up to {grip.slip.assumed_load:.1f} N along the face of each tip"
+                why = (
+                    f"the load may reach {grip.slip.assumed_load:.1f} N along the object's face "
+                    "at each tip"
+                )
             self._warn("slip", f"grip force increased above {grip.commanded:.1f} N: {why}")

@@ -80,7 +80,7 @@ class Task:
         self._end_mode = state.mode
         self._remaining, self._waited = _RESTART_PAUSE, 0.0
         pause = f"{_RESTART_PAUSE:g} s"
-        return f"{reason}; on a simulated hand the task {says} and restarts in {pause}"
+        return f"{reason}; the simulated hand's task {says} and restarts in {pause}"
 
 
 def demo(force: float, angle: float) -> Iterator[Step]:

@@ -96,8 +96,8 @@ def _try_exchange(
 ) -> list[Finding]:
     """Measure the duration of a tick's reads and writes if all servos are usable.
 
-    The writes have the same length and address as those of a tick, but write the present values, so
-    the registers do not change. If a servo has torque on, or might switch it on when a goal is
+    The writes have the same length and address as those of a tick, but contain the current register
+    values, so nothing changes. If a servo has torque on, or might switch it on when a goal is
     written, only the reads are measured.
     """
     if not all(each.table and not each.errors for each in found):
@@ -124,18 +124,18 @@ def _try_exchange(
 
 
 def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -> list[Finding]:
-    """Return the findings of one servo; ``late`` if it answered only after the others' checks."""
+    """Return the findings of one servo; ``late`` if it replied only after some waiting."""
     name = servo.name
     if not servo.replies:
         if servo.errors:
             return list(servo.errors)
         waited = settings.servos.open_timeout
         problem = (
-            f"no answer at {settings.servos.baud} baud within servos.open_timeout = {waited:g} s"
+            f"no reply at {settings.servos.baud} baud within servos.open_timeout = {waited:g} s"
         )
-        fix = "check its power and cable, and see the findings below"
+        fix = "check its power supply and cable, and read the findings below"
         if late:
-            fix = "it replies now: set a longer servos.open_timeout"
+            fix = "set a longer servos.open_timeout, because the servo replies now"
         return [Finding("FAIL", name, problem, fix)]
     results = [*servo.errors, *servo.notices]
     if servo.table:
@@ -162,14 +162,14 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
     if found.old:
         return found.old_protocol()
     if not found.servos and not found.garbled:
-        problem = f"no servo answers on {servos.port} at any rate"
-        return [Finding("FAIL", "servos", problem, "check the bus's power and cable")]
+        problem = f"no servo replies on {servos.port} at any baud rate"
+        return [Finding("FAIL", "servos", problem, "check the servo supply and the bus cable")]
     what = plan(found, settings, model, model.baud_rates)
     lines = [Finding("FAIL", "servos", str(each), ONE_SERVO_ONLY) for each in found.garbled]
     for change in what.changes:
         same = change.servo.id == change.id
-        other = f"servos.baud = {change.servo.baud}" if same else "the other servos.ids"
-        fix = f"`softfinger doctor --fix` makes it {change.name}: {change}; or set {other}"
+        other = f"servos.baud = {change.servo.baud}" if same else "servos.ids"
+        fix = f"run `softfinger doctor --fix` to use it as {change.name}: {change}; or set {other}"
         lines.append(Finding("note", "found", str(change.servo), fix))
     for each in what.strangers:
         fix = ONE_SERVO_ONLY if what.missing and each.number == model.number else ""
@@ -181,7 +181,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
     """Report the most likely cause of missing servos if no further servos reply."""
     at = reg.PRESENT_INPUT_VOLTAGE
     volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
-    problem = "no other servo answers at any rate"
+    problem = "no other servo replies at any baud rate"
     if not volts:
         return [Finding("note", "found", problem)]
     fix = "replace the cable between the servos, then check the supply"
@@ -189,7 +189,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
         Finding(
             "note",
             "found",
-            f"{problem}; the supply is {min(volts):.1f} V at the servos that answer",
+            f"{problem}; the supply is {min(volts):.1f} V at the servos that reply",
             fix,
         )
     ]
@@ -203,19 +203,21 @@ def check_law(settings: Settings, finger: int) -> Finding:
     except CalibrationFileError as error:
         return Finding("FAIL", name, str(error), "`softfinger calibrate`")
     if calibration is None or not calibration.wants:
-        problem = f"tip.physics is {tip.physics!r}, not verified by presses"
+        problem = (
+            f"tip.physics is {tip.physics!r}, which has not been verified with presses on this tip"
+        )
         return Finding("note", name, problem, "`softfinger calibrate law`")
     for key, wanted in calibration.wants.items():
         found = getattr(tip, key)
         near = isinstance(wanted, float) and key == "poisson"
         if found != wanted and not (near and abs(found - wanted) <= _POISSON_TOLERANCE):
-            problem = f"tip.{key} is {found!r}, but the presses of `calibrate law` fit {wanted!r}"
+            problem = f"tip.{key} is {found!r}, but `calibrate law` found {wanted!r}"
             return Finding("warn", name, problem, f"set tip.{key}")
-    return Finding("pass", name, f"{tip.physics}, the model that fits its presses")
+    return Finding("pass", name, f"{tip.physics}, as found by `calibrate law`")
 
 
 def check_board(settings: Settings, finger: int) -> Finding:
-    """Check that a board sends frames with the grid size and rate given in the settings."""
+    """Check that a board sends frames with the configured grid size and rate."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
     sensor = make_sensor(settings, RealClock(), None, finger)
@@ -226,7 +228,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
         what, _, fix = str(error).rpartition(": ")
         if fix.startswith(("set ", "move ")):
             return Finding("FAIL", name, what, fix)
-        return Finding("FAIL", name, str(error), "check tactile.port, its baud and its cable")
+        return Finding("FAIL", name, str(error), "check tactile.port, tactile.baud and the cable")
     try:
         before, start = sensor.counters(), time.monotonic()
         time.sleep(_LISTEN_TIME)
@@ -236,20 +238,23 @@ def check_board(settings: Settings, finger: int) -> Finding:
         sensor.close()
     frames = after.get("frames", 0) - before.get("frames", 0)
     rate = frames / spent
-    found = f"{tactile.rows} × {tactile.cols} cells, {rate:.0f} frames a second"
+    found = f"{tactile.rows} × {tactile.cols} cells, {rate:.0f} frames per second"
     lost = after.get("skipped_bytes", 0) - before.get("skipped_bytes", 0)
     if lost:
-        fix = "check its cable and the other devices on its USB hub"
-        return Finding("warn", name, f"{found}, but {lost} bytes were damaged or lost", fix)
+        fix = "check the cable, and move other devices to another USB hub"
+        return Finding("warn", name, f"{found}, but {lost} bytes were corrupted or lost", fix)
     rest = 0.0 if frame is None else _rest(settings, finger, frame)
     if rest > _REST_NOISE_RATIO * tactile.noise:
-        text = f"{found}, but half of them read {rest / 1e3:.1f} kPa or more, expected 0 at rest"
-        fix = "`softfinger calibrate tare`, or `softfinger send tare` at each start"
+        text = (
+            f"{found}, but half of the cells read {rest / 1e3:.1f} kPa or more without load, "
+            "expected 0"
+        )
+        fix = "run `softfinger calibrate tare` once, or `softfinger send tare` after each start"
         return Finding("warn", name, text, fix)
     # The frame count is uncertain by ±1, depending on the timing.
     if abs(frames - tactile.rate * spent) > max(_RATE_TOLERANCE * tactile.rate * spent, 1.5):
         text = f"{found}, expected {tactile.rate:g}"
-        fix = f"set tactile.rate = {rate:.0f}, unless this machine is busy"
+        fix = f"set tactile.rate = {rate:.0f} unless this machine is busy"
         return Finding("warn", name, text, fix)
     return Finding("pass", name, found)
 

@@ -1,4 +1,4 @@
-"""Check that this machine can run regular ticks: scheduling, memory, idle states, clock.
+"""Check that this machine can run ticks on time: scheduling, memory, idle states and clock.
 
 Problems of this kind only degrade the timing, so they are reported as warnings. The checks read the
 limits of this process. A daemon that is started from the same shell has the same limits.
@@ -17,7 +17,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_folder
 
-_MEMORY = 1 << 30  # bytes, upper bound of the daemon's mapped memory
+_MEMORY = 1 << 30  # bytes, upper bound on the daemon's mapped memory
 _WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
 _CLOCK_MIN = 1_700_000_000.0  # Unix time [s]; an earlier time means that the clock was never set
@@ -57,7 +57,7 @@ def check_memory_lock(limit: int) -> Finding:
     if limit >= _MEMORY:
         return Finding("pass", "memory lock", size)
     problem = (
-        f"only {size} of {_MEMORY >> 20} MiB may be locked: pages of the loop can be swapped out"
+        f"only {size} of {_MEMORY >> 20} MiB may be locked: the loop's memory can be swapped out"
     )
     return Finding("warn", "memory lock", problem, GRANT_MEMORY_LOCK)
 
@@ -66,7 +66,7 @@ def check_idle_states(path: Path) -> Finding:
     """Check that the daemon can disable deep processor idle states, which wake up slowly."""
     name = str(path)
     if not path.exists():
-        return Finding("warn", name, "this kernel has none: deep idle states delay wake-ups")
+        return Finding("warn", name, "missing in this kernel: deep idle states delay wake-ups")
     if os.access(path, os.W_OK):
         return Finding("pass", name, "can be opened")
     problem = "no permission to open it: deep idle states delay wake-ups"
@@ -78,12 +78,12 @@ def check_wall_clock(now: float) -> Finding:
     if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
-    problem = f"is at {date}: published timestamps will be wrong"
+    problem = f"is set to {date}: published timestamps will be wrong"
     return Finding("warn", "wall clock", problem, "sudo timedatectl set-ntp true")
 
 
 def wake_ups() -> list[float]:
-    """Measure wake-up delays [s] of sleeps until a deadline, like those between ticks."""
+    """Measure wake-up delays [s], using the same kind of sleep as between ticks."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UP_COUNT):
@@ -97,27 +97,31 @@ def check_wake_ups(late: list[float]) -> Finding:
     """Check wake-up delays [s]. A median above a quarter of the period is a warning."""
     worst = max(late)
     middle = sorted(late)[len(late) // 2]
-    text = f"late by {middle * 1e6:.0f} µs, at most {worst * 1e6:.0f} µs in {len(late)} ticks"
+    text = (
+        f"median delay {middle * 1e6:.0f} µs, maximum {worst * 1e6:.0f} µs over {len(late)} ticks"
+    )
     if middle < 0.25 * _PERIOD:
         return Finding("pass", "wake-ups", text)
-    problem = f"{text}: the machine is busy or slow to wake"
+    problem = f"{text}: the machine is busy or wakes up slowly"
     return Finding("warn", "wake-ups", problem, "end other programs")
 
 
 def check_kernels(settings: Settings) -> list[Finding]:
-    """Check that compiled kernels can be stored and that this scene's kernels are compiled."""
+    """Check that the kernel cache is writable and contains this scene's compiled kernels."""
     try:
         with find_kernel_folder() as folder:
             place, spoilt = folder.path, len(damaged(folder))
     except (OSError, RuntimeError) as error:
-        problem = f"can't be used, so every start compiles: {error}"
-        fix = "export NUMBA_CACHE_DIR=FOLDER with a folder of your own"
+        problem = f"can't be used, so kernels are compiled at every start: {error}"
+        fix = "export NUMBA_CACHE_DIR=FOLDER, where FOLDER is your own folder"
         return [Finding("warn", "kernel cache", problem, fix)]
     if spoilt:
-        problem = f"{spoilt} damaged files in {place}: the next start compiles them again"
-        return [Finding("warn", "kernels", problem, "softfinger compile, or start the daemon")]
+        problem = f"{spoilt} corrupted files in {place}: they will be recompiled at the next start"
+        return [
+            Finding("warn", "kernels", problem, "run `softfinger compile`, or start the daemon")
+        ]
     cold = [part.name for part in parts(settings) if not is_built(part, settings)]
     if not cold:
         return [Finding("pass", "kernels", f"compiled, in {place}")]
-    problem = f"{', '.join(cold)} not compiled yet: the next start takes longer"
-    return [Finding("warn", "kernels", problem, "softfinger compile, or start the daemon")]
+    problem = f"{', '.join(cold)} not compiled yet: the next start will take longer"
+    return [Finding("warn", "kernels", problem, "run `softfinger compile`, or start the daemon")]

@@ -44,7 +44,7 @@ def check_runtime_folder() -> Finding:
         return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
     folder = runtime_folder()
     if folder.exists() and folder.stat().st_mode & 0o077:
-        what = f"{folder}: other users may enter it, so the local stop socket is elsewhere"
+        what = f"{folder}: other users can access it, so the local stop socket is in another folder"
         return Finding("warn", "runtime folder", what, f"chmod 700 {folder}")
     return Finding("pass", "runtime folder", str(folder))
 
@@ -59,7 +59,11 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
         mode = Path(path).stat()
     except OSError as error:
         dangling = Path(path).is_symlink()
-        why = "the link has no target" if dangling else (error.strerror or "not found").lower()
+        why = (
+            "the link's target does not exist"
+            if dangling
+            else (error.strerror or "not found").lower()
+        )
         fix = f"{port_group_remedy(path)}, or set {key} to an available port"
         return Finding("FAIL", path, why, fix)
     if not stat.S_ISCHR(mode.st_mode):
@@ -83,15 +87,17 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     others = users(path)
     if others:
         return _busy(path, mode_of_daemon)
-    return Finding("pass", path, "can be opened, not in use")
+    return Finding("pass", path, "can be opened and is not in use")
 
 
 def _busy(path: str, mode_of_daemon: str) -> Finding:
     others = users(path)
     daemons = [pid for pid, _ in others if _is_daemon(pid)]
     if mode_of_daemon and daemons:
-        text = f"in use by the softfinger daemon that runs here ({mode_of_daemon}, process "
-        return Finding("warn", path, f"{text}{daemons[0]})", "end it to check the port")
+        text = (
+            f"in use by the softfinger daemon running on this machine ({mode_of_daemon}, process "
+        )
+        return Finding("warn", path, f"{text}{daemons[0]})", "stop the daemon to check this port")
     names = ", ".join(f"process {pid} ({name})" for pid, name in others) or "another process"
     fix = "kill " + " ".join(str(pid) for pid, _ in others) if others else "end it"
     return Finding("FAIL", path, f"in use by {names}", fix)
@@ -111,7 +117,7 @@ def _is_daemon(process: int) -> bool:
 def users(path: str) -> list[tuple[int, str]]:
     """Return (process, name) for each visible process that has the port open.
 
-    The process that owns the other end of a pseudo-terminal is not included.
+    The list excludes the process that owns the other end of a pseudo-terminal.
     """
     try:
         device = Path(path).stat().st_rdev
@@ -149,7 +155,7 @@ def _uses(folder: Path, device: int) -> bool:
 
 
 def _pseudo_terminal(folder: Path, link: Path) -> int:
-    """Return the terminal number of a pseudo-terminal master, or -1 for another descriptor."""
+    """Return the terminal number of a pseudo-terminal master, or -1 for any other descriptor."""
     if not str(link.readlink()).endswith("ptmx"):
         return -1
     match = re.search(r"^tty-index:\s*(\d+)", (folder / "fdinfo" / link.name).read_text(), re.M)
@@ -177,10 +183,13 @@ def _check(settings: Settings, key: str, address: str) -> Finding:
     if trouble != IN_USE:
         return Finding("FAIL", subject, trouble, f"set {key}")
     if mode := daemon_mode(settings.commands.address, settings.access.keys):
-        text = f"a softfinger daemon is already running here ({mode}); a second one will not start"
-        return Finding("warn", subject, text, "end it before you start another one")
-    text = "in use by a program other than a softfinger daemon"
-    return Finding("FAIL", subject, text, f"end it, or set {key} to another address")
+        text = (
+            f"a softfinger daemon is already running on this machine ({mode}), so a second daemon "
+            "will not start"
+        )
+        return Finding("warn", subject, text, "stop it before you start another daemon")
+    text = "in use by another program, which is not a softfinger daemon"
+    return Finding("FAIL", subject, text, f"end that program, or set {key} to another address")
 
 
 def daemon_mode(address: str, keys: str = "") -> str:

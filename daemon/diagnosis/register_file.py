@@ -22,7 +22,7 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
 from softfinger.daemon.types import FINGERS
 
-_FILE_SIZE_MAX = 1 << 20  # bytes, limit for reading a file
+_FILE_SIZE_MAX = 1 << 20  # bytes, maximum file size
 _PASS_COUNT = 2  # A lower limit may be rejected until the upper limit has been written.
 
 
@@ -61,7 +61,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
             servo_id = settings.servos.ids[finger]
             table = line.read(servo_id, 0, CHECKED)
             if table is None:
-                found.append(Finding("FAIL", servo_name(servo_id, finger), "not saved: no answer"))
+                found.append(Finding("FAIL", servo_name(servo_id, finger), "not saved: no reply"))
                 continue
             number = int.from_bytes(table[reg.MODEL_NUMBER : reg.MODEL_NUMBER + 2], "little")
             values = {each.name: each.value_in(table) for each in REGISTERS}
@@ -82,7 +82,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
 def restore_registers(settings: Settings, path: Path) -> list[Finding]:
     """Write the registers saved by :func:`save_registers` to servos with the same ID and model.
 
-    Raises ServoError if the file has other content.
+    Raises ServoError if the file does not have this format.
     """
     stored = _stored(path)
     result: list[Finding] = []
@@ -91,12 +91,14 @@ def restore_registers(settings: Settings, path: Path) -> list[Finding]:
             servo_id = settings.servos.ids[finger]
             name, kept = servo_name(servo_id, finger), stored.get(servo_id)
             if kept is None:
-                result.append(Finding("warn", name, f"not restored: {path} has no ID {servo_id}"))
+                result.append(
+                    Finding("warn", name, f"not restored: {path} does not contain ID {servo_id}")
+                )
                 continue
             number = line.ping(servo_id)
-            model = "no answer" if number is None else reg.name_of(number)
+            model = "no reply" if number is None else reg.name_of(number)
             if model != kept.model:
-                text = f"not restored: {path} is of an {kept.model}, found {model}"
+                text = f"not restored: {path} was saved from an {kept.model}, found {model}"
                 result.append(Finding("warn", name, text))
                 continue
             _restore(line, servo_id, name, kept.registers, result)
@@ -137,7 +139,7 @@ def _restore(
 
 
 def _stored(path: Path) -> dict[int, StoredServo]:
-    """Return a file's servos by ID. Raises ServoError if the file has other content."""
+    """Return a file's servos by ID. Raises ServoError if the file does not have this format."""
     try:
         stored = StoredServos.model_validate_json(read_file(path, _FILE_SIZE_MAX))
     except OSError as error:

@@ -9,13 +9,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 # The process
-MEMORY_MAX = 128 << 20  # bytes of data; Python and libzmq use a third of it
+MEMORY_MAX = 128 << 20  # bytes of data segment; Python and libzmq use a third of this limit
 DESCRIPTOR_COUNT = 64  # file descriptors in addition to those of clients
 CLIENT_COUNT_MAX = 256  # connections, commands and stream combined
 STEP_CPU_TIME_MAX = 3.0  # s, CPU time limit of one step; the kernel then ends the process
-# s, elapsed time limit of one step, longer because a busy machine delays the process.
+# s, elapsed time limit of one step. It exceeds the CPU limit because a busy machine delays the
+# process.
 STEP_TIME_MAX = 30.0
-# s, longest poll interval. After a longer one, new requests are stamped with the previous poll.
+# s, longest poll interval. After a longer interval, new requests are stamped with the time of the
+# previous poll.
 POLL_GAP_MAX = 0.05
 
 # Connections
@@ -30,7 +32,7 @@ REPEAT_INTERVAL = 0.1  # s, minimum interval between message repetitions for lat
 KEY_CHECK_INTERVAL = 0.5  # s, interval between key folder checks
 
 # Stops
-# s, refusal time after a stop for requests other than status; extended during a flood.
+# s, time after a stop in which all requests except status are refused; a flood extends it.
 REFUSAL_TIME = 0.02
 ANSWER_DELAY_MAX = 0.25  # s, limit for holding replies back until the refusal time ends
 
@@ -43,7 +45,7 @@ CLIENT_QUEUE_LENGTH = 64  # queued requests per client
 TOTAL_QUEUE_LENGTH = 2048  # queued requests of all clients
 TOTAL_RATE = 2000.0  # requests per second, all clients combined
 CLIENT_RATE_MIN = 2.0  # requests per second, guaranteed to each client
-RECOVERY_TIME = 0.05  # s, pause after which a client above its rate is accepted again
+RECOVERY_TIME = 0.05  # s, pause after which a client that exceeded its rate is accepted again
 
 # Steps
 STEP_WAIT_MAX = 0.01  # s, longest wait in a step

@@ -2,15 +2,15 @@
 
 The gateway does not unpack requests. A request that looks like a stop is urgent: it bypasses the
 queues, one at a time per client. Only a few other requests are forwarded to the loop at a time. The
-remaining ones wait in queues, and the clients take turns. If a client exceeds its rate, its
+other requests wait in queues, and the clients are served in turn. If a client exceeds its rate, its
 requests are refused until it pauses.
 
 Each request is stamped with its arrival time and the number of stops that preceded it. The libzmq
-thread reads ahead, so the gateway can't observe the order in which a request and a stop arrived.
-After a stop or a poll gap, it therefore stamps requests as if they had arrived earlier. This
-continues until the socket has been empty and few requests have arrived. In the meantime, replies
-are held back for a limited time, because clients may respond to them with new requests, which would
-be refused.
+thread reads ahead, so the gateway can't determine whether a request arrived before or after a stop.
+After a stop or a gap between two polls, the gateway therefore stamps requests as if they had
+arrived earlier. It does so until the socket has been empty and few requests have arrived. In the
+meantime, replies are held back for a limited time, because clients may respond to them with new
+requests, which would be refused.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from softfinger.daemon.gateway.endpoints import NO_WAIT, Admission, Endpoint
 from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask
 
-_PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't occur within a string
+_PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't be part of a string
 _MALFORMED_REFUSAL = refusal(
-    "envelope: expected the command in one frame, alone or after an envelope of at most "
-    f"{bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes that ends with an "
+    "envelope: expected one frame with the command, optionally after an envelope of at most "
+    f"{bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes ending with an "
     "empty frame",
     Reason.REQUEST,
 )
@@ -47,12 +47,12 @@ class Client:
     def __init__(self, per_second: float, now: float) -> None:
         self.waiting: deque[Ask] = deque()
         self.urgent = False  # True while an urgent request awaits its reply
-        self._behind = False  # True from exceeding the rate until the next pause
+        self._behind = False  # True after exceeding the rate, until the client pauses
         self._left = per_second
         self._then = now
 
     def floods(self, per_second: float, now: float) -> bool:
-        """Count one request; return True from exceeding the rate until the client pauses."""
+        """Count one request; return True while the client must pause, having exceeded its rate."""
         passed = now - self._then
         left = min(self._left + passed * per_second, per_second) - 1.0
         self._left = max(left, 0.0)
@@ -82,13 +82,14 @@ class CommandEndpoint(Endpoint):
         self.stops = 0  # stop count stamped on new requests
         self._fence = 0  # current stop count
         self._last_poll = clock()
-        # Last poll before a gap, until all requests that arrived during the gap have been read.
+        # Time of the last poll before a gap; None once all requests from the gap have been read.
         self._dated: float | None = None
         self._left = 0  # maximum number of unread requests from the gap
         self._since = 0.0  # time of the last stop, gap or `_arrived` check
-        self._arrived = 0  # requests since then, except status
+        self._arrived = 0  # requests since `_since`, except status
         self._held: list[list[bytes]] = []  # replies held back
-        # s, holding time. A step adds at most REFUSAL_TIME, so stalls hardly count.
+        # s, time for which replies have been held back. A step adds at most REFUSAL_TIME, so that a
+        # stall of the process hardly counts.
         self._held_for = 0.0
         self._clients: OrderedDict[bytes, Client] = OrderedDict()
         self._active: set[bytes] = set()  # clients that sent a request in the current second

@@ -57,7 +57,7 @@ class Admission(ThreadAuthenticator):
         """Restrict a socket to authenticated clients. Call this method before bind."""
         if self._keys is not None:
             self._keys.guard(socket)
-        # With these options, libzmq rejects all clients if the authenticator fails.
+        # With these options, libzmq rejects every client if the authenticator fails.
         socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN.encode())
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
         socket.setsockopt(zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE_TIMEOUT))
@@ -87,19 +87,21 @@ class Admission(ThreadAuthenticator):
             return
         self._look_at = now + bounds.KEY_CHECK_INTERVAL
         if not self.is_alive():
-            raise RestartNeeded("the authenticator has ended")
+            raise RestartNeeded("the thread that authenticates clients has ended")
         if self._folder is None or self._keys is None:
             return
         try:
             try:
                 found = load_server(self._folder)
-            except NoDescriptor:  # Connections use all descriptors, so new keys can't be read.
+            except NoDescriptor:  # All file descriptors are in use, so new keys can't be read.
                 found = self._keys.left(self._folder)
         except KeyFileError as error:
             raise RestartNeeded(str(error)) from None
         gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
         if gone or found.secret != self._keys.secret:
-            raise RestartNeeded(f"access.keys: removed clients: {', '.join(gone) or 'all'}")
+            raise RestartNeeded(
+                f"access.keys: disconnected clients without a key file: {', '.join(gone) or 'all'}"
+            )
         self._keys = found
 
 
@@ -129,14 +131,14 @@ def _taken(path: str) -> str:
     if not Path(path).exists():
         return ""
     if not Path(path).is_socket():
-        return "exists and is not a socket"
+        return "exists but is not a socket"
     with socket.socket(socket.AF_UNIX) as trial:
         trial.setblocking(False)
         try:
             trial.connect(path)
         except (FileNotFoundError, ConnectionRefusedError):  # A killed process left the file.
             return ""
-        except OSError:  # The queue is full, or this user lacks permission.
+        except OSError:  # The socket's queue is full, or this user lacks permission.
             pass
     return IN_USE
 
@@ -191,7 +193,7 @@ class StreamEndpoint(Endpoint):
         """Bind the socket. Raises AddressError."""
         self._topics = [name.encode() for name in config.topics]
         self._prefixes: set[bytes] = set()
-        self._kept: dict[int, deque[bytes]] = {}  # by topic, last messages for late subscribers
+        self._kept: dict[int, deque[bytes]] = {}  # each topic's last messages, for late subscribers
         self._came_late = 0  # bit mask of topics to be repeated to late subscribers
         self._tell_at = 0.0  # earliest time of the next repetition
         self.wanted = 0  # bit mask of topics with subscribers
@@ -229,7 +231,7 @@ class StreamEndpoint(Endpoint):
             self._tell_at = now + bounds.REPEAT_INTERVAL
 
     def _matching(self, *prefixes: bytes) -> int:
-        """Return the bit mask of topics that begin with any of the prefixes."""
+        """Return a bit mask of the topics that begin with any of the prefixes."""
         return sum(1 << k for k, name in enumerate(self._topics) if name.startswith(prefixes))
 
     def publish(self, topic: int, keep: int, message: bytes) -> None:

@@ -1,8 +1,8 @@
 """Run the gateway process, in which one thread serves the loop and the clients.
 
 It is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's file
-descriptor and a `Config` as JSON. The process first binds its sockets. It exits when the loop
-disconnects.
+descriptor and a `Config` as JSON. The process first binds its sockets. The process exits when the
+loop disconnects.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from softfinger.daemon.gateway.endpoints import (
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel
 
-_TIMER_INTERVAL = 0.5  # s, restart interval of the timers that end a stalled process
+_TIMER_INTERVAL = 0.5  # s, interval for resetting the timers that end a stalled process
 _LATEST_TOPIC = 0  # index of the topic that is also published in single frames
-# s, longest time that the authenticator thread waits for the interpreter during a flood.
+# s, longest time that the authenticator thread waits for the interpreter lock during a flood.
 _AUTHENTICATOR_WAIT = 5e-4
 
 
@@ -60,7 +60,7 @@ class Server:
         """
         self.channel = channel
         self._clock = clock
-        self._reported: tuple[int, int, int] | None = None  # last report to the loop
+        self._reported: tuple[int, int, int] | None = None  # most recent report to the loop
         self._context: zmq.Context[Any] = zmq.Context()
         self._admission = Admission(self._context, Path(config.keys) if config.keys else None)
         self.stream: StreamEndpoint | None = None
@@ -146,7 +146,7 @@ def main(words: list[str]) -> int:
             now = time.monotonic()
             if now - lived > _TIMER_INTERVAL:
                 lived = now
-                # SIGPROF and SIGALRM end the process, because they have no handlers.
+                # SIGPROF and SIGALRM have no handlers, so they end the process.
                 signal.setitimer(signal.ITIMER_PROF, bounds.STEP_CPU_TIME_MAX)
                 signal.setitimer(signal.ITIMER_REAL, bounds.STEP_TIME_MAX)
     except RestartNeeded as reason:
@@ -157,7 +157,7 @@ def main(words: list[str]) -> int:
 
 
 def _be_bounded() -> None:
-    """Limit memory and descriptors, raise the out-of-memory score, leave real-time scheduling."""
+    """Limit memory and file descriptors, raise the OOM score, and drop real-time scheduling."""
     resource.setrlimit(resource.RLIMIT_DATA, (bounds.MEMORY_MAX, bounds.MEMORY_MAX))
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT

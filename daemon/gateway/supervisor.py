@@ -21,7 +21,7 @@ _BIND_TIMEOUT = 60.0  # s, timeout for binding the sockets
 _STABLE_TIME = 10.0  # s, running time after which the restart delay is reset
 # s between checks, and the number of successive stopped states after which a process is killed.
 _CHECK_INTERVAL, _STOPPED_COUNT_MAX = 1.0, 2
-_RESTART_DELAYS = 0.1, 2.0  # s, first and longest delay between an exit and the next start
+_RESTART_DELAYS = 0.1, 2.0  # s, first and maximum delay between an exit and the next start
 
 
 class Gateway:
@@ -50,15 +50,15 @@ class Gateway:
         ours, theirs = loop_link.pair()
         paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
-            # -P keeps a folder named daemon in the working directory from being imported.
+            # With -P, a folder named daemon in the working directory is not imported.
             words = [sys.executable, "-P", "-m", f"{__package__}.server", str(theirs.fileno())]
             process = subprocess.Popen(
                 [*words, json.dumps(self._config)],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # In a separate session, Ctrl-C does not end the process before it has sent the
-                # daemon's last messages.
+                # The process runs in its own session, so Ctrl-C does not end it before it has sent
+                # the daemon's last messages.
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )
@@ -103,7 +103,10 @@ class Gateway:
                 self._channel.close()
 
     def _wait(self) -> int:
-        """Wait for the process to end. Kill a stopped process, because its timers don't run."""
+        """Wait for the process to end.
+
+        A stopped process is killed, because its timers don't run.
+        """
         process, stopped = self._process, 0
         while True:
             try:

@@ -1,4 +1,5 @@
-"""Real-time loop: daemon startup, tick, client requests, publishing and timing.
+"""Implement the real-time loop: daemon startup, tick, client requests, publishing and timing.
 
-This package connects the other packages. Control laws, limits and protocols are defined there.
+This package connects the daemon's other packages. They define the control laws, limits and
+protocols.
 """

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class Daemon:
-    """A hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
+    """Daemon that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
 
     Raises
     ------
@@ -62,8 +62,8 @@ class Daemon:
         Parameters
         ----------
         on_event : called with the level, kind and text of each event
-        wire : serve clients over ZeroMQ; with a `Link`, its owner exchanges the messages instead
-        hand : settings of the simulated hand if they differ from those the daemon assumes
+        wire : serve clients over ZeroMQ; the owner of a `Link` exchanges the messages itself
+        hand : settings of the simulated hand, if they differ from those that the daemon uses
         """
         self.settings = settings
         self._hand_settings = settings if hand is None else hand
@@ -118,7 +118,7 @@ class Daemon:
                     text = f"{silent}; waited servos.open_timeout = {patience:g} s"
                     raise ServosSilent(text) from None
                 if on_event is not None and not was_reported:
-                    text = f"{silent}; waiting up to servos.open_timeout = {patience:g} s"
+                    text = f"{silent}; waiting for up to servos.open_timeout = {patience:g} s"
                     on_event("warning", "servos", text)
                     was_reported = True
             time.sleep(_RETRY_INTERVAL)
@@ -149,7 +149,8 @@ class Daemon:
     def _make_hand(self) -> SimulatedHand | None:
         """Return the simulated hand, or None if no backend requires one.
 
-        Its tips use the material from the settings, even if a calibration defines another material.
+        The simulated tips use the material from the settings, even if a calibration defines another
+        material.
         """
         settings = self.settings
         if not needs_hand(settings.servos.backend, settings.tactile.backend):
@@ -178,7 +179,7 @@ class Daemon:
 
     @property
     def tables(self) -> tuple[ContactTable, ContactTable]:
-        """Contact tables of both tips; identical objects if the tips share a material."""
+        """Contact tables of both tips: the same object twice if the tips share a material."""
         return self.models[0].table, self.models[1].table
 
     def close(self) -> None:
@@ -187,7 +188,7 @@ class Daemon:
             closer = self._closers.pop()
             try:
                 closer()
-            except Exception as error:  # The other closers, including torque off, must still run.
+            except Exception as error:  # Torque off and the other functions must still run.
                 logging.getLogger(__name__).error("closing: %s", error)
 
     def __enter__(self) -> Daemon:

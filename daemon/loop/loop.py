@@ -31,15 +31,15 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-# s, age limit for commands that stiffen or move the hand, except ``hold`` during a grip.
+# s, maximum age of commands that stiffen or move the hand, except ``hold`` during a grip
 _START_AGE_MAX = 0.2
 
 
 def command_age_max(settings: Settings, waits: bool) -> float:
     """Return the maximum age [s] of a command that stiffens or moves the hand.
 
-    An older command may have been sent before the servo watchdog stopped the hand. If ``waits``,
-    the servos' clock and watchdog pause while this machine is late.
+    An older command may have been sent before the servo watchdog stopped the hand. If ``waits`` is
+    True, the servos' clock and watchdog pause while this machine is late.
     """
     watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
     return min(_START_AGE_MAX, watchdog or _START_AGE_MAX)
@@ -52,13 +52,13 @@ class Commands(Protocol):
 
     @property
     def refused_by_pace(self) -> int:
-        """Number of commands that exceeded the rate limit."""
+        """Number of commands refused because they exceeded the rate limit."""
 
     def serve(self, handler: Handler) -> None:
         """Pass each request that is due on this tick to ``handler``."""
 
     def raise_fence(self) -> None:
-        """After a stop, reject all commands received so far except stop and status."""
+        """After a stop, reject all commands received so far, except stop and status commands."""
 
 
 class Loop:
@@ -111,7 +111,7 @@ class Loop:
         self._ending = False
         self._stopping = False
         self._began = -math.inf  # start of the current tick, machine time [s]
-        self._commanded = False  # a command, possibly slow, was executed on this tick
+        self._commanded = False  # a possibly slow command was executed on this tick
 
     # The following methods may be called from outside the tick, including from signal handlers.
 
@@ -145,9 +145,9 @@ class Loop:
             self._control.stop()
             self.torque.end()
             if self.state.torque:
-                self.emit("error", "end", "ended, torque MAY STILL BE ON")
+                self.emit("error", "end", "ended; torque MAY STILL BE ON")
             else:
-                self.emit("info", "end", "ended, torque off")
+                self.emit("info", "end", "ended; torque is off")
 
     def advance(self, duration: float | None = None) -> None:
         """Run ticks for ``duration`` [s] of machine time or until `end`; leave torque unchanged.
@@ -190,7 +190,7 @@ class Loop:
     # The tick
 
     def tick(self, now: float) -> float:
-        """Run one pass of the pipeline at clock time ``now``; return its end in machine time."""
+        """Run the pipeline once at clock time ``now``; return the machine time at its end."""
         state, clock, statistics = self.state, self._clock, self.statistics
         began = self._began = clock.host()
         state.seq += 1
@@ -297,7 +297,7 @@ class Loop:
     ) -> dict[str, Any]:
         """Execute one request on the current tick.
 
-        A request from any other source ends the running task.
+        A request that does not come from the running task ends this task.
 
         Parameters
         ----------
@@ -359,8 +359,7 @@ class Loop:
             self._on_event(level, kind, text)
 
     def _with_cause(self, name: str, text: str) -> str:
-        # A command may occupy the bus for a long time, which does not mean that the machine is
-        # busy.
+        # The command may have occupied the bus for a long time; the machine need not be busy.
         at_work = 0.0 if self._commanded else self._clock.host() - self._began
         return self._lateness.with_cause(name, text, at_work)
 
@@ -374,5 +373,8 @@ class Loop:
             self.state.mode = self._control.mode
 
     def _latch(self, reason: str, name: str) -> None:
-        """Set the latched fault, or clear it with empty texts. All other code only reads it."""
+        """Latch a fault, or clear the latched fault if the texts are empty.
+
+        Only this method changes the fault.
+        """
         self.state.fault, self.state.fault_name = reason, name

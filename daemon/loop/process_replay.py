@@ -1,8 +1,8 @@
 """Re-run a recording's readings, frames and commands through the current code, tick by tick.
 
 The servos, sensors, clock and commands are replayed from the recording. The estimator, tables,
-filter, control and limits are those of the installed code. If the recording contains all inputs
-from the first tick, and code and settings are the same, the states are reproduced bit for bit.
+filter, control and limits come from the installed code. The states are reproduced bit for bit if
+the recording contains all inputs since the first tick and the code and settings are unchanged.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class ProcessReplay:
         frames: Mapping[int, Frame],
         commands: Sequence[dict[str, Any]],
     ) -> State:
-        """Run one tick and return the loop's own state, which the next call modifies.
+        """Run one tick and return the loop's own state object, which the next call modifies.
 
         Parameters
         ----------
@@ -182,7 +182,7 @@ class _Commands:
             try:
                 handler(request, 0.0)
             except Refused:
-                pass  # The state comparison will show the difference.
+                pass  # The comparison of the states will show the difference.
         self.waiting = []
 
     def raise_fence(self) -> None:

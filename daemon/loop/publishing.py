@@ -1,9 +1,9 @@
 """Decide which topics to publish on each tick, and measure the actual rates.
 
 Each topic is published on every n-th tick (counted by ``seq``), where n gives the rate closest to
-the requested rate. If n allows, statistics are offset by a few ticks to avoid publishing everything
-on the same tick. One of every n frames is published. `wire.publisher` sends the messages; this
-module does not change the state.
+the requested rate. If n is large enough, statistics are published a few ticks after the state, so
+that one tick does not publish everything. Of the tactile frames, one in n is published.
+`wire.publisher` sends the messages; this module does not change the state.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
     bit, (schema.STATE, schema.TACTILE, schema.STATS, schema.INPUT, schema.TRUTH)
 )
 _STATS_RATE = 1.0  # Hz
-_STATS_PHASE = 3  # ticks of delay after the state, to avoid publishing both on one tick
+_STATS_PHASE = 3  # ticks from state to statistics, to publish them on separate ticks
 
 
 def every(rate: float, wanted: float) -> int:
@@ -29,7 +29,7 @@ def every(rate: float, wanted: float) -> int:
 
 
 def parts(settings: Settings) -> SceneParts:
-    """Return the parts of the scene defined by these settings."""
+    """List the components of the scene that these settings define."""
     return SceneParts(
         fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
         has_servos=settings.servos.backend != "none",
@@ -73,7 +73,7 @@ class Publishing:
             for perception in self._perceptions:
                 if perception.frame is not self._seen[perception.finger]:
                     self._frame(state, perception)
-        if wanted & _INPUT:  # must follow the frames that it refers to
+        if wanted & _INPUT:  # must be published after the frames that it refers to
             frames: list[Frame | None] = [None, None]
             for perception in self._perceptions:
                 frames[perception.finger] = perception.frame
@@ -106,7 +106,7 @@ class Publishing:
         self._publisher.send(schema.TACTILE, frame, data, *sensor, wall, n, number)
 
     def _rates(self, state: State) -> Rates:
-        """Return the rates [Hz] in machine time since the previous call."""
+        """Return the rates [Hz] since the previous call, measured in machine time."""
         frames = [0, 0]
         for perception in self._perceptions:
             frames[perception.finger] = perception.frame_count

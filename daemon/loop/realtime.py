@@ -1,6 +1,6 @@
 """Configure scheduling, memory and timers for a steady tick, and notify systemd.
 
-The measures in the ``[realtime]`` settings are applied once after warm-up. All of them are
+The measures in the ``[realtime]`` settings are applied once, after warm-up. All of them are
 optional: if the system refuses one, a warning explains the consequence and gives the command that
 grants it. `daemon.clock` implements the spin before a deadline. The `Service` class sends the
 READY, WATCHDOG and STOPPING notifications to systemd with sd_notify.
@@ -50,15 +50,15 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 # deadline, period.
 _ATTRIBUTE_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 _ATTRIBUTES = struct.Struct("=IIQiIQQQ")
-_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # ns, slice range accepted by the kernel
+_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # ns, range of time slices accepted by the kernel
 
 
 class RealTime:
-    """Real-time measures, active while open: ``with RealTime(settings): loop.run()``.
+    """Real-time measures, active inside ``with RealTime(settings): loop.run()``.
 
-    Open it after warm-up in the loop thread. It never raises; ``granted`` and ``refused`` list the
-    outcomes of the measures. On virtual time, only the garbage collector and the thread switch
-    interval are adjusted.
+    Open the object in the loop thread, after warm-up. Opening never raises an exception;
+    ``granted`` and ``refused`` list the outcome of each measure. In virtual time, only the garbage
+    collector and the thread switch interval are adjusted.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -85,7 +85,7 @@ class RealTime:
             self._granted(f"spin of {wanted.spin * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
-        """Return one event for all granted measures and one for each refusal."""
+        """Return one event for all granted measures, and one event for each refused measure."""
         events = [("info", "realtime", ", ".join(self.granted))] if self.granted else []
         return events + [("warning", "realtime", text) for text in self.refused]
 
@@ -114,8 +114,8 @@ class RealTime:
         """Keep the garbage collector and other threads from delaying the loop.
 
         A full collection of all NumPy and Numba objects takes tens of milliseconds, so existing
-        objects are frozen. Another thread may hold the interpreter for one switch interval, which
-        is 5 ms by default.
+        objects are frozen. Another thread may hold the interpreter lock for one switch interval,
+        which is 5 ms by default.
         """
         self._undo += [gc.unfreeze, partial(sys.setswitchinterval, sys.getswitchinterval())]
         if freeze:
@@ -127,9 +127,8 @@ class RealTime:
     def _schedule(self, priority: int) -> None:
         """Set SCHED_FIFO for the loop thread, and one level lower for other interpreter threads.
 
-        A reader thread that is preempted while it holds the interpreter lock delays the loop.
-        Threads outside the interpreter, such as ZeroMQ threads, and child processes keep normal
-        scheduling.
+        If a reader thread is preempted while it holds the interpreter lock, the loop is delayed.
+        Native threads, such as ZeroMQ's, and child processes keep normal scheduling.
         """
         undo: list[Callable[[], object]] = []
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -154,8 +153,8 @@ class RealTime:
     def _shorten_slice(self, nanoseconds: int) -> None:
         """Shorten the time slice of the interpreter's threads if SCHED_FIFO is not in use.
 
-        Since version 6.12, Linux runs the thread with the earliest slice end, so threads with short
-        slices are scheduled sooner.
+        Since version 6.12, Linux first runs the thread whose slice ends first, so threads with
+        short slices are scheduled sooner.
         """
         usual = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
         calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
@@ -163,7 +162,7 @@ class RealTime:
             return
         threads = _threads()
         shortened = [_set_slice(calls, thread, nanoseconds) for thread in threads]
-        if any(shortened):  # Older kernels ignore the request.
+        if any(shortened):  # Older kernels ignore the requested slice.
             undo = [partial(_set_slice, calls, thread, 0) for thread in threads]
             self._granted(f"scheduler slices of {nanoseconds * 1e-6:g} ms", *undo)
 
@@ -185,9 +184,9 @@ class RealTime:
     def _lock_memory(self) -> None:
         """Lock pages in memory when they are touched. Warm-up has already touched the loop's pages.
 
-        Two thirds of the compiler libraries' pages are never touched, and loading them would take
-        most of a second. If memory locking is limited, only existing mappings are locked, because
-        later mappings would otherwise fail.
+        Two thirds of the compiler libraries' pages are never touched, and loading all of them would
+        take almost a second. If there is a limit on locked memory, only existing mappings are
+        locked, because later mappings would otherwise fail.
         """
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         flags = _MCL_CURRENT | _MCL_ONFAULT
@@ -196,7 +195,7 @@ class RealTime:
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.mlockall(flags) != 0:
             why = os.strerror(ctypes.get_errno())
-            text = f"memory lock refused ({why}): pages of the loop can be swapped out"
+            text = f"memory lock refused ({why}): the loop's memory can be swapped out"
             self._refused(text, GRANT_MEMORY_LOCK)
         else:
             self._granted("memory locked", libc.munlockall)
@@ -223,7 +222,7 @@ class RealTime:
         if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
             why = os.strerror(ctypes.get_errno())
             self._refused(f"timer slack refused ({why}): wake-ups may be 50 µs late")
-        else:  # 0 restores the thread's initial slack.
+        else:  # A value of 0 restores the thread's initial slack.
             undo = partial(libc.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
             self._granted(f"timer slack {nanoseconds} ns", undo)
 
@@ -252,13 +251,14 @@ class Service:
     """Notifier for systemd via the socket in ``NOTIFY_SOCKET``. Never blocks or raises.
 
     Each notification is one datagram. The loop calls `alive` on every tick. Most calls only compare
-    times; a few messages are sent per watchdog period.
+    times; only a few messages are sent per watchdog period.
     """
 
     def __init__(self, address: str, watchdog: float = 0.0) -> None:
         """Open the socket.
 
-        If no message arrives for ``watchdog`` [s], systemd acts; 0 disables this.
+        systemd terminates the service if no message arrives for ``watchdog`` [s]; 0 disables the
+        watchdog.
         """
         # A name starting with @ denotes an abstract socket, whose first byte is zero.
         self._address = "\0" + address[1:] if address.startswith("@") else address
@@ -299,4 +299,4 @@ class Service:
         try:
             self._socket.sendto(message, self._address)
         except OSError:
-            pass  # systemd is not listening, or its queue is full.
+            pass  # systemd is not listening, or its receive queue is full.

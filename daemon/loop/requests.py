@@ -28,7 +28,7 @@ from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, State
 
-AGE_MAX = 1.0  # s, age limit for all commands except status and stop
+AGE_MAX = 1.0  # s, maximum age of all commands except status and stop
 _COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE_KEYS = frozenset({"command", "client"})
 _MODE_REMEDIES = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
@@ -43,13 +43,13 @@ class Command(NamedTuple):
 
 
 def parse(request: dict[str, Any], mode: Mode) -> Command:
-    """Validate a request against the command table. Raises Refused if it is invalid."""
+    """Validate a request against the command table. Raises Refused if the request is invalid."""
     name = request["command"]
     if name not in COMMANDS:
         raise _malformed(f"unknown command {name[:40]!r}; expected one of {', '.join(COMMANDS)}")
     client = request.get("client", "")
     if not isinstance(client, str) or len(client) > 64:
-        raise _malformed("client: expected a string of at most 64 characters")
+        raise _malformed("client: expected a string of up to 64 characters")
     heard, parameters = COMMANDS[name].modes, COMMANDS[name].parameters
     unknown = sorted(set(request) - _ENVELOPE_KEYS - set(parameters))
     if unknown:
@@ -80,7 +80,7 @@ def _malformed(text: str) -> Refused:
 
 
 def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
-    """Return the range of a command's parameter; infinite if it depends on the grip.
+    """Return the range of a command's parameter, which is infinite if it depends on the grip.
 
     A force must be above the lower bound.
     """
@@ -110,18 +110,18 @@ class Lease:
             return
         if now < self._until and command.client != self._owner:
             owner = self._owner or "an unnamed client"
-            text = f"{command.name}: {owner} has the lease for another {self._until - now:.1f} s"
+            text = f"{command.name}: {owner} holds the lease for another {self._until - now:.1f} s"
             raise Refused(text, Reason.LEASE)
 
     def lapses(self, now: float) -> str:
-        """Return the name of the client whose lease has just expired, otherwise "".
+        """Return the name of the client whose lease has just expired, or an empty string.
 
         Each expiry is reported once.
         """
         if not -math.inf < self._until <= now:
             return ""
         self._until = -math.inf
-        return self._owner or "the commanding client"
+        return self._owner or "the client in control"
 
     def renew(self, command: Command, now: float) -> None:
         """Take or extend the lease after the execution of a command."""
@@ -149,7 +149,7 @@ class Requests:
         Parameters
         ----------
         emit : sends an event
-        command_age_max : maximum age [s] of a command that can stiffen or move the hand
+        command_age_max : maximum age [s] of a command that may stiffen or move the hand
         """
         self._command_age_max = command_age_max
         self._settings = settings
@@ -220,12 +220,12 @@ class Requests:
         return reply
 
     def watch_silence(self) -> None:
-        """Apply ``commands.on_silence`` when the lease of the commanding client expires."""
+        """Apply ``commands.on_silence`` when the lease of the client in control expires."""
         action = self._settings.commands.on_silence
         if action == "hold" or not (silent := self._lease.lapses(self._state.t)):
             return
         if self.end_grip(action):
-            text = f"{silent} has been silent for {self._lease.seconds:g} s: {action}"
+            text = f"{silent} has not sent a command for {self._lease.seconds:g} s: {action}"
             self._emit("warning", "silence", text)
 
     def end_grip(self, action: str) -> bool:
@@ -252,7 +252,7 @@ class Requests:
         longest = AGE_MAX if streamed or name in SAFE_COMMANDS else self._command_age_max
         if age > longest:
             text = (
-                f"{name}: the command was {age:.2f} s old when it was handled, expected at most "
+                f"{name}: the command was {age:.2f} s old when it was processed, expected at most "
                 f"{longest:g} s"
             )
             raise Refused(f"{text}; send it again", Reason.LATE)
@@ -269,7 +269,7 @@ class Requests:
             refuse_if(
                 state.torque and not self._control.torque,
                 Reason.STATE,
-                "the servos have not confirmed torque off yet: check their cable and power",
+                "the servos have not confirmed torque off yet: check their cable and power supply",
             )
         begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING_MODES)
         if begins or name in ("arm", "clear"):
@@ -277,25 +277,30 @@ class Requests:
             refuse_if(cause, Reason.STATE, cause)
         if name == "arm":
             refuse_if(self._torque.servos is None, Reason.SCENE, "this scene has no servos")
-            text = "the servos did not answer in this tick; send it again"
+            text = "the servos did not reply within this tick; send the command again"
             refuse_if(not state.reading.valid, Reason.LATE, text)
         elif name == "tare":
             refuse_if(not fingers, Reason.SCENE, "this scene has no tactile sensors")
             touched = any(contact.contact for contact in state.contacts)
-            refuse_if(touched, Reason.STATE, "a tip is in contact; free both tips")
+            refuse_if(touched, Reason.STATE, "a tip is in contact; remove the load from both tips")
         elif name == "move":
             self._check_move(numbers)
         elif name == "demo":
-            text = "the profile defines no task; `softfinger run --config demo` has one"
+            text = (
+                "the profile does not define a task; run one that does, for example "
+                "`softfinger run --config demo`"
+            )
             refuse_if(settings.task.name == "none", Reason.SCENE, text)
         elif name == "hold":
-            refuse_if(not numbers, Reason.REQUEST, "force or angle is missing")
+            refuse_if(
+                not numbers, Reason.REQUEST, "found neither force nor angle, expected at least one"
+            )
         if begins:
             taring = any(perception.is_taring for perception in fingers)
             refuse_if(taring, Reason.STATE, "a tare is in progress")
-            text = "each finger needs a tactile sensor in this scene"
+            text = "this command requires a tactile sensor on each finger of the scene"
             refuse_if(not fingers, Reason.SCENE, text)
-            text = 'servos.mode = "position" does not limit the current; choose another mode'
+            text = 'servos.mode = "position" does not limit the current; select another mode'
             refuse_if(settings.servos.mode == "position", Reason.SCENE, text)
             numbers.setdefault("force", settings.control.force_default)
         if "force" in numbers:
@@ -304,7 +309,7 @@ class Requests:
             refuse_if(not low < force <= high, Reason.BOUNDS, text)
         if "angle" in numbers:
             turns = len(settings.scene.fingers) == 2 and settings.scene.object_model
-            text = "an angle needs two fingers and scene.object_model = true"
+            text = "an angle requires two fingers and scene.object_model = true"
             refuse_if(not turns, Reason.SCENE, text)
             if self._control.mode in HOLDING_MODES and (name == "rotate" or not state.object.valid):
                 text = self._control.fingers.turn_refusal(numbers["angle"])
@@ -316,7 +321,7 @@ class Requests:
 
     def _check_move(self, numbers: dict[str, float]) -> None:
         if not numbers:
-            raise _malformed("move: left or right is missing")
+            raise _malformed("move: found neither left nor right, expected at least one")
         for name, q in numbers.items():
             if name not in self._settings.scene.fingers:
                 raise Refused(f"move: this scene has no {name} finger", Reason.SCENE)
@@ -337,7 +342,7 @@ class Requests:
         if self._torque.servos is None or not silent:
             return
         if self._torque.pending and not state.read_error:
-            return  # The port works. Connecting would end the bus silence that stops the servos.
+            return  # The port works, and connecting would end the silence that stops the servos.
         try:
             self._torque.reconnect()
         except ServoError as error:
@@ -345,7 +350,9 @@ class Requests:
         self._emit("info", "servos", "reconnected")
 
     def _reopen(self, name: str) -> None:
-        """Reopen sensors with a lost port. Only ``clear`` and ``arm`` do this, with torque off.
+        """Reopen the sensors whose port was lost.
+
+        Only ``clear`` and ``arm`` reopen sensors, while torque is off.
 
         Raises
         ------

@@ -1,12 +1,12 @@
 """Measure loop timing: histograms of the stages, and tick delays.
 
-One kernel call per tick updates the histograms, which are published once per second. Each octave
-above 1 ns is divided into 32 bins. A quantile is reported as the upper edge of its bin, so it is
-never too small and at most 3.2 % too large. The maximum is exact.
+A single kernel call per tick updates the histograms; they are published once per second. Each
+octave above 1 ns is divided into 32 bins. A quantile is reported as the upper edge of its bin, so
+it is never too small and at most 3.2 % too large. The maximum is exact.
 
-Delays in machine time are reported by occasional events and as the possible cause of a fault. While
-a tick is late, real hardware is uncontrolled, whereas a simulated hand on its own clock waits
-(`daemon.clock.HandClock`).
+Delays, measured in machine time, are reported in occasional events and as a possible cause of
+faults. While a tick is late, real hardware is uncontrolled, whereas a simulated hand on its own
+clock waits (`daemon.clock.HandClock`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 TIMES = ("wake", "compute", "bus", "publish")
 QUANTILES = (0.5, 0.99, 0.999)
 
-# Exponent of the first bin's lower edge, 2^-30 s = 0.93 ns. Shorter times are counted there.
+# Exponent of the first bin's lower edge, 2^-30 s = 0.93 ns. This bin also counts shorter times.
 _LOWEST_EXPONENT = -29
 _OCTAVES = 36  # up to 64 s; the last bin also counts longer times
 _BINS_PER_OCTAVE = 32
@@ -36,7 +36,8 @@ _BIN_EDGES = np.ldexp(
 _UPPER_EDGES = np.append(_BIN_EDGES.ravel()[:-1], np.inf)
 
 LATENESS_MIN = 0.05  # s, minimum delay that is reported
-# s, minimum time between reports. In addition, the reported delay must at least double each time.
+# s, minimum time between reports. In addition, each reported delay must be at least twice the
+# previous one.
 REPORT_INTERVAL = 60.0
 ATTRIBUTION_TIME = 0.25  # s after a late tick during which faults may be attributed to it
 # Limits that a late tick alone can violate.
@@ -95,7 +96,7 @@ class Statistics:
         return spreads
 
     def table(self) -> list[str]:
-        """Format the spreads as a table in µs."""
+        """Format the quantiles and maxima as a table in µs."""
         lines = [f"{'':8} {'p50':>9} {'p99':>9} {'p99.9':>9} {'max':>9}  µs"]
         for name, spread in self.spreads().items():
             cells = " ".join(f"{1e6 * value:9.1f}" for value in spread)
@@ -107,7 +108,7 @@ class Lateness:
     """Delay monitor for one loop's ticks."""
 
     def __init__(self, settings: Settings, timing: Timing, waits: bool) -> None:
-        """Create the monitor; it writes only ``busy_s`` of the loop's ``timing``.
+        """Create the monitor; in the loop's ``timing``, it writes only ``busy_s``.
 
         ``waits`` is True if the hand's clock pauses while the machine is late.
         """
@@ -122,7 +123,7 @@ class Lateness:
         """Evaluate the tick that began at ``t`` [s]; return an event to emit, or None.
 
         ``timing`` must already contain the start of this tick. ``own_doing`` is True if a command
-        delayed the previous tick.
+        executed on the previous tick may have delayed this one.
         """
         timing = self._timing
         gap = 0.0 if own_doing else timing.tick_s - self._period
@@ -130,7 +131,7 @@ class Lateness:
             timing.busy_s, self._busy_until = gap, t + ATTRIBUTION_TIME
         elif t > self._busy_until:
             timing.busy_s = 0.0
-        if self._waits:  # The hand will also wait for this tick's delay before the next tick.
+        if self._waits:  # Before the next tick, the hand will also wait for this tick's delay.
             self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
         elif gap > LATENESS_MIN:
             self._sum += gap
@@ -142,7 +143,7 @@ class Lateness:
 
     def _text(self, new: float) -> str:
         did = (
-            f"the simulated hand waited {new:.2f} s"
+            f"the simulated hand paused for {new:.2f} s"
             if self._waits
             else f"ticks were {new:.2f} s late"
         )

@@ -1,9 +1,9 @@
 """Compile a scene's kernels by running each part of the pipeline once before the first tick.
 
 `loop.build` runs all parts before the loop is created, and therefore before torque can be on. On
-first use, `processes.compile` has already compiled parts in parallel processes. A part builds the
-objects it needs, runs them on a made-up contact and discards them. Components that are not in the
-scene are skipped.
+first use, `processes.compile` has already compiled the parts in parallel processes. Each part
+builds the objects that it needs, runs them on an artificial contact and discards them. Components
+that are not in the scene are skipped.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def _joints(scene: WantedScene) -> None:
     winding_std(heat.array)
     time_to_limit(heat.array, 1.0, 70.0)
     sustained_square(heat.array, 70.0)
-    tip_position(0.0, 1.0, 0.0, 1.0, 0.0)  # used by the limit joint.opens
+    tip_position(0.0, 1.0, 0.0, 1.0, 0.0)  # used by the joint.opens limit
     Setpoint(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time, SetpointState())
     Statistics()
 

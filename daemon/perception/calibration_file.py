@@ -208,7 +208,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
     calibration = load_calibration(Path(name))
     wrong = difference(calibration.sensor, sensor_of(settings, finger))
     if wrong:
-        raise CalibrationFileError(f"{name}: calibration of another sensor: {wrong}")
+        raise CalibrationFileError(f"{name}: the calibration belongs to another sensor: {wrong}")
     return calibration
 
 
@@ -268,8 +268,8 @@ class Converter:
             finite = math.isfinite(self.largest)
         if not finite:
             raise CalibrationFileError(
-                f"calibration: the curve {self._curve[1]:g}·x^{self._curve[0]:g} gives no finite "
-                "pressure for a saturated cell"
+                f"calibration: the curve {self._curve[1]:g}·x^{self._curve[0]:g} does not give a "
+                "finite pressure for a saturated cell"
             )
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
@@ -331,12 +331,12 @@ def _contradiction(calibration: Calibration) -> str:
         if len(rows) != sensor.rows or any(len(row) != sensor.cols for row in rows):
             return f"{name}: expected {sensor.rows} rows of {sensor.cols} numbers"
         if min(min(row) for row in rows) < 0.0:
-            return f"{name}: expected no negative numbers"
+            return f"{name}: expected numbers ≥ 0"
     rho = calibration.tare.correlation if calibration.tare else []
     if rho and (len({len(row) for row in rho}) > 1 or rho[0][:1] != [1.0]):
-        return "tare.correlation: expected rows of equal length, the first one starting with 1"
+        return "tare.correlation: expected rows of equal length whose first number is 1"
     if calibration.equilibrate and not any(map(any, calibration.equilibrate.gain)):
-        return "equilibrate.gain: all cells are dead"
+        return "equilibrate.gain: found only dead cells (gain 0), expected at least one live cell"
     if calibration.curve:
         converter = Converter(Calibration(sensor=sensor, date="", curve=calibration.curve), 1.0)
         counts = np.linspace(0, sensor.full_count, min(_MONOTONE_POINTS, sensor.full_count + 1))

@@ -92,8 +92,8 @@ def make_models(
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
         if material.misfits is not None and on_event is not None:
             text = (
-                f"{name}: the law fits its points within {material.fit_error:.0f} Pa, at most "
-                f"{material.worst_force_error:.1%} of F"
+                f"{name}: the law deviates from its points by up to {material.fit_error:.0f} Pa, "
+                f"or {material.worst_force_error:.1%} of the force"
             )
             on_event("info", "material", text)
     left, right = (made.get(k) or replace(made[1 - k], finger=k) for k in range(len(FINGERS)))
@@ -130,13 +130,12 @@ def _measured_tip(settings: Settings, finger: int, calibration: Calibration | No
         )
     if law.radius != settings.tip.radius:
         raise SettingsError(
-            f"tip.radius: found {settings.tip.radius:g} m, expected {law.radius:g} m, the radius "
-            f"in {file}"
+            f"tip.radius: found {settings.tip.radius:g} m, expected {law.radius:g} m as in {file}"
         )
     if settings.safety.d_max > law.deepest:
         raise SettingsError(
             f"safety.d_max: found {settings.safety.d_max:g} m, expected at most {law.deepest:g} "
-            f"m, the deepest press in {file}"
+            f"m, the maximum depth in {file}"
         )
     return Fingertip(law.radius, "measured", law=law)
 

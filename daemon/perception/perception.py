@@ -266,7 +266,7 @@ class FingerPerception:
             self._estimator.saturation = least_end(ends)
         middle, most = float(np.median(moved)), float(moved[np.argmax(np.abs(moved))])
         text = (
-            f"{side} sensor's zero moved by {middle:+.1f} counts "
-            f"({middle * self._quantum:+.0f} Pa), one cell by {most:+.1f} counts"
+            f"{side} sensor's zero offsets changed by {middle:+.1f} counts "
+            f"({middle * self._quantum:+.0f} Pa), in one cell by {most:+.1f} counts"
         )
         self._events.append(("info", "tare", text))

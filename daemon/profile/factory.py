@@ -1,4 +1,4 @@
-"""Create the objects that the settings describe: tip, material, contact table, sensor grid."""
+"""Create the objects that the settings describe: tip, material, contact table and sensor grid."""
 
 from __future__ import annotations
 
@@ -19,20 +19,18 @@ def make_tip(settings: Settings) -> Fingertip:
     """Create the fingertip model. Raises SettingsError for a measured tip, which has none."""
     tip = settings.tip
     if tip.physics == "measured":
-        raise SettingsError(
-            'tip.physics: found "measured", expected "springs" or "solid", which have a model'
-        )
+        raise SettingsError('tip.physics: found "measured", expected "springs" or "solid"')
     return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base, tip.face)
 
 
 def law_problem(material: Material, limit: float) -> str:
-    """Describe a material law fit error above ``limit`` (relative to F); empty if it is smaller."""
+    """Describe a fit error of the material law above ``limit`` (relative to F), else return ""."""
     found = material.worst_force_error
     if found <= limit:
         return ""
     return (
-        f"the smooth law deviates from its points by up to {material.fit_error:.4g} Pa, "
-        f"{found:.1%} of F; expected at most {limit:.1%} (material.force_error_max)"
+        f"the smooth law deviates from the measured points by up to {material.fit_error:.4g} Pa, "
+        f"{found:.1%} of the force; expected at most {limit:.1%} (material.force_error_max)"
     )
 
 
@@ -57,7 +55,7 @@ def make_table(
     """
     tip = tip or make_tip(settings)
     try:
-        if tip.physics != "springs":  # These tables are built fast, so they are not cached.
+        if tip.physics != "springs":  # Building such a table is fast, so it is not cached.
             return ContactTable.build(tip, material)
         return _built(tip, material, settings.table.tolerance)
     except TableError as error:
@@ -66,7 +64,7 @@ def make_table(
 
 @lru_cache(maxsize=8)
 def _built(tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
-    """Build a table in 0.16 s. All hands in a process share it."""
+    """Build a contact table in 0.16 s. All hands in one process share the table."""
     return ContactTable.build(tip, material, tolerance)
 
 

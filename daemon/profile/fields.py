@@ -12,8 +12,8 @@ from softfinger.daemon.errors import PluginError
 
 __all__ = ["Section", "setting"]
 
-# Every number has two bounds, because implausible values are typing errors and must not reach an
-# integral. Whether a bound itself is allowed depends on the quantity.
+# Every number has a lower and an upper bound, because implausible values are typing errors and must
+# not reach an integral. Whether a bound itself is allowed depends on the quantity.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
@@ -58,9 +58,10 @@ def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
 
 
 class Section(BaseModel):
-    """Base class of all sections, which are immutable and strict.
+    """Base class of all settings sections, which are immutable and strictly typed.
 
-    Unknown keys are errors. Integers are accepted as floats, but strings are never converted.
+    Unknown keys are errors. Integers are accepted for floats, but strings are never converted to
+    numbers.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)

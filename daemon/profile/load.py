@@ -25,9 +25,9 @@ from softfinger.daemon.profile.validation import plausibility_warnings, problems
 __all__ = ["load"]
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-_FILE_SIZE_MAX = 256 << 10  # bytes; the reference with every key has 21 kB
+_FILE_SIZE_MAX = 256 << 10  # bytes; the reference profile, which has every key, takes 21 kB
 _DEPTH_MAX = 8  # nesting depth of tables and arrays
-_ERROR_COUNT_MAX = 20  # reported errors per load
+_ERROR_COUNT_MAX = 20  # maximum number of errors reported per load
 # Matches dotted keys with 16 or more parts, because tomllib needs minutes for thousands of parts.
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
 _WORD = re.compile(r"\w+")
@@ -56,7 +56,7 @@ class ExaminedProfile(NamedTuple):
     unused: set[str]
 
     def warnings(self) -> list[str]:
-        """Return a line for every setting that is allowed but probably wrong."""
+        """Return one line for each setting that is allowed but probably wrong."""
         found = _without_words(plausibility_warnings(self.settings), self.unused)
         return [f"{self.name}: {line}" for line in found]
 
@@ -83,7 +83,7 @@ def load(
 def examine(
     path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
 ) -> ExaminedProfile:
-    """Read a profile and find all of its errors. Raises SettingsError if it cannot be read.
+    """Read a profile and find all of its errors. Raises SettingsError if the profile can't be read.
 
     The arguments are those of `load`.
     """
@@ -136,7 +136,7 @@ def _without_words(lines: Iterable[str], words: set[str]) -> list[str]:
 
 
 def _without(data: dict[str, Any], wrong: Sequence[ErrorDetails]) -> dict[str, Any]:
-    """Return the sections without the keys, or the whole sections, that have errors."""
+    """Return the sections without the invalid keys and without entirely invalid sections."""
     kept: dict[Any, Any] = {
         name: dict(keys) if isinstance(keys, dict) else keys for name, keys in data.items()
     }
@@ -154,7 +154,7 @@ def names() -> list[str]:
 
 
 def find(path: Path) -> Path:
-    """Return a profile's file; a bare name may refer to a packaged profile.
+    """Return the path of a profile's file; a bare name may refer to a packaged profile.
 
     Raises SettingsError for a bare name that is neither in `names` nor an existing file.
     """
@@ -163,7 +163,7 @@ def find(path: Path) -> Path:
     file = _PROFILES / f"{path.name}.toml"
     if not file.exists():
         raise SettingsError(
-            f"{path}: no such profile; expected a file or one of {', '.join(names())}"
+            f"{path}: profile not found; expected a file or one of {', '.join(names())}"
         )
     return file
 
@@ -199,13 +199,17 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raw = tomllib.loads(profile_text(path))
         return {key: _tuples(item) for key, item in raw.items()}
     except OSError as error:
-        hint = f"; `{path.stem}` alone selects the packaged profile" if path.stem in names() else ""
+        hint = (
+            f"; `{path.stem}` without path and suffix selects the packaged profile"
+            if path.stem in names()
+            else ""
+        )
         raise SettingsError(f"{name}: can't be read: {error.strerror}{hint}") from None
     except UnicodeDecodeError as error:
         raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
     except RecursionError:
-        raise SettingsError(f"{name}: nested too deeply") from None
-    except ValueError as error:  # TOMLDecodeError, or a number with 5000 digits
+        raise SettingsError(f"{name}: tables or arrays are nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError, or ValueError for a number with 5000 digits
         raise SettingsError(f"{name}: not TOML: {error}") from None
 
 
@@ -218,7 +222,7 @@ def _change(data: dict[str, Any], change: str) -> str:
     try:
         value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
-        value = text.strip()  # a string whose quotes the shell has removed
+        value = text.strip()  # a string whose quotes were removed by the shell
     held = data
     for section in sections:
         held = held.setdefault(section, {})
@@ -241,9 +245,10 @@ def _tuples(value: Any, depth: int = 0) -> Any:
         return {key: _tuples(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list):
         return tuple(_tuples(item, depth + 1) for item in value)
-    # Large integers are rejected here, because one with 5000 digits could not be printed later.
+    # Large integers are rejected here, because an integer with 5000 digits could not be printed
+    # later.
     if isinstance(value, int) and value.bit_length() > 63:
-        raise ValueError("an integer beyond 64 bits")
+        raise ValueError("an integer of more than 64 bits")
     return value
 
 
@@ -261,10 +266,16 @@ def _plugin_problems(settings: Settings) -> Iterator[str]:
             above = ["plugins", each.name]
             yield from (_line(every, above, each.section) for every in error.errors())
         if each.name in tables and each.section is None:
-            yield f"plugins.{each.name}: found settings, but {each.source} has no settings"
+            yield (
+                f"plugins.{each.name}: found settings, but {each.source} does not accept "
+                "settings; remove them"
+            )
     for name in tables:
         if not any(name in known(kind) for kind in BUILT_IN):
-            yield f"plugins.{name}: found settings, but this plugin is not installed"
+            yield (
+                f"plugins.{name}: found settings, but no plugin of this name is installed; "
+                "install it or remove the settings"
+            )
 
 
 def _line(

@@ -50,7 +50,9 @@ class SceneSettings(Section):
     fingers: tuple[Finger, ...] = setting(
         ("left", "right"), "", "Fingers of the hand, one or two.", min_length=1, max_length=2
     )
-    object_model: bool = setting(True, "", "Estimate object angle and width from both contacts.")
+    object_model: bool = setting(
+        True, "", "Estimate the object's angle and width from both contacts."
+    )
 
 
 class GeometrySettings(Section):
@@ -80,16 +82,18 @@ class TipSettings(Section):
     `calibrate law` stores measured curves in the files named by ``tactile.calibration``.
     """
 
-    radius: Length = setting(0.020, "m", "Radius of the hemisphere.")
+    radius: Length = setting(0.020, "m", "Radius of the hemispherical tip.")
     physics: Literal["springs", "solid", "measured"] = setting(
         "springs", "", "Contact model: the paper's springs, solid rubber, or measured curves."
     )
     poisson: float = setting(0.49, "", "Poisson's ratio of a solid tip.", ge=0.45, le=0.4995)
     base: Literal["bonded", "lying"] = setting(
-        "bonded", "", "Base of a solid tip: bonded to the sensor, or lying on it and free to slide."
+        "bonded",
+        "",
+        "Base of a solid tip: bonded to the sensor, or resting on it and free to slide.",
     )
     face: Literal["frictionless", "sticking"] = setting(
-        "frictionless", "", "Contact between a solid tip and the object."
+        "frictionless", "", "Contact between a solid tip and the object: sticking or frictionless."
     )
     relaxation: tuple[Fraction, Fraction, Fraction] = setting(
         (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: initial excess stiffness of the tip "
@@ -106,21 +110,28 @@ class MaterialSettings(Section):
 
     law: Literal["table_i", "constant", "points"] = setting("table_i", "", "Stress-strain law.")
     modulus: Modulus = setting(0.304e6, "Pa", 'Modulus for law = "constant".')
-    strain: tuple[Finite, ...] = setting((), "", 'Strains of the points for law = "points".')
-    stress: tuple[Finite, ...] = setting((), "Pa", 'Stresses of the points for law = "points".')
+    strain: tuple[Finite, ...] = setting(
+        (), "", 'Strains of the stress-strain points for law = "points".'
+    )
+    stress: tuple[Finite, ...] = setting(
+        (), "Pa", 'Stresses of the stress-strain points for law = "points".'
+    )
     modulus_error: float = setting(
         0.0, "", "Relative standard deviation of the modulus.", ge=0, le=1
     )
     force_error_max: Positive = setting(
-        0.05, "", "Maximum relative force error due to the fit of the points, for "
-        "d > radius/20; a larger error rejects the profile."
+        0.05, "",
+            "Maximum relative force error of the curve fitted to the points, for d > "
+            "radius/20. The profile is rejected if the error is larger."
     )  # fmt: skip
 
 
 class TableSettings(Section):
     """The contact table, a lookup of force, energy and their partial derivatives."""
 
-    tolerance: float = setting(1e-9, "", "Maximum relative error of the lookup.", ge=1e-9, le=1e-2)
+    tolerance: float = setting(
+        1e-9, "", "Maximum relative error of the table lookup.", ge=1e-9, le=1e-2
+    )
 
 
 class ServoSettings(Section):
@@ -130,13 +141,13 @@ class ServoSettings(Section):
         "simulated", "", "Driver of the servos.", examples=[*BUILT_IN["servos"]]
     )
     port: str = setting(
-        "/dev/ttyUSB0", "", 'Serial port; "{dir}" is replaced by the folder of the option --dir.'
+        "/dev/ttyUSB0", "", 'Serial port; "{dir}" is replaced by the folder given with --dir.'
     )
     baud: int = setting(2_000_000, "bit/s", "Baud rate of the bus.", ge=9600, le=4_500_000)
     model: ServoModel = setting("XM430-W350", "", "Model of both servos.")
     ids: tuple[ServoId, ServoId] = setting((1, 2), "", "IDs of the servos on the bus.")
     direction: tuple[Literal[-1, 1], Literal[-1, 1]] = setting(
-        (1, -1), "", "1 if the servo's counts increase when the finger closes, otherwise -1."
+        (1, -1), "", "1 if the servo position increases when the finger closes, otherwise -1."
     )
     zero: tuple[Counts, Counts] = setting((2048, 2048), "counts", "Servo position at q = 0.")
     gear_ratio: Positive = setting(1.0, "", "Servo revolutions per joint revolution.")
@@ -162,8 +173,9 @@ class ServoSettings(Section):
         0.05, "s", "Time without a valid reading after which a fault is latched."
     )
     watchdog: float = setting(
-        0.1, "s", "Time without a command after which a servo stops by itself; 0 disables the "
-        "watchdog.", ge=0, le=2.54
+        0.1, "s",
+            "Time without any command after which a servo stops on its own; 0 disables the "
+            "watchdog.", ge=0, le=2.54
     )  # fmt: skip
     heat_rise: NonNegative = setting(
         0.0, "K/A²", "Final case temperature rise per squared current; 0 selects the model's value."
@@ -181,7 +193,7 @@ class TactileSettings(Section):
     )
     port: tuple[str, str] = setting(
         ("/dev/ttyUSB1", "/dev/ttyUSB2"), "",
-        'Serial ports; "{dir}" is replaced by the folder of the option --dir.'
+        'Serial ports; "{dir}" is replaced by the folder given with --dir.'
     )  # fmt: skip
     baud: int = setting(
         2_000_000, "bit/s", "Baud rate of the serial ports.", ge=9600, le=12_000_000
@@ -203,13 +215,11 @@ class TactileSettings(Section):
     blur: float = setting(
         0.0, "m", "Standard deviation of the blur due to the layer above the cells.", ge=0, le=0.01
     )
-    dead: tuple[Cells, Cells] = setting(
-        ((), ()), "", "Cells [row, col] of each sensor that are ignored."
-    )
+    dead: tuple[Cells, Cells] = setting(((), ()), "", "Ignored cells [row, col] of each sensor.")
     threshold: int = setting(
         0,
         "counts",
-        "Minimum count that the board sends; smaller counts are sent as 0.",
+        "Minimum nonzero count of the board, which sends smaller counts as 0.",
         ge=0,
         le=255,
     )
@@ -219,14 +229,15 @@ class TactileSettings(Section):
     )
     rate: Rate = setting(100.0, "Hz", "Expected frame rate.")
     noise: Positive = setting(
-        1520.0, "Pa", "Standard deviation of the noise of a cell (default: 0.5 % of 0.304 MPa)."
+        1520.0, "Pa", "Noise standard deviation of each cell (default: 0.5 % of 0.304 MPa)."
     )
     baseline_error: NonNegative = setting(
-        0.0, "Pa", "Standard deviation of a common zero shift of all cells since the last tare."
+        0.0, "Pa", "Standard deviation of the zero shift that all cells share since the last tare."
     )
     slope_error: NonNegative = setting(
-        0.0, "Pa", "Standard deviation of a linear change of the zero offset from the tip's centre "
-        "to its rim, in x and in y."
+        0.0, "Pa",
+            "Standard deviation of a zero offset that increases linearly from the tip's centre "
+            "to its rim, in x and in y."
     )  # fmt: skip
     centre_error: float = setting(
         0.0, "m", "Standard deviation of `centre`, in x and in y.", ge=0, le=0.01
@@ -246,14 +257,19 @@ class TactileSettings(Section):
         0.02, "s", "Time from the middle of a scan to the arrival of the frame's first byte."
     )
     response: Delay = setting(
-        0.0, "s", "Time constant of the cells' first-order lag; the estimate compensates for it."
+        0.0,
+        "s",
+        "Time constant of the cells' first-order lag, which the estimator compensates for.",
     )
     open_timeout: Seconds = setting(5.0, "s", "Maximum time to wait for the first valid frame.")
     sensor: tuple[str, str] = setting(
         ("", ""), "", "Sensor names, such as serial numbers; calibration files store them."
     )
     calibration: tuple[str, str] = setting(
-        ("", ""), "", "Files of `softfinger calibrate`; their values replace the settings above."
+        ("", ""),
+        "",
+        "Calibration files created by `softfinger calibrate`; their values override the "
+        "settings above.",
     )
     recording: tuple[str, str] = setting(
         ("", ""), "", 'Recordings for backend = "replay": an .npz file, a folder of .npy files, or '
@@ -267,10 +283,11 @@ class TactileSettings(Section):
 class EstimatorSettings(Section):
     """Estimation of displacement and tilt from a frame."""
 
-    method: Literal["ml"] = setting("ml", "", "Estimator: maximum likelihood.")
+    method: Literal["ml"] = setting("ml", "", "Estimation method: maximum likelihood.")
     free_gain: Literal["auto", True, False] = setting(
-        "auto", "", "Estimate the sensor gain from each frame. `auto` selects this for springs "
-        "only: a solid tip's frames show d only through the force, so its gain must be known."
+        "auto", "",
+            "Estimate the sensor gain from each frame. `auto` does so for springs only, "
+            "because the frames of a solid tip do not determine both d and the gain."
     )  # fmt: skip
 
 
@@ -284,7 +301,9 @@ class LoopSettings(Section):
     """
 
     rate: float = setting(500.0, "Hz", "Rate of the control loop.", ge=10, le=5000)
-    clock: Literal["auto", "hand", "real", "virtual"] = setting("auto", "", "Clock of the loop.")
+    clock: Literal["auto", "hand", "real", "virtual"] = setting(
+        "auto", "", "Clock used by the loop."
+    )
 
 
 class RealtimeSettings(Section):
@@ -294,11 +313,11 @@ class RealtimeSettings(Section):
     its processor.
     """
 
-    priority: int = setting(
-        0, "", "Priority under SCHED_FIFO; 0 keeps normal scheduling.", ge=0, le=80
-    )
+    priority: int = setting(0, "", "SCHED_FIFO priority; 0 keeps normal scheduling.", ge=0, le=80)
     slice: float = setting(
-        1e-4, "s", "Scheduler slice; short slices are scheduled sooner; 0 keeps the default.",
+        1e-4, "s",
+            "Scheduler slice. A process with a short slice is scheduled sooner. 0 keeps the "
+            "default.",
         ge=0, le=0.1
     )  # fmt: skip
     cpus: tuple[Processor, ...] = setting(
@@ -306,17 +325,22 @@ class RealtimeSettings(Section):
     )
     lock_memory: bool = setting(True, "", "Prevent the process memory from being swapped out.")
     hold_latency: bool = setting(
-        True, "", "Keep the processors out of deep idle states, which they leave slowly."
+        True, "", "Keep the processors out of deep idle states, from which they wake up slowly."
     )
     timer_slack: float = setting(
         1e-9, "s", "Timer slack; 0 keeps the default, usually 50 µs.", ge=0, le=1e-3
     )
     freeze_collector: bool = setting(
-        True, "", "Exclude startup objects from garbage collection, which would otherwise take "
-        "tens of milliseconds."
+        True, "",
+            "Exclude objects created at startup from garbage collection, which would otherwise "
+            "pause the loop for tens of milliseconds."
     )  # fmt: skip
     spin: float = setting(
-        5e-5, "s", "Time before each tick in which the loop waits without sleeping.", ge=0, le=1e-3
+        5e-5,
+        "s",
+        "Time before each tick during which the loop waits without sleeping.",
+        ge=0,
+        le=1e-3,
     )
 
 
@@ -325,11 +349,14 @@ class StreamSettings(Section):
 
     address: str = setting(STREAM_ADDRESS, "", "Address of the stream, tcp or ipc.")
     latest: str = setting(
-        "", "", "Address on which each state is also sent as a single frame, for `ZMQ_CONFLATE`; "
-        "empty: not used."
+        "", "",
+            "Address on which each state is also sent as a single frame, for `ZMQ_CONFLATE`. "
+            "If empty, this is disabled."
     )  # fmt: skip
     state_rate: Rate = setting(100.0, "Hz", "Rate of `hand/state`.")
-    tactile_rate: Rate = setting(100.0, "Hz", "Rate of the tactile frames of each finger.")
+    tactile_rate: Rate = setting(
+        100.0, "Hz", "Rate at which the tactile frames of each finger are sent."
+    )
     tactile_unit: Literal["count", "Pa"] = setting(
         "count", "", "Send raw counts, or the pressures used by the estimator."
     )
@@ -350,7 +377,7 @@ class CommandSettings(Section):
         2.0, "s", "Time for which a client keeps control of the hand after its last command."
     )
     on_silence: Literal["hold", "release", "stop"] = setting(
-        "hold", "", "Action if the lease of the client in control expires."
+        "hold", "", "Action when the lease of the client in control expires."
     )
     max_bytes: int = setting(4096, "bytes", "Maximum size of a command.", ge=64, le=65_536)
     per_second: float = setting(
@@ -363,7 +390,10 @@ class AccessSettings(Section):
     """Access to stream and commands. Keys are required for addresses that other machines reach."""
 
     keys: str = setting(
-        "", "", "Folder created by `softfinger keys`; both sockets then accept only its clients."
+        "",
+        "",
+        "Folder created by `softfinger keys`. Both sockets then accept only clients that "
+        "have a key there.",
     )
     ipc_mode: Literal["0600", "0660", "0666"] = setting("0600", "", "File mode of an ipc address.")
 
@@ -384,19 +414,21 @@ class ControlSettings(Section):
     move_speed: Positive = setting(1.0, "rad/s", "Joint speed of `move` and `release`.")
     contact_force: Positive = setting(0.5, "N", "Force above which a finger is in contact.")
     force_default: Positive = setting(5.0, "N", "Force of a `grasp` without the parameter `force`.")
-    law: LawName = setting("energy", "", "Grip law; `upright` does not measure the object's angle.")
+    law: LawName = setting(
+        "energy", "", "Grip control law; `upright` does not use the measured object angle."
+    )
     force_time: Seconds = setting(
         0.1, "s", "Duration of the force ramp from the measured to the commanded value."
     )
     smooth_time: Seconds = setting(
-        0.1, "s", "Averaging time of the setpoints, which bounds their jerk."
+        0.1, "s", "Averaging time of the setpoints; averaging limits their jerk."
     )
     force_gain: NonNegative = setting(1.0, "", "Proportional gain of the force controller.")
     force_bandwidth: NonNegative = setting(1.0, "Hz", "Bandwidth of the force integral.")
     rotate_speed: Positive = setting(1.3, "rad/s", "Rotation speed of the object in `rotate`.")
     rotate_bandwidth: NonNegative = setting(4.0, "Hz", "Bandwidth of the angle integral.")
     joint_stiffness: Positive = setting(
-        45.0, "N·m/rad", "Stiffness of the position loop on the antisymmetric joint motion."
+        45.0, "N·m/rad", "Stiffness of the position loop for antisymmetric joint motion."
     )
     dither_torque: NonNegative = setting(
         0.3, "N·m", "Amplitude of the antisymmetric dither torque with which `upright` overcomes "
@@ -405,18 +437,21 @@ class ControlSettings(Section):
     dither_frequency: float = setting(
         5.0, "Hz", "Dither frequency; lower frequencies would make the grip swing.", ge=3, le=50
     )
-    dither_time: Delay = setting(2.0, "s", "Time within which the dither fades.")
+    dither_time: Delay = setting(2.0, "s", "Time constant with which the dither decays.")
     joint_inertia: Factor = setting(
-        0.010, "kg·m²", "Inertia of finger and rotor, used to compute the damping."
+        0.010, "kg·m²", "Inertia of the finger and the rotor, used to compute the damping."
     )
     damping_ratio: NonNegative = setting(
-        0.7, "", "Damping ratio of the joint inertia on the stiffness of tips and position loop."
+        0.7,
+        "",
+        "Damping ratio of the oscillation of the joint inertia on the stiffness of the "
+        "tips and the position loop.",
     )
     joint_friction: NonNegative = setting(
         0.05, "N·m", "Coulomb friction that is compensated while the joint is commanded to move."
     )
     joint_load_friction: GearLoss = setting(
-        0.0, "", "Gear friction as a fraction of the transmitted torque (MX-64 0.23, XL330 0.3)."
+        0.0, "", "Gear friction as a fraction of the transmitted torque (MX-64 0.23, XL330 0.25)."
     )
     friction_speed: Positive = setting(
         0.02, "rad/s", "Commanded speed above which friction is fully compensated."
@@ -427,14 +462,18 @@ class ControlSettings(Section):
         0.0, "N", "Known load along the object's faces, usually its weight."
     )
     grip_raise_max: NonNegative = setting(
-        10.0, "N", "Maximum increase of the grip force against slip."
+        10.0, "N", "Maximum grip force increase that counteracts slip."
     )
     grip_raise_share: NonNegative = setting(
-        1.0, "", "Maximum increase as a fraction of the commanded force; the smaller bound applies."
+        1.0,
+        "",
+        "Maximum grip force increase as a fraction of the commanded force; the smaller of "
+        "the two bounds applies.",
     )
     envelope: str = setting(
-        "", "", "File of `softfinger envelope --keep` that `grasp` is checked against; empty: "
-        "the packaged map."
+        "", "",
+            "Map created by `softfinger envelope --keep`, against which `grasp` is checked. If "
+            "empty, the packaged map is used."
     )  # fmt: skip
 
     @property
@@ -468,24 +507,31 @@ class SafetySettings(Section):
     )  # fmt: skip
     velocity_max: Positive = setting(6.0, "rad/s", "Joint speed above which a fault is latched.")
     frame_age_hold: Positive = setting(
-        3.0, "frame periods", "Age of the last frame above which the goal is held."
+        3.0, "frame periods", "Age of the last frame above which the goal is frozen."
     )
     frame_age_fault: Positive = setting(
         10.0, "frame periods", "Age of the last frame above which a fault is latched."
     )
     frame_age_action: Literal["torque off", "open"] = setting(
-        "torque off", "", "Reaction to the fault of old frames; `open` opens the hand first."
+        "torque off", "", "Reaction to the fault caused by old frames; `open` opens the hand first."
     )
     goal_reach: Positive = setting(
-        0.5, "rad", "Distance from the present joint angle within which a goal may step."
+        0.5,
+        "rad",
+        "Maximum distance from the current joint angle for which the goal may change in one step.",
     )
-    goal_speed: Positive = setting(3.0, "rad/s", "Maximum speed of a goal outside `goal_reach`.")
+    goal_speed: Positive = setting(
+        3.0, "rad/s", "Maximum speed of the goal angle outside `goal_reach`."
+    )
     current_rate: Positive = setting(60.0, "A/s", "Maximum rate of increase of a goal current.")
     current_fault: Positive = setting(
-        1.8, "A", "Measured current that latches a fault if it is exceeded for 0.1 s."
+        1.8, "A", "Measured current above which a fault is latched after 0.1 s."
     )
     stall_error: Positive = setting(
-        0.1, "rad", "Distance from the goal beyond which a joint at maximum current is stalled."
+        0.1,
+        "rad",
+        "Distance from the goal beyond which a stationary joint at maximum current counts "
+        "as stalled.",
     )
     stall_time: Seconds = setting(2.0, "s", "Duration of a stall after which a fault is latched.")
     temperature_max: Positive = setting(
@@ -496,7 +542,7 @@ class SafetySettings(Section):
         "reduces the grip force."
     )  # fmt: skip
     heat_action: Literal["hold", "release", "stop"] = setting(
-        "hold", "", "Action against overheating if the load does not allow a smaller grip force."
+        "hold", "", "Action against overheating if the load does not allow a lower grip force."
     )
     voltage_min: NonNegative = setting(
         0.0, "V", "Minimum supply voltage of a servo; 0 selects the model's limit."
@@ -505,8 +551,9 @@ class SafetySettings(Section):
         0.0, "V", "Maximum supply voltage of a servo; 0 selects the model's limit."
     )
     residual_angle: Positive = setting(
-        0.2, "rad", "Difference between the object angles of both fingers above which a fault is "
-        "latched."
+        0.2, "rad",
+            "Difference between the object angles measured by the two fingers above which a "
+            "fault is latched."
     )  # fmt: skip
     residual_width: Positive = setting(
         0.004, "m", "Change of the held object's width since the grip began above which a fault is "
@@ -519,7 +566,10 @@ class SafetySettings(Section):
         0.05, "", "Fraction of saturated cells above which a warning is issued."
     )
     frozen_after: Delay = setting(
-        0.5, "s", "Time of identical frames in contact after which a fault is latched; 0: never."
+        0.5,
+        "s",
+        "Duration of identical frames during contact after which a fault is latched; 0 "
+        "disables the check.",
     )
     overruns_fault: int = setting(
         100, "ticks", "Number of consecutive late ticks after which a fault is latched.", ge=1
@@ -531,11 +581,13 @@ class ObjectSettings(Section):
 
     width: Length = setting(0.040, "m", "Distance between the object's faces.")
     taper: float = setting(
-        0.0, "rad", "Angle between the object's faces; positive if it is wider at the palm.",
+        0.0, "rad", "Angle between the object's faces; positive if it widens towards the palm.",
         ge=-1.5, le=1.5
     )  # fmt: skip
     width_min: NonNegative = setting(
-        0.002, "m", "Distance between the tips below which the grip is empty and the hand opens."
+        0.002,
+        "m",
+        "Distance between the tips below which the grip counts as empty and the hand opens.",
     )
 
 
@@ -544,7 +596,7 @@ class TaskSettings(Section):
 
     name: Literal["none", "demo"] = setting("none", "", "Name of the task.")
     force: Positive = setting(8.0, "N", "Mean tip force.")
-    angle: Angle = setting(0.14, "rad", "Rotation angle of the object to either side.")
+    angle: Angle = setting(0.14, "rad", "Angle by which the object is rotated to either side.")
 
 
 class PluginSettings(Section):

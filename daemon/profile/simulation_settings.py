@@ -28,7 +28,7 @@ class SimulationSettings(Section):
     The default values are plausible, but not measured.
     """
 
-    seed: int = setting(1, "", "Random seed of noise and faults.", ge=0)
+    seed: int = setting(1, "", "Random seed for noise and faults.", ge=0)
     object_mass: Factor = setting(0.10, "kg", "Mass of the object.")
     object_shape: Annotated[str, names_backend("shapes")] = setting(
         "rectangle", "", "Shape of the object in the hand's plane.", examples=[*BUILT_IN["shapes"]]
@@ -36,7 +36,9 @@ class SimulationSettings(Section):
     object_width: Length = setting(
         0.040, "m", "Width of the object; for a wedge, the width at half its height."
     )
-    object_height: Length = setting(0.060, "m", "Size of the object, away from the palm.")
+    object_height: Length = setting(
+        0.060, "m", "Length of the object in the direction away from the palm."
+    )
     object_radius: Length = setting(0.020, "m", "Radius of a disc.")
     object_taper: float = setting(
         0.17, "rad", "Angle between the faces of a wedge.", ge=-1.5, le=1.5
@@ -48,14 +50,14 @@ class SimulationSettings(Section):
     gravity: tuple[Acceleration, Acceleration] = setting(
         (0.0, 0.0),
         "m/s²",
-        "Gravity (x, y) in the hand's plane; the default hand lies on a table.",
+        "Gravity (x, y) in the hand's plane; the built-in hand lies on a table, so both are 0.",
     )
     table_friction: NonNegative = setting(0.3, "", "Friction coefficient between object and table.")
     tip_friction: NonNegative = setting(0.6, "", "Friction coefficient between tip and object.")
     modulus_scale: Factor = setting(
         1.0, "", "Modulus of the simulated tips divided by the modulus of the profile's material."
     )
-    tactile_noise: NonNegative = setting(1520.0, "Pa", "Standard deviation of the noise of a cell.")
+    tactile_noise: NonNegative = setting(1520.0, "Pa", "Noise standard deviation of each cell.")
     tactile_gain: tuple[Factor, Factor] = setting(
         (1.0, 1.0), "", "Gain of each sensor: reading divided by pressure."
     )
@@ -69,7 +71,7 @@ class SimulationSettings(Section):
         0.0, "m", "Standard deviation of the blur due to the layer above the cells.", ge=0, le=0.1
     )
     tactile_hysteresis: Fraction = setting(
-        0.0, "", "Relative excess of the reading while the load on a cell decreases."
+        0.0, "", "Relative hysteresis: excess of the reading while the load on a cell decreases."
     )
     tactile_creep: Fraction = setting(
         0.0, "", "Relative creep of the reading under constant pressure."
@@ -80,10 +82,12 @@ class SimulationSettings(Section):
         1.0, "", "Exponent of the cells' characteristic curve, reading versus pressure."
     )
     tactile_fold: NonNegative = setting(
-        0.0, "Pa", "Pressure above which the reading of a cell decreases again; 0: never."
+        0.0,
+        "Pa",
+        "Pressure above which the reading of a cell decreases again; 0 disables this effect.",
     )
     tactile_crosstalk: Fraction = setting(
-        0.0, "", "Fraction of the mean of its row and column that is added to each cell."
+        0.0, "", "Crosstalk: fraction of the mean of its row and column that is added to each cell."
     )
     tactile_row_noise: NonNegative = setting(
         0.0, "Pa", "Standard deviation of the noise that is common to all cells of a row."
@@ -106,27 +110,32 @@ class SimulationSettings(Section):
     palm_friction: NonNegative = setting(0.3, "", "Friction coefficient between object and palm.")
     tip_loss: Delay = setting(0.002, "s", "Damping of the tip divided by its stiffness.")
     tip_law: Literal["springs", "bristles"] = setting(
-        "springs", "", "Tangential force law of the tips; with `springs`, shear is coupled to θ."
+        "springs",
+        "",
+        "Tangential force law of the tips; with `springs`, the shear force depends on θ.",
     )
     tip_shear_stiffness: Ratio = setting(
         1.0, "", "Ratio of tangential to normal stiffness of the tip's springs."
     )
     tip_creep_time: NonNegative = setting(
-        0.0, "s", "Time constant with which the shear of a sticking tip relaxes; 0: no relaxation."
+        0.0,
+        "s",
+        "Time constant with which the shear of a sticking tip relaxes; 0 disables relaxation.",
     )
     tip_micro_slip: bool = setting(
-        False, "", "Let the edge of the footprint slip before its centre."
+        False, "", "Let the footprint slip at its edge first, and then at its centre."
     )
     tip_relaxation: tuple[Fraction, Fraction, Fraction] = setting(
-        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: initial excess stiffness of the tip "
-        "as fractions of its final stiffness; 0: elastic."
+        (0.0, 0.0, 0.0), "",
+            "Amplitudes of three Prony terms: initial excess stiffness of the tip as fractions "
+            "of its final stiffness; 0 makes it elastic."
     )  # fmt: skip
     tip_relaxation_times: tuple[Positive, Positive, Positive] = setting(
         (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "
         "human fingerpad (Pawluk & Howe, 1999)."
     )  # fmt: skip
     joint_inertia: Factor = setting(
-        0.010, "kg·m²", "Inertia of finger and rotor, referred to the joint."
+        0.010, "kg·m²", "Inertia of the finger and the rotor, referred to the joint."
     )
     joint_damping: NonNegative = setting(0.02, "N·m·s/rad", "Viscous friction of the joint.")
     joint_friction: NonNegative = setting(0.05, "N·m", "Coulomb friction of the joint.")
@@ -134,8 +143,9 @@ class SimulationSettings(Section):
         0.0, "N·m", "Additional friction of a joint at standstill."
     )
     joint_load_friction: tuple[Fraction, Fraction] = setting(
-        (0.0, 0.0), "", "Gear friction as a fraction of the transmitted torque, and its increase "
-        "at standstill."
+        (0.0, 0.0), "",
+            "Gear friction as a fraction of the transmitted torque, and the increase of this "
+            "fraction at standstill."
     )  # fmt: skip
     joint_stribeck_speed: Positive = setting(
         0.12, "rad/s", "Joint speed at which the additional friction has fallen to 1/e."
@@ -144,7 +154,7 @@ class SimulationSettings(Section):
         0.0005, "rad", "Elastic deflection of the gears before they start to move."
     )
     servo_heat: tuple[Factor, Factor, Factor] = setting(
-        (1.0, 1.0, 1.0), "", "Factors of the servos' heating, cooling and heat capacity."
+        (1.0, 1.0, 1.0), "", "Factors for the servos' heating, cooling and heat capacity."
     )
     ambient: float = setting(25.0, "°C", "Ambient temperature of the servos.", ge=-40, le=80)
     compression_speed: NonNegative = setting(

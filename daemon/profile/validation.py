@@ -1,4 +1,4 @@
-"""Check a profile for keys that contradict each other.
+"""Check a profile for settings that contradict each other.
 
 Each check is a function that yields one line per problem, with the key, the value found and the
 value expected.
@@ -16,8 +16,8 @@ from softfinger.daemon.backends import backend, servo_model
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
-_VALUE_LENGTH_MAX = 60  # longest value in a message, in characters
-_DITHER_TICKS_MIN = 8  # ticks per period of the dither; fewer give no separate oscillation
+_VALUE_LENGTH_MAX = 60  # characters, maximum length of a value in a message
+_DITHER_TICKS_MIN = 8  # minimum number of ticks per dither period
 _SENSOR_WIDTH_MAX = 2.0  # tip diameters; a larger sensor probably belongs to another tip
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
@@ -49,15 +49,15 @@ def _wide_sensor(settings: Settings) -> Iterator[str]:
         and min(_sides(settings)) > _SENSOR_WIDTH_MAX * 2.0 * tip.radius
     ):
         yield (
-            f"tactile.rows, cols, pitch: found a sensor of {_size(settings)} for a tip of "
+            f"tactile.rows, cols, pitch: found a sensor area of {_size(settings)} for a tip of "
             f"{tip.radius * 2e3:.4g} mm diameter: check these settings and tip.radius"
         )
 
 
 def _small_sensor(settings: Settings) -> Iterator[str]:
-    """Compare the sensor with what a tip presses on it.
+    """Compare the sensor size with the contact area of a tip.
 
-    A solid tip presses with its whole base, springs only with the footprint.
+    A solid tip loads the sensor with its whole base, a spring tip only with the footprint.
     """
     tip, tactile = settings.tip, settings.tactile
     if tactile.backend == "none":
@@ -78,9 +78,10 @@ def _small_sensor(settings: Settings) -> Iterator[str]:
     for what, reach in reaches:
         if half < reach:
             yield (
-                f"tactile.rows, cols, pitch: found a sensor of {_size(settings)}, smaller than the "
-                f"tip's {what}, {reach * 2e3:.3g} mm wide with tip.radius = {tip.radius * 1e3:.3g} "
-                "mm: pressure beyond the sensor is not measured"
+                f"tactile.rows, cols, pitch: found a sensor area of {_size(settings)}, smaller "
+                f"than the tip's {what}, {reach * 2e3:.3g} mm wide with tip.radius = "
+                f"{tip.radius * 1e3:.3g} mm: the pressure outside the sensor is not measured; use "
+                "a larger sensor or a lower force"
             )
             return
 
@@ -89,13 +90,13 @@ def _deep_grip(settings: Settings) -> Iterator[str]:
     for key, force, d in _set_depths(settings):
         if d > settings.safety.d_max:
             yield (
-                f"{key}: found {force:g} N, which displaces the tip by {d * 1e3:.3g} mm, expected "
-                f"at most safety.d_max, {settings.safety.d_max * 1e3:.3g} mm"
+                f"{key}: found {force:g} N, which compresses the tip by {d * 1e3:.3g} mm, "
+                f"expected at most safety.d_max = {settings.safety.d_max * 1e3:.3g} mm"
             )
 
 
 def _strong_grip(settings: Settings) -> Iterator[str]:
-    """Compare forces with the torque of the servos over the length of a finger."""
+    """Compare forces with the servo torque divided by the finger length."""
     servos, lever = settings.servos, settings.hand.finger_length
     if servos.backend == "none" or backend("servos", servos.backend).source:
         return
@@ -104,20 +105,20 @@ def _strong_grip(settings: Settings) -> Iterator[str]:
     if force > stall:
         yield (
             f"safety.force_max: found {settings.safety.force_max:g} N, which allows grips of "
-            f"{force:.3g} N, expected at most the {stall:.2g} N at which {servos.model} stalls on "
-            "this finger; lower safety.force_max and safety.current_max"
+            f"{force:.3g} N, expected at most {stall:.2g} N (stall force of {servos.model} on "
+            "this finger); lower safety.force_max and safety.current_max"
         )
     bound = settings.control.torque_constant * settings.safety.current_max / lever
     for key, force in _set_forces(settings):
         if force > bound:
             yield (
-                f"{key}: found {force:g} N, expected at most {bound:.3g} N, the force of "
+                f"{key}: found {force:g} N, expected at most {bound:.3g} N, the force at "
                 f"safety.current_max = {settings.safety.current_max:g} A on this finger"
             )
 
 
 def _set_forces(settings: Settings) -> list[tuple[str, float]]:
-    """Return key and value [N] of the forces that are gripped with unless a command names one."""
+    """Return key and value [N] of the grip forces used by commands that do not specify a force."""
     forces = [("control.force_default", settings.control.force_default)]
     if settings.task.name != "none":
         forces.append(("task.force", settings.task.force))
@@ -127,7 +128,7 @@ def _set_forces(settings: Settings) -> list[tuple[str, float]]:
 def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
     """Yield key, force [N] and displacement [m] of an upright spring tip at the set forces.
 
-    The force is that of `Material.force_error`, by sums over steps of the strain.
+    The force is computed as in `Material.force_error`, by summing over strain steps.
     """
     if settings.tip.physics != "springs":
         return
@@ -200,7 +201,7 @@ def _joints(settings: Settings) -> Iterator[str]:
 def _servos(settings: Settings) -> Iterator[str]:
     servos = settings.servos
     if servos.ids[0] == servos.ids[1] and len(settings.scene.fingers) == 2:
-        yield f"servos.ids: found {shown(servos.ids)}, expected two different ids"
+        yield f"servos.ids: found {shown(servos.ids)}, expected two different IDs"
 
 
 def _ports(settings: Settings) -> Iterator[str]:
@@ -219,8 +220,8 @@ def _ports(settings: Settings) -> Iterator[str]:
         if place in taken:
             same = "" if place == port else f", a link to {shown(place)}"
             yield (
-                f"{key}: found {shown(port)}{same}, expected another port than {taken[place]}; "
-                "boards without serial numbers have distinct names in /dev/serial/by-path"
+                f"{key}: found {shown(port)}{same}, expected a port other than {taken[place]}; if "
+                "the boards have no serial numbers, use their names in /dev/serial/by-path"
             )
         taken.setdefault(place, key)
 
@@ -242,15 +243,15 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
     if backend in ("simulated", "none"):
         yield (
             f'tip.physics: found "measured" with tactile.backend = "{backend}", expected '
-            '"springs" or "solid": measured curves need the frames of a real board'
+            '"springs" or "solid": measured curves require the frames of a physical board'
         )
     else:
-        file = 'a file of `softfinger calibrate law` because of tip.physics = "measured"'
+        file = 'a file created by `softfinger calibrate law`, because tip.physics is "measured"'
         yield from _missing(settings, "calibration", file)
 
 
 def _missing(settings: Settings, key: str, expected: str) -> Iterator[str]:
-    """Check a string in the tactile settings that must be set for each finger in the scene."""
+    """Check a tactile setting, a string that must be given for each finger in the scene."""
     for name in settings.scene.fingers:
         if not getattr(settings.tactile, key)[FINGERS.index(name)]:
             yield f'tactile.{key}: found "" for {name}, expected {expected}'
@@ -262,7 +263,7 @@ def _too_large(key: str, found: float, unit: str, limit: float, why: str) -> Ite
 
 
 def _depth(settings: Settings) -> Iterator[str]:
-    """Check that the limit of the displacement can act."""
+    """Check that the displacement limit does not exceed the tip radius."""
     why = "the tip's radius"
     yield from _too_large("safety.d_max", settings.safety.d_max, "m", settings.tip.radius, why)
 
@@ -277,7 +278,7 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
     yield from _too_large("safety.d_max", settings.safety.d_max, "m", 0.4 * tip.radius, why)
     if tactile.backend == "none":
         return
-    why = "a quarter of a solid tip's radius, since a wider blur hides θ"
+    why = "a quarter of a solid tip's radius, because θ can't be measured with more blur"
     blurred = list(_too_large("tactile.blur", tactile.blur, "m", 0.25 * tip.radius, why))
     yield from blurred
     if not [*blurred, *_blur(settings)]:
@@ -331,7 +332,7 @@ def _wedge(settings: Settings) -> Iterator[str]:
     if abs(simulation.object_taper) >= limit:
         yield (
             f"simulation.object_taper: found {simulation.object_taper:g} rad, expected less than "
-            f"{limit:.3g} rad, where the faces would meet at this width and height"
+            f"{limit:.3g} rad, at which the faces of an object of this width and height would meet"
         )
 
 
@@ -352,8 +353,8 @@ def _cells(settings: Settings) -> Iterator[str]:
         for cell in cells:
             if cell[0] >= tactile.rows or cell[1] >= tactile.cols:
                 yield (
-                    f"tactile.dead: found {shown(cell)} for {FINGERS[index]}, "
-                    f"expected a cell of {tactile.rows} × {tactile.cols}"
+                    f"tactile.dead: found {shown(cell)} for {FINGERS[index]}, expected a cell of "
+                    f"the grid of {tactile.rows} × {tactile.cols}"
                 )
 
 
@@ -380,8 +381,8 @@ def _limits(settings: Settings) -> Iterator[str]:
     safety = settings.safety
     if safety.frame_age_hold >= safety.frame_age_fault:
         yield (
-            f"safety.frame_age_hold: found {safety.frame_age_hold:g}, "
-            f"expected below frame_age_fault, {safety.frame_age_fault:g}"
+            f"safety.frame_age_hold: found {safety.frame_age_hold:g}, expected a value below "
+            f"safety.frame_age_fault = {safety.frame_age_fault:g}"
         )
 
 
@@ -412,7 +413,7 @@ def address_problem(address: str, lacking: str) -> str:
         return ""
     hint = ""
     if lacking and _ANY_TCP.fullmatch(address):
-        hint = f"; other addresses need {lacking}, which `softfinger keys` creates"
+        hint = f"; other addresses require {lacking}, which `softfinger keys` creates"
     return (
         f"found {shown(address)}, expected tcp://127.0.0.1:PORT with a port of 1 to 65535, "
         f"or ipc://PATH{hint}"
@@ -443,7 +444,7 @@ def _folder(settings: Settings) -> Iterator[str]:
         ports += [("tactile.port", port) for port in settings.tactile.port]
     for key, port in ports:
         if "{dir}" in port:
-            yield f"{key}: found {shown(port)}, expected the option --dir for the folder {{dir}}"
+            yield f"{key}: found {shown(port)}, expected --dir to set the folder for {{dir}}"
 
 
 _CHECKS = (

@@ -31,11 +31,11 @@ from softfinger.kinematics.hand.servo_heat import (
 
 _UPDATE_INTERVAL = 0.5  # s between thermal model updates
 _AVERAGING_TIME = 5.0  # s, averaging time for the squared current
-# °C, half a thermometer step, because the rounded reading reaches the limit early.
+# °C, half the thermometer's resolution, because the rounded reading reaches the limit early.
 _HALF_STEP = 0.5
 _TARGET_MARGIN = 3.0  # °C below the limit, target temperature after a reduction
-_FRACTION_MAX = 0.97  # maximum force fraction for which a reduction is worthwhile
-_FRACTION_MIN = 0.6  # minimum force fraction per reduction, because the first estimate is uncertain
+_FRACTION_MAX = 0.97  # maximum ratio of new to old force for which a reduction is worthwhile
+_FRACTION_MIN = 0.6  # minimum ratio of new to old force; the first estimate is uncertain
 _SETTLING_TIME = 10.0  # s from a reduction to the next evaluation
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
 # Winding fractions of the total heat capacity and thermal resistance.
@@ -77,11 +77,11 @@ class HeatWatch:
         self._t = math.nan  # time of the last reading [s]
         self._elapsed = 0.0  # time since the last update [s]
         self._reduction_time = -math.inf  # time of the last force reduction [s]
-        self._error_reported = False  # an insufficient reduction has been reported
-        self.due = False  # the model was updated on this tick
+        self._error_reported = False  # True if an insufficient reduction has been reported
+        self.due = False  # True if the model was updated on this tick
 
     def update(self) -> None:
-        """Add this tick's reading; update the model if due."""
+        """Add this tick's reading; update the model if an update is due."""
         reading = self._state.reading
         dt = reading.t - self._t
         self._t = reading.t
@@ -116,7 +116,10 @@ class HeatWatch:
             estimate.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
     def act(self, control: Control, events: list[Event]) -> str:
-        """Reduce the grip force if a servo gets too hot; return a ``heat_action`` due now or ""."""
+        """Reduce the grip force if a servo gets too hot.
+
+        Return the ``heat_action`` if it is due, or "".
+        """
         state = self._state
         if state.mode not in GRIPPING_MODES:
             self._error_reported = False
@@ -146,6 +149,9 @@ class HeatWatch:
         action = self._limits.heat_action
         if not self._error_reported:
             self._error_reported = True
-            text = f"{who}, and the load does not allow a weaker grip: {action}"
+            text = (
+                f"{who}, and the load does not allow a lower grip force; safety.heat_action = "
+                f"{action}"
+            )
             events.append(("error", "servos.heat", text))
         return action if left < _ACTION_TIME and action != "hold" else ""

@@ -33,7 +33,7 @@ from softfinger.kinematics.hand.geometry import tip_position
 
 _NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention noise
 _WARNING_FRACTION = 0.9  # fraction of a fault limit at which a warning starts
-# A/rad, expected current per position error. The control loop of every servo model is stiffer.
+# A/rad, expected current per position error. The position loop of every servo model is stiffer.
 _CURRENT_PER_ERROR = 2.0
 _STANDSTILL_SPEED = 0.05  # rad/s, maximum speed of a joint at standstill
 # Minimum relative increase in commanded force, and fraction of it that must be measured.
@@ -41,8 +41,8 @@ _FORCE_RISE_MIN = 0.2
 _RESPONSE_TIME = 0.3  # s, time allowed for the measured force to follow
 _STEP_TOLERANCE = 0.02  # rad, step tolerance beyond the distance at maximum velocity
 _DRIFT_MAX = 0.1  # rad, allowed difference between angle and integrated velocity
-_DRIFT_TIME = 0.1  # s, window for this difference, to allow for velocity lag
-_LATE_TIME = 0.02  # s or 3 ticks, interval between readings that restarts the window
+_DRIFT_TIME = 0.1  # s, time window for this difference, which allows for velocity lag
+_LATE_TIME = 0.02  # s; if readings are farther apart than this and 3 ticks, the window restarts
 _FAILURE_TIME = 0.72  # s, time constant for the fraction of failed readings
 _FAILED_FRACTION_MAX = 0.75  # warning threshold, reached after 1 s without a valid reading
 _GAP_TIME = 0.1  # s, interval between readings above which steps are not checked
@@ -51,7 +51,7 @@ _GAP_TIME = 0.1  # s, interval between readings above which steps are not checke
 class JointMotion:
     """Consistency check of joint angles with measured velocities and the maximum velocity.
 
-    An encoder may jump, stop while the joint rotates, or drift while the joint is at standstill.
+    An encoder may jump, freeze while the joint rotates, or drift while the joint is at standstill.
     Its angles are then inconsistent with its velocity, and the finger's bit is set in ``jumped``.
     """
 
@@ -93,7 +93,7 @@ class JointMotion:
 
 
 class View:
-    """Scene in which limits are checked, and history required by some checks."""
+    """Scene whose limits are checked, with the history that some checks require."""
 
     def __init__(
         self,
@@ -110,11 +110,11 @@ class View:
         self.failed = 0.0  # fraction of failed readings during about the last second
         self._t = math.nan  # time of the previous state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
-        servos = settings.servos  # limited by the stiffness in current mode
+        servos = settings.servos  # in current mode, the stiffness limits `pull`
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
             self.pull = min(self.pull, 0.5 * servos.stiffness)
-        self.bad_goal = False  # a goal since the previous check was not finite
+        self.bad_goal = False  # True if a goal since the previous check was not finite
         self.grip_width = math.nan  # object width at the start of the grip [m]
         self._target = math.nan  # commanded grip force on the previous tick [N]
         self.rise_t = math.inf  # time of a commanded increase without a measured response [s]
@@ -127,7 +127,7 @@ class View:
         self.voltage = (low, high)
 
     def update(self, state: State) -> None:
-        """Record parts of this tick's state for comparison in later checks."""
+        """Store the parts of this tick's state that later checks compare."""
         self.motion.update(state.t, state.reading)
         self.wiring.update(state)
         passed, self._t = state.t - self._t, state.t
@@ -175,8 +175,8 @@ FingerCheck = Callable[[View, State, float, int], str]
 class Limit:
     """One row of the table. As a decorator, it adds the row with the decorated check.
 
-    A row without a check is added directly; its limit is applied in `Safety.write`, on the bus or
-    in the gateway.
+    A row without a check is added directly, because its limit is applied elsewhere: in
+    `Safety.write`, on the bus or in the gateway.
     """
 
     name: str
@@ -193,7 +193,7 @@ class Limit:
     def __call__(self, check: Check) -> Check:
         """Add the row with its check.
 
-        If several rows decorate the same check, the lowest row is added first.
+        If several rows decorate the same check, the one closest to the function is added first.
         """
         LIMITS.append(replace(self, check=check))
         return check
@@ -216,7 +216,8 @@ LIMITS: list[Limit] = []
 
 # --- servos ---------------------------------------------------------------------------------------
 
-LIMITS.append(Limit("servos.bus", "lost port, stopped servo or servo that rejects goals", "fault",
+LIMITS.append(Limit("servos.bus", "lost port, servo stopped by its watchdog, or servo that rejects "
+    "goals", "fault",
     ("servos.watchdog",)))  # fmt: skip
 
 
@@ -238,17 +239,22 @@ def _servos_late(view: View, _: State, fraction: float) -> str:
     allowed = 1e3 * view.settings.servos.reply_timeout
     return (
         f"servos: {view.failed:.0%} of the readings in the last second failed: no valid reply "
-        f"within servos.reply_timeout = {allowed:g} ms; `softfinger doctor` times the replies"
+        f"within servos.reply_timeout = {allowed:g} ms; run `softfinger doctor` to measure the "
+        "reply times"
     )
 
 
-@Limit("servos.frozen", "servo whose clock register has not changed for 0.1 s, so its readings are "
+@Limit("servos.frozen",
+    "servo whose clock register has not changed for 0.1 s, which means that its readings are "
     "old", "fault", needs="servos")  # fmt: skip
 def _servos_frozen(view: View, state: State, _: float) -> str:
     frozen = state.reading.frozen
     if not frozen:
         return ""
-    return f"servos: readings from {_names(view, frozen)} are old: the clock register stands still"
+    return (
+        f"servos: the readings are old ({_names(view, frozen)}): the clock register has stopped; "
+        "check the cable, and switch the supply off and on"
+    )
 
 
 def _names(view: View, bits: int) -> str:
@@ -305,7 +311,7 @@ def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
 _STOP_TOLERANCE = 0.1  # rad, tolerance for joints pushed beyond their limits
 
 
-@Limit("joint.angle", "joint angle, 0.1 rad beyond its limits", "fault",
+@Limit("joint.angle", "joint angle more than 0.1 rad beyond its limits", "fault",
     ("hand.q_min", "hand.q_max"), "servos").each  # fmt: skip
 def _joint_angle(view: View, state: State, _: float, i: int) -> str:
     hand, q = view.settings.hand, state.reading.q[i]
@@ -320,7 +326,7 @@ def _joint_velocity(view: View, state: State, _: float, i: int) -> str:
     bound, dq = view.limits.velocity_max, state.reading.dq[i]
     if -bound <= dq <= bound:
         return ""
-    return f"{FINGERS[i]} joint moves at {dq:.2f} rad/s, above {bound:g} rad/s"
+    return f"{FINGERS[i]} joint is moving at {dq:.2f} rad/s, above {bound:g} rad/s"
 
 
 @Limit("joint.jump", "joint angle that differs from its integrated velocity by 0.1 rad within 0.1 "
@@ -331,7 +337,7 @@ def _joint_jump(view: View, _: State, __: float) -> str:
         return ""
     return (
         f"angle of the {_names(view, view.motion.jumped)} joint does not follow its velocity: "
-        "its encoder or coupling has slipped"
+        "check for a slipping encoder or coupling"
     )
 
 
@@ -340,8 +346,8 @@ _EXPECTED_CURRENT_MIN = 0.04  # A, minimum expected current for the check
 _CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 
 
-@Limit("joint.dead", "joint 0.05 rad from its goal that does not move and draws no current for "
-    "0.05 s", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
+@Limit("joint.dead", "joint at least 0.05 rad from its goal that neither moves nor draws "
+    "current for 0.05 s", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     """Report a joint that is stationary away from its goal without drawing current.
 
@@ -359,9 +365,9 @@ def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     if not (expected > _EXPECTED_CURRENT_MIN and toward < _CURRENT_FRACTION_MIN * expected):
         return ""
     return (
-        f"{FINGERS[i]} joint stands still {math.degrees(abs(error)):.1f}° from its goal and "
-        f"draws only {toward:.2f} A of {goal.current[i]:.2f} A: check encoder, current sensor "
-        "and motor"
+        f"{FINGERS[i]} joint is stationary {math.degrees(abs(error)):.1f}° from its goal and "
+        f"draws only {toward:.2f} A of {goal.current[i]:.2f} A: check the encoder, the current "
+        "sensor and the motor"
     )
 
 
@@ -376,7 +382,8 @@ def _joint_current(view: View, state: State, _: float, i: int) -> str:
 _FULL_CURRENT = 0.9  # fraction of the goal's current limit that counts as saturated
 
 
-@Limit("joint.stall", "joint that does not move, at its highest current and away from its goal",
+@Limit("joint.stall", "joint that does not move although it is away from its goal and at "
+    "maximum current",
     "fault", ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
     lasts="stall_time").each  # fmt: skip
 def _joint_stall(view: View, state: State, _: float, i: int) -> str:
@@ -393,14 +400,15 @@ def _joint_stall(view: View, state: State, _: float, i: int) -> str:
     return f"{FINGERS[i]} joint has stalled {off} at {current:.2f} A"
 
 
-@Limit("joint.swapped", "joint that moves the other finger's tip, or object that turns against its "
-    "command", "fault", ("servos.ids",), "sensors")  # fmt: skip
+@Limit("joint.swapped", "joint that moves the other finger's tip, or object that rotates "
+    "opposite to its command", "fault", ("servos.ids",), "sensors")  # fmt: skip
 def _joint_swapped(view: View, _: State, __: float) -> str:
     return view.wiring.swapped
 
 
-@Limit("joint.blocked", "joint that stops in the approach at its highest current for 0.5 s, "
-    "without contact", "warn", ("servos.direction",), "servos", lasts=0.5).each  # fmt: skip
+@Limit("joint.blocked", "joint that stops for 0.5 s at maximum current during the "
+    "approach without contact", "warn", ("servos.direction",), "servos",
+    lasts=0.5).each  # fmt: skip
 def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     goal, reading, contact = state.goal, state.reading, state.contacts[i]
     if state.mode != Mode.GRASPING or not goal.valid or not view.sensors or contact.contact:
@@ -412,23 +420,24 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     if not (full and stands):
         return ""
     return (
-        f"{FINGERS[i]} joint has stopped at {math.degrees(reading.q[i]):.0f}° in the approach, "
-        "and its tip has no contact: remove what blocks it; if it opens instead of closing, "
-        "correct servos.direction"
+        f"{FINGERS[i]} joint has stopped at {math.degrees(reading.q[i]):.0f}° during the approach "
+        "although its tip has no contact: remove the obstacle; if the finger opens instead of "
+        "closing, correct servos.direction"
     )
 
 
-_OVERLAP_RATIO = 0.5  # of the tip radius; more than zero errors and frame latency cause
+_OVERLAP_RATIO = 0.5  # fraction of the tip radius; offset errors and frame latency cause less
 
 
-@Limit("joint.opens", "tips that overlap by their joint angles in an approach, and one of them has "
-    "no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
+@Limit("joint.opens",
+    "tips that overlap according to the joint angles during the approach although one of them "
+    "has no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 
-    With the wrong direction, goal, angle and current change their signs together, so the servos'
-    readings are those of a finger that closes. The first difference is the contact that is missing
-    when the tips should meet.
+    If the configured direction is wrong, goal, angle and current all change sign, so the servos'
+    readings look like those of a closing finger. The first visible difference is that contact is
+    missing when the tips should meet.
     """
     felt = [contact.contact for contact in state.contacts]
     if state.mode != Mode.GRASPING or len(view.sensors) < len(FINGERS) or all(felt):
@@ -441,22 +450,26 @@ def _joint_opens(view: View, state: State, _: float) -> str:
         return ""
     tips = f"the {FINGERS[felt.index(False)]} tip has no" if any(felt) else "neither tip has"
     return (
-        f"the joint angles let the tips overlap by {1e3 * overlap:.0f} mm, but {tips} contact: "
-        "if a finger opens instead of closing, correct servos.direction; otherwise servos.zero"
+        f"according to the joint angles the tips overlap by {1e3 * overlap:.0f} mm, but {tips} "
+        "contact: if a finger opens instead of closing, correct servos.direction; otherwise "
+        "correct servos.zero"
     )
 
 
 _CURRENT_FRACTION_MAX = 0.95  # fraction of the maximum current that counts as saturated
 
 
-@Limit("joint.strained", "joint that needs the highest current in a grip", "warn",
+@Limit("joint.strained", "joint that requires the maximum current in a grip", "warn",
     ("safety.current_max",), "servos", in_turn=True, lasts=1.0).each  # fmt: skip
 def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     limit = view.limits.current_max
     well = abs(state.reading.current[i]) < _CURRENT_FRACTION_MAX * fraction * limit
     if not state.torque or state.mode not in GRIPPING_MODES or well:
         return ""
-    return f"{FINGERS[i]} joint needs the highest current, {limit:g} A, for this grip"
+    return (
+        f"{FINGERS[i]} joint requires the maximum current of {limit:g} A for this grip; reduce "
+        "the force, or raise safety.current_max"
+    )
 
 
 LIMITS.append(Limit("torque.off", "torque off not confirmed within half of servos.watchdog; the "
@@ -467,16 +480,21 @@ LIMITS.append(Limit("torque.off", "torque off not confirmed within half of servo
 # --- goals ----------------------------------------------------------------------------------------
 
 
-@Limit("goal.lost", "servo that has not received any goal for 0.05 s", "fault", (),
+@Limit("goal.lost", "servo that has not received a goal for 0.05 s", "fault", (),
     "servos")  # fmt: skip
 def _goal_lost(view: View, state: State, _: float) -> str:
     lost = state.reading.lost
     if not lost:
         return ""
-    return f"servos: goals are not received by {_names(view, lost)}: check the cable"
+    return f"servos: goals are not being received ({_names(view, lost)}): check the cable"
 
 
-@Limit("goal.number", "goal that is not a finite number; it is not sent", "fault", needs="servos")
+@Limit(
+    "goal.number",
+    "computed goal that is not a finite number; it is not sent",
+    "fault",
+    needs="servos",
+)
 def _goal_number(view: View, _: State, __: float) -> str:
     return "control: computed a goal that is not a finite number" if view.bad_goal else ""
 
@@ -484,9 +502,9 @@ def _goal_number(view: View, _: State, __: float) -> str:
 LIMITS += [
     Limit("goal.angle", "goal angle", "limit", ("hand.q_min", "hand.q_max")),
     Limit("goal.current", "goal current", "limit", ("safety.current_max",)),
-    Limit("goal.step", "step of a goal angle that is far from the joint", "limit",
+    Limit("goal.step", "step of a goal angle that is far from the joint angle", "limit",
         ("safety.goal_reach", "safety.goal_speed")),
-    Limit("goal.slew", "rise of a goal current per tick", "limit", ("safety.current_rate",)),
+    Limit("goal.slew", "increase of a goal current per tick", "limit", ("safety.current_rate",)),
 ]  # fmt: skip
 
 
@@ -513,7 +531,7 @@ def _tip_displacement(view: View, state: State, fraction: float, i: int) -> str:
     return f"{FINGERS[i]} tip displacement is {contact.d * 1e3:.2f} mm, above {bound * 1e3:g} mm"
 
 
-_TILT_TEXT = "|θ|, limit asin(1 − d/a) minus a margin"
+_TILT_TEXT = "|θ|; the limit is asin(1 − d/a) minus a margin"
 
 
 @Limit("tip.tilt", _TILT_TEXT, "fault", ("safety.theta_margin",), "sensors").each
@@ -535,8 +553,8 @@ def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
         return ""
     if not contact.inside and view.settings.tip.physics != "springs":
         tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
-        deep = f"{FINGERS[i]} tip is {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°"
-        return f"{deep}, outside the range of its contact model"
+        deep = f"{FINGERS[i]} tip is {contact.d * 1e3:.2f} mm deep at a tilt of {tilt:.1f}°"
+        return f"{deep}, which is outside the range of its contact model"
     limit = fraction * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
     tilt = math.degrees(contact.theta)
     return f"{FINGERS[i]} tip tilt is {tilt:.1f}°, above {math.degrees(limit):.1f}° at this depth"
@@ -544,7 +562,7 @@ def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
 
 # --- sensors --------------------------------------------------------------------------------------
 
-LIMITS.append(Limit("tactile.late", "age of the last valid frame; an older one holds the goal",
+LIMITS.append(Limit("tactile.late", "age of the last valid frame; older frames freeze the goal",
     "limit", ("safety.frame_age_hold",), "sensors", gripping=True))  # fmt: skip
 
 
@@ -560,14 +578,14 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
     cure = ""
     for sensor in (each for each in view.sensors if each.finger == i):
         if sensor.sensor.counters().get("port_lost"):
-            cure = ": the port is lost; `clear`, or `disarm` and `arm`, opens it again"
+            cure = ": the port is lost; send `clear`, or `disarm` and `arm`, to reopen it"
         elif what != "frame":
             cure = f": {sensor.estimate.invalid.text}" if sensor.estimate.invalid else ""
             noise = view.settings.tactile.noise
             if sensor.noise > _NOISE_RATIO * noise:
                 cure += (
-                    f"; the noise of its cells is {sensor.noise:.0f} Pa, tactile.noise is "
-                    f"{noise:g} Pa"
+                    f"; the measured cell noise is {sensor.noise:.0f} Pa, expected tactile.noise "
+                    f"= {noise:g} Pa"
                 )
     return (
         _sensor_fault(view, state, i)
@@ -584,19 +602,20 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
         if abs(turned) <= ANGLE_JUMP:
             what = f"{deeper:+.1f} mm in d"
         return (
-            f"{side} sensor reports a jump of {what}, which neither the joints nor the other tip "
-            "confirm: it has shifted, its frames are old, or its tip is at the object's edge"
+            f"{side} sensor reports a jump of {what}, which is inconsistent with the joints and "
+            "the other tip: the sensor has shifted, its frames are old, or its tip is at the "
+            "object's edge"
         )
     if found.has_bias[finger] and view.holds(state):
         off, turned = 1e3 * found.d_bias[finger], math.degrees(found.angle_bias[finger])
         if abs(found.angle_bias[finger]) > ANGLE_BIAS_MIN:
             return (
-                f"{side} sensor's angle differs by {turned:+.0f}° from the rolling of the "
-                "joints: its image has moved"
+                f"{side} sensor's angle differs by {turned:+.0f}° from the rolling angle computed "
+                "from the joints: its image has shifted"
             )
         return (
-            f"{side} sensor's displacement is {abs(off):.1f} mm "
-            f"{'less' if off < 0.0 else 'more'} than the joint's angle and torque give: tare it"
+            f"{side} sensor's displacement is {abs(off):.1f} mm {'less' if off < 0.0 else 'more'} "
+            "than computed from the joint's angle and torque: tare the sensor"
         )
     for sensor in view.sensors:
         if sensor.finger == finger and sensor.repeats.is_fault:
@@ -604,7 +623,7 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
     return ""
 
 
-_GAIN_SIGMA = 1.5  # prior standard deviations of gain error that trigger a report
+_GAIN_SIGMA = 1.5  # prior standard deviations; a larger gain error is reported
 
 
 def _gain_fault(view: View, finger: int) -> str:
@@ -614,31 +633,32 @@ def _gain_fault(view: View, finger: int) -> str:
     if not abs(off) - unsure > _GAIN_SIGMA * grasp.gain_prior_std[finger]:
         return ""
     return (
-        f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of the pressure that the joints and "
-        "the other tip give: tare or calibrate it"
+        f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of the pressure expected from the "
+        "joints and the other tip: tare or calibrate the sensor"
     )
 
 
 def _add_consistency_checks(finger: int, side: str) -> None:
-    @Limit(f"consistency.{side}_sensor", "frames of a tip, compared with the joints and the other "
-        "tip", "warn", ("tactile.gain_error",), "sensors", in_turn=True)  # fmt: skip
+    @Limit(f"consistency.{side}_sensor",
+        "difference between a tip's frames and the values expected from the joints and the "
+        "other tip", "warn", ("tactile.gain_error",), "sensors", in_turn=True)  # fmt: skip
     def _sensor(view: View, state: State, _: float) -> str:
         if finger not in view.fingers:
             return ""
-        # Check the gain only during a grip: after release, the cells may relax more slowly than the
-        # shape.
+        # Check the gain only during a grip. After release, the sensor cells may relax more slowly
+        # than the shape of the tip.
         return _sensor_fault(view, state, finger) or (
             _gain_fault(view, finger) if view.holds(state) else ""
         )
 
-    @Limit(f"consistency.{side}_current", "measured current of a joint in a grip, compared with "
-        "its goal", "warn", (), "servos", in_turn=True)  # fmt: skip
+    @Limit(f"consistency.{side}_current", "difference between a joint's measured current in "
+        "a grip and its goal", "warn", (), "servos", in_turn=True)  # fmt: skip
     def _current(view: View, state: State, _: float) -> str:
         if not view.grasp.current_off_time[finger] > CURRENT_OFF_TIME_MAX:
             return ""
         return (
-            f"{side} joint's measured current is {state.reading.current[finger]:.2f} A, its goal "
-            f"{state.goal.current[finger]:.2f} A: the measured current is not used"
+            f"{side} joint's measured current is {state.reading.current[finger]:.2f} A, but its "
+            f"goal is {state.goal.current[finger]:.2f} A: the measured current is ignored"
         )
 
 
@@ -646,18 +666,18 @@ for _finger, _side in enumerate(FINGERS):
     _add_consistency_checks(_finger, _side)
 
 
-@Limit("consistency.force", "measured force that does not follow the commanded force for 0.3 s",
+@Limit("consistency.force", "measured force that has not followed the commanded force for 0.3 s",
     "fault", (), "sensors", in_turn=True)  # fmt: skip
 def _force_response(view: View, state: State, _: float) -> str:
     if not state.t - view.rise_t > _RESPONSE_TIME:
         return ""
     return (
-        f"commanded force rose to {state.goal.force:.1f} N, measured force stayed at "
+        f"commanded force rose to {state.goal.force:.1f} N, but the measured force stayed at "
         f"{view.rise_felt:.1f} N"
     )
 
 
-@Limit("tactile.frozen", "time of identical frames during contact", "fault",
+@Limit("tactile.frozen", "duration of identical frames during contact", "fault",
     ("safety.frozen_after",), "sensors", in_turn=True)  # fmt: skip
 def _tactile_frozen(view: View, state: State, _: float) -> str:
     for sensor in view.sensors:
@@ -692,13 +712,13 @@ def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
         return ""
     return (
         f"tactile: the {FINGERS[i]} sensor's frames do not fit the contact model, so d and theta "
-        "may be biased: check tip material, cell gains and tactile.noise"
+        "may be biased: check the tip material, the cell gains and tactile.noise"
     )
 
 
 # --- the hand and its grip ------------------------------------------------------------------------
 
-_ANGLE_SIGMA = 4.0  # minimum significant difference, in summed tilt standard deviations
+_ANGLE_SIGMA = 4.0  # summed tilt standard deviations, minimum significant difference
 _ANGLE_TEXT = "difference between the two fingers' estimates of the object's angle"
 _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
@@ -710,7 +730,7 @@ _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
-    left, right = (sensor.estimate for sensor in view.sensors)  # from the newest frames alone
+    left, right = (sensor.estimate for sensor in view.sensors)  # newest frames only
     if not (left.contact and right.contact):
         return ""
     unsure = _ANGLE_SIGMA * (left.tilt_x_std + right.tilt_x_std)
@@ -739,7 +759,7 @@ def _hand_width(view: View, state: State, fraction: float) -> str:
     )
 
 
-@Limit("hand.force", "difference of the two tips' forces", "warn", ("safety.residual_force",),
+@Limit("hand.force", "difference between the two tip forces", "warn", ("safety.residual_force",),
     "sensors", in_turn=True, lasts=0.3)  # fmt: skip
 def _hand_force(view: View, state: State, fraction: float) -> str:
     left, right = (contact.force for contact in state.contacts)
@@ -749,7 +769,8 @@ def _hand_force(view: View, state: State, fraction: float) -> str:
     return f"the forces of the two tips differ: left {left:.1f} N, right {right:.1f} N"
 
 
-@Limit("grip.slip", "shear over normal force, limit: friction minus a margin", "warn",
+@Limit("grip.slip", "ratio of shear to normal force; the limit is the friction coefficient "
+    "minus a margin", "warn",
     ("control.tip_friction", "control.slip_margin"), "sensors", in_turn=True,
     lasts=0.1)  # fmt: skip
 def _grip_slip(view: View, state: State, fraction: float) -> str:
@@ -757,12 +778,15 @@ def _grip_slip(view: View, state: State, fraction: float) -> str:
     usable = control.tip_friction * (1.0 - control.slip_margin)
     if not view.holds(state) or shear <= fraction * usable:
         return ""
-    return f"shear is {shear:.2f} of the grip force, above {usable:.2f}: the object may slip"
+    return (
+        f"shear force is {shear:.2f} times the grip force, above the limit of {usable:.2f}: the "
+        "object may slip"
+    )
 
 
 # --- commands and the loop ------------------------------------------------------------------------
 
-LIMITS.append(Limit("commands.pace", "rate of a client's commands; `stop` is always accepted",
+LIMITS.append(Limit("commands.pace", "command rate of a client; `stop` is always accepted",
     "limit", ("commands.per_second",)))  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from softfinger.daemon.safety.limits import LIMITS, Check, Limit, View
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Goal, State
 
-_REPEAT_TIME = 1.0  # s without a violation before a warning may be repeated
+_REPEAT_TIME = 1.0  # s, time without a violation after which a warning may be repeated
 _HYSTERESIS = 0.95  # fraction of the bound below which a reported warning clears
 
 BUS = "servos.bus"  # limit name for servo backend errors
@@ -49,7 +49,7 @@ class _Watch:
     def check_limit(
         self, view: View, state: State, faults: dict[_Watch, str], warnings: list[Breach]
     ) -> None:
-        """Run the check; record a violation that has lasted long enough."""
+        """Run the check; record a violation if it has lasted long enough."""
         limit = self.limit
         found = self.check(view, state, limit.fraction * (_HYSTERESIS if self.reported else 1.0))
         if not found:
@@ -98,7 +98,7 @@ class Safety:
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
         self._found: dict[_Watch, str] = {}  # current violations of fault limits
-        self.must_hold = False  # hold the goal because frames are late during a grip
+        self.must_hold = False  # True if frames are late during a grip, so the goal is held
         self.warnings: list[Breach] = []  # new warnings, reported and removed by the loop
         self.limited: Counter[str] = Counter()  # number of ticks with a modified goal, by limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
@@ -162,14 +162,14 @@ class Safety:
     # Goals
 
     def write(self, servos: Servos, state: State) -> None:
-        """Limit the goal in place and send it; a non-finite goal is marked invalid instead.
+        """Limit the goal in place and send it; if it is not finite, mark it as invalid instead.
 
         Raises ServoError like `Servos.write`.
         """
         goal = state.goal
         q, current = goal.q, goal.current
         present = state.reading.q
-        if state.seq - self._sent_seq != 1:  # torque was off: start from here without current
+        if state.seq - self._sent_seq != 1:  # torque was off: start here with zero current
             self._sent_q[:] = present
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq

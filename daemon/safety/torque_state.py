@@ -1,9 +1,9 @@
-"""Track the torque state: on once requested, off only after the servos have confirmed it.
+"""Track the torque state: on from the request to switch it on, off only after confirmation.
 
-Torque off is sent on every tick until the servo registers confirm it. Without confirmation within
-half the bus watchdog time, the bus stays silent until the watchdog has stopped the motors.
-Otherwise, a servo that receives read requests but loses all writes would keep driving. Torque off
-is then tried again.
+Torque off is sent on every tick until the servo registers confirm it. If the servos do not confirm
+within half the bus watchdog time, the bus stays silent until the watchdog has stopped the motors.
+Otherwise, a servo that receives read requests but loses all writes would keep driving. The daemon
+then tries torque off again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 
 _TRY_FRACTION = 0.5  # fraction of the watchdog time for attempts before bus silence
-_TRY_TIME_UNGUARDED = 0.05  # s of attempts before a report if servos.watchdog = 0
+_TRY_TIME_UNGUARDED = 0.05  # s, duration of attempts before a report if servos.watchdog = 0
 _CLOSING_TRY_COUNT = 15  # attempts at shutdown
 
 
@@ -37,7 +37,7 @@ class TorqueState:
     ) -> None:
         """Create the controller.
 
-        ``fail(reason, limit name)`` latches a fault; ``emit`` sends an event.
+        ``fail(reason, name)`` latches a fault with the limit's name; ``emit`` sends an event.
         """
         self.servos = servos
         self._state = state
@@ -46,14 +46,14 @@ class TorqueState:
         self._emit = emit
         watchdog = settings.watchdog
         self._try_time = _TRY_FRACTION * watchdog or _TRY_TIME_UNGUARDED
-        # The servo counts whole units and may react one unit late.
+        # The servo's watchdog counts whole units and may act one unit late.
         units = math.ceil(watchdog / WATCHDOG_UNIT - 1e-9) + 1 if watchdog else 0
         self._silence = units * WATCHDOG_UNIT
         self._tried_since = math.inf  # start of the current series of attempts [s]
         self._silent_until = -math.inf
         self._first = math.inf  # time of the first torque-off request [s]
         self._reported = False
-        self._port_gone = False  # the port is lost, so sending is impossible
+        self._port_gone = False  # True if the port is lost, so that sending is impossible
         self._last_try = -1  # seq of the tick with the last attempt
         self._unused = Reading()  # buffer for readings that are discarded
 
@@ -107,7 +107,7 @@ class TorqueState:
             return "confirmed"
         first = not self.pending
         if first:
-            state.torque = True  # another program may have switched it on
+            state.torque = True  # another program may have switched torque on
             self._first = self._tried_since = state.t
             self._silent_until = -math.inf
         if self._last_try != state.seq and (first or not self._is_silent()):
@@ -118,7 +118,10 @@ class TorqueState:
         return "unconfirmed" if state.torque else "confirmed"
 
     def end(self) -> None:
-        """Turn torque off if it may be on. If this fails, bus silence trips the watchdogs."""
+        """Turn torque off if it may be on.
+
+        If this fails, the bus stays silent, which trips the watchdogs.
+        """
         for _ in range(_CLOSING_TRY_COUNT):
             if not self._state.torque:
                 return
@@ -126,7 +129,10 @@ class TorqueState:
             self.off()
 
     def reconnect(self) -> None:
-        """Reconnect servos that stopped responding, such as after an unplug. Raises ServoError."""
+        """Reconnect servos that have stopped responding, for example because they were unplugged.
+
+        Raises ServoError.
+        """
         if self.servos is None:
             return
         self.servos.connect()
@@ -137,7 +143,7 @@ class TorqueState:
             self.off()
 
     def _on(self, servos: Servos) -> None:
-        self._state.torque = True  # From here on, torque may be on, regardless of the reply.
+        self._state.torque = True  # From this point on, torque may be on, regardless of the reply.
         try:
             servos.torque_on()
         except ServoError as error:
@@ -161,7 +167,7 @@ class TorqueState:
         if self._reported:
             self._reported = False
             waited = state.t - self._first
-            self._emit("info", TORQUE_OFF, f"servos confirmed torque off after {waited:.2f} s")
+            self._emit("info", TORQUE_OFF, f"the servos confirmed torque off after {waited:.2f} s")
 
     def _is_silent(self) -> bool:
         """Return True if the bus must stay silent on this tick to trip the servo watchdogs."""
@@ -176,18 +182,21 @@ class TorqueState:
         return silence > 0.0
 
     def _report(self) -> None:
-        """Report once that torque off is unconfirmed; latch a fault unless one is latched."""
+        """Report once that torque off is unconfirmed; latch a fault if none is latched yet."""
         if self._reported:
             return
         self._reported = True
         state = self._state
-        text = f"servos have not confirmed torque off for {state.t - self._first:.2f} s: "
+        text = f"the servos have not confirmed torque off for {state.t - self._first:.2f} s: "
         if not self._silence:
-            text += "cut their power; servos.watchdog = 0, so nothing else stops them"
+            text += (
+                "switch off their supply, because servos.watchdog = 0 disables the watchdogs "
+                "that would stop them"
+            )
         elif self._port_gone:
-            text += "the port is lost; their watchdogs stop them"
+            text += "the port is lost; the watchdogs will stop the servos"
         else:
-            text += "the bus is kept silent until their watchdogs stop them"
+            text += "the daemon keeps the bus silent until the watchdogs stop the servos"
         if state.fault:
             self._emit("error", TORQUE_OFF, text)
         else:

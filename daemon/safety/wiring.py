@@ -1,8 +1,8 @@
-"""Detect swapped servo IDs, where the joint of one finger moves the tip of the other finger.
+"""Detect swapped servo IDs, with which the joint of one finger moves the other finger's tip.
 
-Joint angles and currents are consistent in this case, because each servo reports its own values.
-Only the tactile sensors show the error: when one joint is stationary and the other moves, the wrong
-tip tilts or is loaded, and the object rotates opposite to the command.
+Even then, joint angles and currents are consistent, because each servo reports its own values. Only
+the tactile sensors show the error: when one joint is stationary and the other moves, the wrong tip
+tilts or is loaded, and the object rotates opposite to the command.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from collections.abc import Sequence
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.types import FINGERS, State
 
-_STANDING_MAX = 0.02  # rad, maximum motion of the joint that waits
+_STANDING_MAX = 0.02  # rad, maximum motion of the stationary joint
 _CLOSING_MIN = 0.05  # rad, minimum closing motion of the other joint
 # Minimum tip tilt as a fraction of the closing motion. With swapped IDs, a tip tilts by about the
-# rotation angle of its finger: 0.9 of that angle on a sliding object in the simulated hand. With
-# correct wiring, the fraction is 0.25.
+# rotation angle of its finger: by 0.9 of that angle in the simulated hand, on a sliding object.
+# With correct wiring, the fraction is 0.25.
 _TILT_RATIO = 0.5
-_TILT_SIGMA = 2.0  # tilt standard deviations added to the threshold
+_TILT_SIGMA = 2.0  # number of tilt standard deviations that are added to the threshold
 _FORCE_RISE_MIN = 1.0  # N, minimum tip force increase
-_SETTLING_TIME = 0.07  # s after a touch, to cover frame latency and joint stopping time
+_SETTLING_TIME = 0.07  # s after a touch, covers the frame latency and the joint's stopping time
 _WRONG_ROTATION = math.radians(4.0)  # rad, minimum rotation opposite to the command
 _TILT_SIGNS = (1.0, -1.0)  # sign of tip tilt when the finger closes
 
 
 class WiringWatch:
-    """Comparison of joint motion with the responding tip, during approach and rotation."""
+    """Check, during approach and rotation, that the moving joint and the responding tip match."""
 
     def __init__(self, fingers: Sequence[int]) -> None:
         self.swapped = ""  # description of a detected swap, otherwise empty
@@ -76,12 +76,12 @@ class WiringWatch:
         if turned or pressed:
             self.swapped = (
                 f"the {FINGERS[finger]} tip moves with the {FINGERS[other]} joint while the "
-                f"{FINGERS[finger]} joint stands still: are servos.ids swapped?"
+                f"{FINGERS[finger]} joint is stationary: check whether servos.ids are swapped"
             )
 
     def _check_turn(self, state: State) -> None:
         angle, goal = state.object.angle, state.goal.angle
-        if goal != self._goal:  # Also true for NaN. A streamed goal changes on each tick.
+        if goal != self._goal:  # Also true for NaN. A streamed goal changes on every tick.
             self._goal, self._turn = goal, math.nan
         if math.isnan(self._turn):
             if state.object.valid and abs(goal - angle) > 0.5 * _WRONG_ROTATION:
@@ -90,6 +90,6 @@ class WiringWatch:
         against = self._sense * (self._turn - angle)
         if state.object.valid and against > _WRONG_ROTATION:
             self.swapped = (
-                f"the object turned by {math.degrees(against):.0f}° against the commanded "
-                "direction: are servos.ids swapped?"
+                f"the object rotated by {math.degrees(against):.0f}° opposite to the commanded "
+                "direction: check whether servos.ids are swapped"
             )

@@ -28,7 +28,7 @@ class Finding:
     """
 
     status: Status
-    subject: str  # such as ``servo 1 (left)``
+    subject: str  # for example ``servo 1 (left)``
     text: str  # what was found and what was expected
     fix: str = ""  # command or action, empty if none is needed
 
@@ -52,8 +52,8 @@ class Servos(Protocol):
       but not for grasping.
 
     ``connect`` checks the servos and never stiffens or moves the hand. ``read`` and ``write`` are
-    called once per tick. A failed exchange is reported by ``valid`` and the counters. It raises an
-    error only if the port itself is lost.
+    called once per tick. A failed exchange is reported by ``valid`` and the counters. `read` and
+    `write` raise an error only if the port itself is lost.
     """
 
     def connect(self) -> None:
@@ -74,17 +74,17 @@ class Servos(Protocol):
         """
 
     def torque_off(self, reading: Reading) -> bool:
-        """Request torque off once and read like `read`; return True if all servos confirm it.
+        """Request torque off once and read like `read`; return True once all servos confirm it.
 
-        It takes no longer than `read`, so the loop can call it on every tick until it returns True.
-        Raises ServoError if the port is lost.
+        This method takes no longer than `read`, so the loop can call it on every tick until it
+        returns True. Raises ServoError if the port is lost.
         """
 
     def write(self, goal: Goal) -> None:
         """Send each joint's goal angle and current limit."""
 
     def counters(self) -> dict[str, int]:
-        """Return the numbers of failed exchanges since connect by type: ``timeouts``, ``crc``, …"""
+        """Count the failed exchanges since `connect` by type: ``timeouts``, ``crc``, …"""
 
     def close(self) -> None:
         """Try to switch torque off and close the port. Never raises."""
@@ -128,7 +128,7 @@ class JointPlant(Protocol):
 
 
 def make_servos(settings: Settings, clock: Clock, hand: object) -> Servos | None:
-    """Create the unconnected servo backend of the settings, or None in a scene without servos.
+    """Create the configured servo backend, not yet connected, or None in a scene without servos.
 
     ``hand`` is the simulated hand, for backends that use it. Raises the same errors as the
     backend's constructor.

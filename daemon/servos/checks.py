@@ -20,22 +20,22 @@ from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-CHECKED = reg.BACKUP_READY  # number of registers to read, 0 … 146
+CHECKED = reg.BACKUP_READY  # number of registers to read: addresses 0 to 146
 DRIVE_REVERSE = 0b0001
 FIX = "`softfinger doctor --fix`"
-REBOOT_FIX = "remove the cause, then reboot it with `softfinger doctor --fix`"
-LOST_TURN_FIX = "reboot it: switch its supply off and on, or run `softfinger doctor --fix`"
+REBOOT_FIX = "remove the cause, then reboot the servo with `softfinger doctor --fix`"
+LOST_TURN_FIX = "reboot the servo: switch its supply off and on, or run `softfinger doctor --fix`"
 OLD_PROTOCOL = (
-    "answers Protocol 1.0, expected 2.0",
-    "set its protocol to 2.0 with the manufacturer's DYNAMIXEL Wizard (register 13; an MX needs "
-    "firmware for 2.0), or use another servo",
+    "replies in Protocol 1.0, expected Protocol 2.0",
+    "select Protocol 2.0 with the manufacturer's DYNAMIXEL Wizard (register 13; MX servos "
+    "require firmware for Protocol 2.0), or use another servo",
 )
 _WATCHDOG_FIRMWARE = 38
-_FAULT_AFTER_LONG = 0.5  # s, value of servos.fault_after above which a notice is given
-_CONSTANT_RATIO_MAX = 1.3  # allowed ratio of a torque constant to the data sheet value
+_FAULT_AFTER_LONG = 0.5  # s, values of servos.fault_after above this limit cause a notice
+_CONSTANT_RATIO_MAX = 1.3  # maximum ratio of a torque constant to the data sheet value
 _TEMPERATURE_MARGIN = 10  # °C below the temperature limit
-# rad beyond the hand's limits at which an angle is implausible. Causes are a wrong zero offset, or
-# a servo that lost its turn count when it was switched off.
+# rad beyond the hand's limits. A larger angle is implausible. Possible causes are a wrong zero
+# offset, or a servo that lost its turn count when it was switched off.
 ANGLE_MARGIN = 0.25
 
 
@@ -61,7 +61,7 @@ class Examined:
     table: Registers = field(default_factory=Registers)
     errors: tuple[Finding, ...] = ()
     notices: tuple[Finding, ...] = ()
-    misplaced: Finding | None = None  # set if the joint angle is implausible
+    misplaced: Finding | None = None  # None, or the finding that the joint angle is implausible
 
     @property
     def name(self) -> str:
@@ -87,8 +87,8 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
             notices = notice_servo(name, model, table, settings, finger)
         else:
             why = (
-                "answers a ping but no read (status return level 0, two servos with this ID, or a "
-                "bad line)"
+                "replies to a ping but not to a read: its status return level is 0, two servos "
+                "have this ID, or the line is faulty"
             )
             errors, notices = [Finding("FAIL", name, why, FIX)], []
         found.append(
@@ -101,9 +101,12 @@ def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
     """Return a finding if the model does not support an operating mode, otherwise None."""
     if mode in model.modes:
         return None
-    problem = f"an {model.name} has no {reg.MODE_NAMES[mode]} mode"
+    problem = f"an {model.name} does not support {reg.MODE_NAMES[mode]} mode"
     return Finding(
-        "FAIL", name, problem, 'use a model that senses current, or set servos.mode = "position"'
+        "FAIL",
+        name,
+        problem,
+        'use a model that measures its current, or set servos.mode = "position"',
     )
 
 
@@ -142,18 +145,20 @@ def check_servo(
     )
     if not low <= volts <= high:
         fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
-        fix = FIX if fits else "check the supply"  # its own limits are too narrow
-        wrong(f"supply is {volts:.1f} V, expected {low:.1f} to {high:.1f} V", fix)
+        fix = FIX if fits else "check the power supply"  # the servo's own limits are too narrow
+        wrong(f"supply voltage is {volts:.1f} V, expected {low:.1f} to {high:.1f} V", fix)
     firmware = table[reg.FIRMWARE_VERSION]
     if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:
         wrong(
-            f"firmware {firmware} has no bus watchdog",
-            f"update it to {_WATCHDOG_FIRMWARE} or later, or set servos.watchdog = 0",
+            f"firmware {firmware} does not support the bus watchdog",
+            f"update the firmware to version {_WATCHDOG_FIRMWARE} or later, or set "
+            "servos.watchdog = 0",
         )
     current_max, greatest = settings.safety.current_max, model.stall_current
     if model.senses_current and settings.servos.mode != "position" and greatest < current_max:
         wrong(
-            f"safety.current_max is {current_max:g} A, above this model's {greatest:.3g} A",
+            f"safety.current_max is {current_max:g} A, above this model's stall current of "
+            f"{greatest:.3g} A",
             "lower safety.current_max",
         )
     return found
@@ -162,10 +167,10 @@ def check_servo(
 def other_model(number: int, model: ServoModel) -> tuple[str, str]:
     """Describe a servo whose model differs from the settings, and how to fix it."""
     if reg.by_number(number) is not None:
-        return f"is an {reg.name_of(number)}, not an {model.name}", "set servos.model"
+        return f"is an {reg.name_of(number)}, expected an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
     return (
-        f"has the unknown model number {number}, expected {model.number} of an {model.name}",
+        f"has unknown model number {number}, expected {model.number} ({model.name})",
         f"use one of the known models: {known}",
     )
 
@@ -197,31 +202,34 @@ def notice_servo(
         return []
     limit, present = table[reg.TEMPERATURE_LIMIT], table[reg.PRESENT_TEMPERATURE]
     notices = (
-        (servos.mode == "position", "position mode does not limit its current"),
+        (
+            servos.mode == "position",
+            'servos.mode = "position" does not limit the current of the servo',
+        ),
         (
             not servos.watchdog,
-            "servos.watchdog = 0: it keeps moving if the daemon or the line fails",
+            "servos.watchdog = 0: the servo keeps moving if the daemon or the bus fails",
         ),
         (
             servos.fault_after > _FAULT_AFTER_LONG,
-            f"servos.fault_after = {servos.fault_after:g} s: without replies its last reading is "
-            "used for this long",
+            f"servos.fault_after = {servos.fault_after:g} s: if replies are missing, the last "
+            "reading is used for this long",
         ),
         (
             table[reg.DRIVE_MODE] & DRIVE_REVERSE,
-            "its drive mode is reversed, in addition to servos.direction",
+            "its drive mode is reversed, which adds to the reversal by servos.direction",
         ),
-        (table[reg.TORQUE_ENABLE], "torque is already on, and stays on until disarm or arm"),
+        (table[reg.TORQUE_ENABLE], "torque is already on and stays on until `disarm` or `arm`"),
         (
             table[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR,
-            "its bus watchdog has stopped it; arming clears the watchdog",
+            "its bus watchdog has stopped the servo; `arm` clears the watchdog",
         ),
         (
             not model.fast_read(firmware),
-            f"firmware {firmware} has no fast sync read (needs {model.fast_read_firmware}); the "
-            "slower sync read is used",
+            f"firmware {firmware} does not support fast sync reads (version "
+            f"{model.fast_read_firmware} or later does); the slower sync read is used",
         ),
-        (present >= limit - _TEMPERATURE_MARGIN, f"{present} °C, near its limit of {limit} °C"),
+        (present >= limit - _TEMPERATURE_MARGIN, f"{present} °C, close to its limit of {limit} °C"),
     )
     found = [Finding("warn", name, text) for true, text in notices if true]
     found += check_registers(name, model, table, settings, finger, "warn")
@@ -237,11 +245,14 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
     found = []
     given = settings.control.torque_constant
     if constant and not 1.0 / _CONSTANT_RATIO_MAX < given / constant < _CONSTANT_RATIO_MAX:
-        text = f"control.torque_constant is {given:g} N·m/A, its data sheet gives {constant:.3g}"
+        text = (
+            f"control.torque_constant is {given:g} N·m/A, but the servo's data sheet states "
+            f"{constant:.3g}"
+        )
         found.append(Finding("warn", name, text, f"control.torque_constant = {constant:.3g}"))
     if model.gear_loss and not settings.control.joint_load_friction:
         text = (
-            f"its gears lose {model.gear_loss:g} of their torque to friction, so a grip may "
+            f"gear friction consumes {model.gear_loss:g} of the transmitted torque, so a grip may "
             "never settle"
         )
         fix = f"control.joint_load_friction = {model.gear_loss:g}"
@@ -254,8 +265,8 @@ def check_angle(
 ) -> Finding | None:
     """Return a finding if a joint is far outside the hand's limits, otherwise None.
 
-    Switching torque on would immediately move such a joint back. After a reboot, the servo counts
-    from its first turn again, which corrects a lost turn.
+    Switching torque on would immediately move such a joint back. A reboot resets the servo's turn
+    count, which corrects a lost turn.
     """
     low, high = hand.q_min[finger], hand.q_max[finger]
 
@@ -272,7 +283,10 @@ def check_angle(
     if turns and is_inside(counts - turns * reg.COUNTS_PER_TURN):
         problem += f": its servo has counted {turns} turn{'' if turns in (1, -1) else 's'} too many"
         return Finding("FAIL", name, problem, LOST_TURN_FIX)
-    cure = "turn it there by hand, or find its zero with `softfinger calibrate joints`"
+    cure = (
+        "turn the joint into this range by hand, or correct servos.zero with `softfinger "
+        "calibrate joints`"
+    )
     return Finding("FAIL", name, problem, cure)
 
 
@@ -281,19 +295,19 @@ def check_position(
 ) -> Finding | None:
     """Check the angle of a servo from its registers.
 
-    A servo with reversed drive mode counts from 0 down, which no reboot changes.
+    A servo in reverse drive mode counts down from 0, also after a reboot.
     """
     counts = table.long(reg.PRESENT_POSITION)
     found = check_angle(name, scale, counts, hand, finger)
     reversed_ = table[reg.DRIVE_MODE] & DRIVE_REVERSE and -reg.COUNTS_PER_TURN < counts <= 0
     if found is not None and found.fix == LOST_TURN_FIX and reversed_:
-        fix = "`softfinger calibrate joints`, since its drive mode is reversed"
+        fix = "run `softfinger calibrate joints`, because the drive mode is reversed"
         return Finding(found.status, name, found.text.partition(": ")[0], fix)
     return found
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
-    """Check a USB adapter's latency timer against the reply time [s]; None if it has no timer.
+    """Compare a USB adapter's latency timer with the reply time [s]; None if it has no timer.
 
     The adapter holds a reply until the timer expires, so a value of 16 ms limits reads to 60 Hz.
     """
@@ -309,4 +323,6 @@ def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Findin
         return Finding("pass", subject, f"{latency} ms")
     status: Status = "FAIL" if latency * 1e-3 >= reply_timeout else "warn"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
-    return Finding(status, subject, f"{latency} ms, so every read takes that long", fix)
+    return Finding(
+        status, subject, f"{latency} ms, expected 1 ms: every read takes at least this long", fix
+    )

@@ -108,7 +108,7 @@ MODE_NUMBERS: Final = {name: number for number, name in MODE_NAMES.items()}
 OVERHEATING: Final = 2
 OVERLOAD: Final = 5
 HARDWARE_ERRORS: Final = {
-    0: "input voltage out of limits",
+    0: "input voltage outside its limits",
     OVERHEATING: "overheating",
     3: "motor encoder",
     4: "electrical shock",
@@ -131,7 +131,7 @@ SAG: Final = 0.35  # Ω, simulated supply including cable
 
 @dataclass(frozen=True, slots=True)
 class ServoModel:
-    """Data for one servo model with factory defaults, in register counts unless a unit is given."""
+    """Data and factory defaults of a servo model, in register counts unless a unit is given."""
 
     name: str
     number: int
@@ -148,13 +148,13 @@ class ServoModel:
     position_gains: tuple[int, int, int]  # D, I, P
     shutdown: int
     drive_mode_max: int
-    fast_read_firmware: int  # first version with fast sync read and fast bulk read
+    fast_read_firmware: int  # first firmware version with fast sync read and fast bulk read
     stall: tuple[float, float, float]  # stall torque [N·m] and current [A] at a voltage [V]
     mass: float  # g
     size: tuple[float, float, float]  # mm
     modes: tuple[int, ...] = tuple(MODE_NAMES)
     pwm_slope: int | None = None  # default of register 62, None if the model lacks it
-    is_x330: bool = False  # X330 series, whose indirect map moved with firmware 53
+    is_x330: bool = False  # True for the X330 series, whose indirect addresses moved in firmware 53
     gear_loss: float = 0.0  # fraction of the gear torque lost to friction, if published
 
     @property
@@ -228,10 +228,11 @@ _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MO
 # the model's page in the ROBOTIS e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or …/mx/NAME-2/
 # (specifications and both areas of the control table). Where model numbers differ (XD430), the
 # source is control_table/dynamixel.model in dynamixel-sdk. The velocity limits for XH430-V,
-# XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's values
-# apply to firmware before 42. The page of the XW430-T200 lists the stall torque of the XW540-T140,
-# 6.9 N·m at 4.9 A. The values used are scaled by the gear ratio, 200 : 213, from those of the
-# XH430-W210. The same rule gives 3.2 N·m for the XW430-T333, whose page lists 3.1 N·m at 1.3 A.
+# XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's values are
+# for firmware before version 42. The page of the XW430-T200 lists the stall torque of the
+# XW540-T140, 6.9 N·m at 4.9 A. The values used are scaled by the gear ratio, 200 : 213, from those
+# of the XH430-W210. The same rule gives 3.2 N·m for the XW430-T333, whose page lists 3.1 N·m at
+# 1.3 A.
 _430 = 82, (28.5, 46.5, 34.0)  # g, mm
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)
@@ -318,13 +319,13 @@ def by_name(name: str) -> ServoModel:
 
 
 def name_of(number: int) -> str:
-    """Return the name of the model with this ``number``, or the number itself if unknown."""
+    """Return the name of the model with this ``number``, or the number itself if it is unknown."""
     names = [model.name for model in MODELS.values() if model.number == number]
     return names[0] if names else f"model number {number}"
 
 
 def by_number(number: int) -> ServoModel | None:
-    """Return the model with this ``number``, or None if unknown."""
+    """Return the model with this ``number``, or None if it is unknown."""
     return next((model for model in MODELS.values() if model.number == number), None)
 
 

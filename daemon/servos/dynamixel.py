@@ -7,8 +7,8 @@ exchange. Every 10 ms, a read includes the goals stored in the servo, its bus wa
 more bytes).
 
 One sync write sends goal current and goal position as adjacent registers (:mod:`servos.torque`).
-Current mode and position mode have a single goal and need no indirect addresses. Required EEPROM
-values are checked but never changed.
+Current mode and position mode have a single goal, so they do not need indirect addresses. Required
+EEPROM values are checked but never changed.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _CHECK_INTERVAL = 0.01  # s
 _CHECK_FRACTION = 0.05  # maximum fraction of the line capacity used for checks
 _RECENT_TIME = 0.035  # s, maximum age of a recent goal
 _FROZEN_TIME = 0.1  # s, maximum time for which a servo's 1 ms clock may stand still
-_VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a missing reply
+_VARIED_READ_COUNT = 32  # requests with varying span lengths after a missing reply
 _CHECK_TIMEOUT = 0.2  # s, reply timeout during the checks; `clear` blocks the loop for this time
 # s, reply timeout for an emulated hand, whose clock pauses while the machine is late.
 _BUSY_TIME = 0.04
@@ -82,9 +82,9 @@ class DynamixelServos:
         self._line: ServoLine | None = None
         self._torque: Torque | None = None
         self._reads: TickReads | None = None
-        self._waiting: SerialPort | None = None  # open port, waiting for the servos to respond
-        self._turn = 0  # index of the last span length
-        self._varied_reads = 0  # remaining requests whose replies could be confused
+        self._waiting: SerialPort | None = None  # open port whose servos have not responded yet
+        self._turn = 0  # index of the most recent span length
+        self._varied_reads = 0  # number of remaining requests whose replies could be confused
         self._next_health = self._next_check = -math.inf  # clock times of the next reads
         self._check_interval = _CHECK_INTERVAL
         self._retries = 0
@@ -135,7 +135,7 @@ class DynamixelServos:
         self._line, self._torque = line, torque
 
     def _check(self, line: ServoLine, model: ServoModel) -> TickReads:
-        """Check servos, adapter and group reads; set the joint limits and the notices."""
+        """Check servos, adapter and group reads; store the joint limits and the notices."""
         port = line.port
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _CHECK_TIMEOUT)
         try:
@@ -159,9 +159,9 @@ class DynamixelServos:
         """
         if not any(each.replies or each.errors for each in found):
             raise ServosSilent(
-                f"{port.port_name}: no servo answers at {port.baudrate} baud (IDs "
-                f"{', '.join(str(each.id) for each in found)}): check power and wiring; "
-                "`softfinger doctor` tries every rate"
+                f"{port.port_name}: no servo replies at {port.baudrate} baud (IDs "
+                f"{', '.join(str(each.id) for each in found)}): check the power supply and the "
+                "wiring; `softfinger doctor` tries every baud rate"
             )
         slow = check_latency_timer(port.port_name, allowed)
         errors = [slow] if slow and slow.status == "FAIL" else []
@@ -170,8 +170,8 @@ class DynamixelServos:
             errors += each.errors
             notices += each.notices
             if not each.replies and not each.errors:
-                fix = "check its cable and ID; `softfinger doctor` tries every rate"
-                errors.append(Finding("FAIL", each.name, f"no answer at {port.baudrate} baud", fix))
+                fix = "check its cable and ID; `softfinger doctor` tries every baud rate"
+                errors.append(Finding("FAIL", each.name, f"no reply at {port.baudrate} baud", fix))
         if errors:
             silent = sum(not each.replies and not each.errors for each in found)
             kind = ServosSilent if len(errors) == silent else ServoError
@@ -184,7 +184,7 @@ class DynamixelServos:
                 each.table.long(reg.MAX_POSITION_LIMIT),
             )
             if each.misplaced is not None:
-                fix = f"{each.misplaced.fix}; arming is refused until then"
+                fix = f"{each.misplaced.fix}; until then, `arm` is refused"
                 notices.append(replace(each.misplaced, fix=fix))
         self.notices = tuple(notices)
 
@@ -259,7 +259,7 @@ class DynamixelServos:
             reading.temperature[joint.finger] = float(temperature)
 
     def _check_torque(self, group: GroupRead, reading: Reading, now: float) -> None:
-        """Check that each servo's clock advances and that its goal is a recent one."""
+        """Check that each servo's clock advances and that its goal is recent."""
         start, torque = group.start, self._torque
         assert torque is not None
         reading.lost = reading.frozen = 0
@@ -282,12 +282,12 @@ class DynamixelServos:
                 reading.hardware[joint.finger] = errors.data[joint.id][0]
 
     def write(self, goal: Goal) -> None:
-        """Send goal angles and current limits, but only if torque was switched on here.
+        """Send goal angles and current limits, but only if this object switched torque on.
 
         Raises
         ------
         ServoError
-            The port is gone.
+            If the port has been lost.
         """
         torque = self._torque
         if torque is None or torque.goals is None:
@@ -318,7 +318,7 @@ class DynamixelServos:
         Raises
         ------
         ServoError
-            The port is gone.
+            If the port has been lost.
         """
         torque = self._torque
         if torque is None:
@@ -337,7 +337,7 @@ class DynamixelServos:
     # --- closing ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """Return the numbers of failed exchanges since connect by type."""
+        """Return the number of failed exchanges since `connect`, by type."""
         handler = self._handler
         return {
             "timeouts": handler.timeouts,
@@ -353,7 +353,7 @@ class DynamixelServos:
     def close(self) -> None:
         """Switch torque off, verify it if possible, and close. Never raises.
 
-        Torque that another program switched on is left unchanged.
+        If another program switched torque on, it stays on.
         """
         if self._waiting is not None:
             with contextlib.suppress(Exception):
@@ -368,9 +368,14 @@ class DynamixelServos:
                     break
                 self.torque_off(reading)
             if torque.may_be_on:
-                _log.error("servos have not confirmed torque off; their bus watchdog stops them")
+                _log.error(
+                    "the servos have not confirmed torque off; their bus watchdogs will stop them"
+                )
         except PortLost:
-            _log.error("servos: the port was lost with torque on; their bus watchdog stops them")
+            _log.error(
+                "servos: the port was lost while torque was on; the bus watchdogs will stop "
+                "the servos"
+            )
         except Exception as error:
             _log.error("servos: torque off not confirmed: %s", error)
         self._line = self._torque = self._reads = None

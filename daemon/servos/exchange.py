@@ -1,4 +1,4 @@
-"""Perform a tick's group reads, choose their type, and measure their duration.
+"""Perform the group reads of a tick, choose their type, and measure their duration.
 
 The daemon and `doctor` share this code, so `doctor` tests the exchanges that the daemon uses.
 """
@@ -20,25 +20,25 @@ from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.servos.protocol import TRY_COUNT, FastGroupRead, GroupRead, PacketHandler
 
 Span = tuple[int, int]  # first and last address
-# Spans of one exchange: on most ticks; including goals and bus watchdog; including supply and
-# temperature; starting at torque enable.
+# Register spans read in one exchange: the one for most ticks; with goals and bus watchdog; with
+# supply voltage and temperature; from torque enable on.
 PRESENT: Span = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
 CHECK: Span = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
 HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 # A late reply could be mistaken for the reply to the next request. After a missing reply, the next
-# requests therefore use spans of different lengths, which distinguish the replies.
-LENGTH_COUNT = 11  # per span: the shortest version, and up to ten preceding registers
+# requests therefore use spans of different lengths, so that the replies can be distinguished.
+LENGTH_COUNT = 11  # versions of each span: without and with up to ten preceding registers
 
 EXCHANGE_COUNT = 50  # number of exchanges timed by `doctor`
 _TIMED_REPLY_TIMEOUT = 0.1  # s, minimum reply timeout for timed exchanges
-_CONNECT_READ_COUNT = 9  # reads at connect; the fastest one gives the minimum reply time
-_REPLY_FRACTION_MAX = 0.8  # maximum fraction of a tick for a reply
+_CONNECT_READ_COUNT = 9  # reads in `connect`; the fastest one gives the minimum reply time
+_REPLY_FRACTION_MAX = 0.8  # maximum duration of a reply as a fraction of a tick
 _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2  # fraction of failed exchanges
 
 
 class TickReads:
-    """The group reads of a tick, all of one type, in all span lengths."""
+    """A tick's group reads, all of the same type, in all span lengths."""
 
     def __init__(
         self,
@@ -79,14 +79,14 @@ def choose_reads(
         reads = TickReads(port, handler, ids, FastGroupRead)
         if reads.answered():
             return reads, notices
-        text = "the firmware should answer fast sync reads but does not"
+        text = "the servos do not reply to fast sync reads, although their firmware supports them"
         notices.append(Finding("warn", "servos", text, "the slower sync read is used"))
     reads = TickReads(port, handler, ids, GroupRead)
     if not reads.answered():
         listed = ", ".join(map(str, ids))
         raise ServoError(
-            f"{port.port_name}: the servos (IDs {listed}) answer single reads, but not a sync "
-            "read of all: check the cables between the servos, and lower servos.baud"
+            f"{port.port_name}: the servos (IDs {listed}) reply to single reads, but not to a "
+            "sync read of all servos: check the cables between the servos, and lower servos.baud"
         )
     return reads, notices
 
@@ -106,10 +106,10 @@ def time_exchanges(
     write: Callable[[], None] | None = None,
     count: int = EXCHANGE_COUNT,
 ) -> ExchangeTimes:
-    """Time ``count`` exchanges without pauses, reading and writing as in a tick.
+    """Time ``count`` exchanges without pauses, with the same reads and writes as in a tick.
 
-    A read waits on the wire for the preceding write, so its duration includes both. If ``write`` is
-    None, only reads are timed. Each reply may take up to 0.1 s.
+    A read has to wait until the preceding write has been transmitted, so its duration includes
+    both. If ``write`` is None, only reads are timed. Each reply may take up to 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0
@@ -146,27 +146,29 @@ def judge_exchanges(
     rate, allowed = settings.loop.rate, settings.servos.reply_timeout
     failed = f"{times.failed:.0%} failed"
     if times.failed == 1.0:
-        text = f"{what}: none was answered within {_TIMED_REPLY_TIMEOUT * 1e3:g} ms"
+        text = f"{what}: no reply within {_TIMED_REPLY_TIMEOUT * 1e3:g} ms"
         return Finding("FAIL", "exchange", text, "check the cable, and lower servos.baud")
     text = f"{what}: p50 {_ms(times.p50)}, p99 {_ms(times.p99)}, {failed}"
     if decisive > min(1.0 / rate, allowed):
         text += (
-            f"; a tick takes {_ms(1.0 / rate)} (loop.rate = {rate:g}), and a reply may take "
+            f"; expected at most one tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}) and at most "
             f"{_ms(allowed)} (servos.reply_timeout)"
         )
         return Finding("FAIL", "exchange", text, _remedy(decisive, settings))
     if times.failed > _FAILED_FRACTION_WARN:
         status: Status = "FAIL" if times.failed > _FAILED_FRACTION_FAIL else "warn"
-        fix = "check the cable and its plugs, and lower servos.baud"
+        fix = "check the cable and its connectors, and lower servos.baud"
         return Finding(status, "exchange", text, fix)
     if decisive * rate > _REPLY_FRACTION_MAX:
-        text += f"; a tick takes {_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
+        text += (
+            f", too much of a tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
+        )
         return Finding("warn", "exchange", text, _remedy(decisive, settings))
     return Finding("pass", "exchange", text)
 
 
 def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) -> list[Finding]:
-    """Return a notice if even the fastest of a few reads takes most of a tick."""
+    """Return a notice if even the fastest of a few test reads takes most of a tick."""
     least = time_exchanges(port, reads, count=_CONNECT_READ_COUNT).least
     rate = settings.loop.rate
     if least * rate <= _REPLY_FRACTION_MAX:
@@ -175,7 +177,10 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
         f"the servos take at least {_ms(least)} to reply, {least * rate:.0%} of a tick of "
         f"{_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
     )
-    fix = f"{_remedy(least, settings)}; `softfinger doctor` times {EXCHANGE_COUNT} exchanges"
+    fix = (
+        f"{_remedy(least, settings)}; to measure the reply times, run `softfinger doctor`, "
+        f"which times {EXCHANGE_COUNT} exchanges"
+    )
     return [Finding("warn", "servos", text, fix)]
 
 
@@ -188,7 +193,7 @@ def _remedy(duration: float, settings: Settings) -> str:
         parts.append(f"servos.reply_timeout = {1.5 * duration:.2g}")
     if duration * settings.loop.rate > _REPLY_FRACTION_MAX:
         parts.append(f"loop.rate = {max(rate // digit * digit, 1.0):g}")
-    return f"set {' and '.join(parts)}; or use a faster adapter (latency timer 1 ms)"
+    return f"set {' and '.join(parts)}, or use a faster adapter (latency timer of 1 ms)"
 
 
 def _ms(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""Represent a joint and its servo: unit conversion, limits, last reading and packed goals."""
+"""Represent a joint and its servo: unit conversion, limits, last reading and encoded goals."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def current_toward(
 
 @dataclass(frozen=True, slots=True)
 class JointScale:
-    """Conversion of one joint's counts to rad, rad/s and A.
+    """Conversion between a joint's counts and rad, rad/s and A.
 
     q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and similarly for velocity. Currents
-    remain motor currents; only their sign follows the joint, so that positive currents close it.
+    are motor currents; only their sign is converted, so that positive currents close the joint.
     """
 
     direction: int  # +1 or -1, sign of the counts when closing
@@ -105,7 +105,7 @@ class JointScale:
 
 @dataclass(slots=True)
 class Joint:
-    """Bus state of a finger's joint."""
+    """State of a finger's joint on the servo bus."""
 
     finger: int
     id: int
@@ -114,8 +114,8 @@ class Joint:
     ends: tuple[int, int] = (0, 0)  # position limits in counts
     q: float = 0.0  # angle in the last valid reading [rad]
     dq: float = 0.0  # [rad/s]
-    sent: deque[bytes] = field(default_factory=deque)  # recent goals as register bytes
-    ticks: int = -1  # servo clock at the last check
+    sent: deque[bytes] = field(default_factory=deque)  # recently sent goals as register bytes
+    ticks: int = -1  # reading of the servo clock at the last check
     ticked: float = math.inf  # time when that clock last advanced [s]
 
     @property

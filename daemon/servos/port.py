@@ -1,4 +1,4 @@
-"""Provide the SDK with an exclusive serial port and a monotonic deadline per exchange.
+"""Provide an exclusive serial port for the SDK, with a monotonic deadline for each exchange.
 
 :mod:`servos.protocol` lists the reasons why the SDK's own port is not used.
 """
@@ -19,7 +19,7 @@ from dynamixel_sdk.port_handler import PortHandler
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.port_access import grant, port_group_remedy
 
-with contextlib.suppress(ModuleNotFoundError):  # Windows supports only simulated servos
+with contextlib.suppress(ModuleNotFoundError):  # on Windows, only simulated servos are supported
     import termios
 
 BITS_PER_BYTE = 10
@@ -31,13 +31,13 @@ _SYSFS = Path("/sys/class/tty")
 
 
 def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
-    """Return the kernel file for a USB adapter's latency timer [ms], or None if there is none."""
+    """Return the kernel file for a USB adapter's latency timer [ms]; None if it does not exist."""
     place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     return place if place.exists() else None
 
 
 class PortLost(ServoError):
-    """Raised if the open port disappears: adapter unplugged or without power."""
+    """Raised if the open port disappears because the adapter was unplugged or lost power."""
 
 
 class SerialPort(PortHandler):  # type: ignore[misc]
@@ -114,7 +114,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
     def setPacketTimeout(self, packet_length: int) -> None:
         """Start the deadline for a reply of ``packet_length`` bytes."""
         wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
-        # At slow baud rates, allow twice the transmission time and the return delays.
+        # At low baud rates, allow twice the transmission time plus the return delays.
         self.deadline = time.monotonic() + max(self.reply_timeout, 2.0 * wire + 0.001)
 
     def fill(self) -> bool:
@@ -133,7 +133,8 @@ class SerialPort(PortHandler):  # type: ignore[misc]
 
     def _gone(self, error: object) -> PortLost:
         return PortLost(
-            f"{self.port_name}: the port is lost ({error}): plug the adapter in and power the bus"
+            f"{self.port_name}: the port is lost ({error}): connect the adapter and switch on the "
+            "servo supply"
         )
 
 
@@ -141,11 +142,11 @@ def _why_not(path: str, error: Exception) -> str:
     code = getattr(error, "errno", None)
     if code == errno.ENOENT or not Path(path).exists():
         return (
-            f"{path}: no such port: {port_group_remedy(path)}, or set servos.port; `softfinger "
+            f"{path}: port not found: {port_group_remedy(path)}, or set servos.port; `softfinger "
             "doctor` lists the available ports"
         )
     if code == errno.EACCES:
         return f"{path}: no permission: {grant(path)}"
     if code in (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK) or "lock" in str(error).lower():
-        return f"{path}: the port is in use by another process: end it first"
+        return f"{path}: the port is in use by another process: end that process first"
     return f"{path}: can't be opened: {error}"

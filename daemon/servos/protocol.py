@@ -3,7 +3,8 @@
 This module and :mod:`servos.port` override the following behaviour of the SDK (3.7.31 to 4.1.0).
 The rest of the SDK is used unchanged.
 
-- ``txPacket`` discards the stuffed packet, so FF FF FD within goals is sent unstuffed and misread.
+- ``txPacket`` discards the stuffed packet, so the sequence FF FF FD in a goal is sent without
+  stuffing and is misinterpreted.
 - ``removeStuffing`` drops a byte of FF FF FD 12 FF FD FD; 3-8 % of group reads failed in tests.
 - ``rxPacket`` polls with non-blocking reads, which keeps a processor busy during transmission.
 - ``txPacket`` leaves ``is_using`` set if the port raises, so all later calls return −1000.
@@ -12,8 +13,8 @@ The rest of the SDK is used unchanged.
   and a joint appears to be at 0.
 - ``broadcastPing`` always waits for 253 servos, which takes 0.8 s at 1 Mbaud.
 - ``PortHandler`` measures deadlines on the wall clock and adds 34 ms. A missing servo therefore
-  costs 35 ms, and setting the clock changes the deadline. It also opens ports that are in use by
-  another process.
+  causes a delay of 35 ms, and adjusting the system clock changes the deadline. It also opens ports
+  that are in use by another process.
 """
 
 from __future__ import annotations
@@ -53,9 +54,9 @@ _MAX_PACKET = 1024
 _STATUS_SIZE = 11  # bytes of a status packet without data
 _FAST_SYNC_READ = 0x8A  # not defined by dynamixel-sdk 3
 _OLD_HEADER = b"\xff\xff"  # Protocol 1.0: header, ID, length, instruction or error, checksum
-_OLD_STATUS = 6  # bytes, ping reply in Protocol 1.0
-_OLD_TIMEOUT = 0.5  # s; an emulated servo on a busy machine may take longer than 0.1 s
-_ERROR_MASK = 0x7F  # error code in the error byte; the highest bit is the alert
+_OLD_STATUS = 6  # bytes, length of a ping reply in Protocol 1.0
+_OLD_TIMEOUT = 0.5  # s; on a busy machine, an emulated servo may take longer than 0.1 s
+_ERROR_MASK = 0x7F  # mask for the error code in the error byte; the highest bit is the alert
 
 
 def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -93,10 +94,10 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     def readTxRx(
         self, port: SerialPort, dxl_id: int, address: int, length: int
     ) -> tuple[list[int], int, int]:
-        """Read a span; return (data, result code, error byte). After an error, data are zeros.
+        """Read a register span; return (data, result code, error byte).
 
-        Replies with another length are skipped. They are late replies to an action instruction, for
-        which the SDK does not wait.
+        After an error, the data are 0. Replies of the wrong length are skipped. They are late
+        replies to an action instruction, for which the SDK does not wait.
         """
         if dxl_id >= BROADCAST_ID:
             return [], int(COMM_NOT_AVAILABLE), 0
@@ -117,8 +118,8 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     def rxPacket(self, port: SerialPort, fast_option: bool = False) -> tuple[Any, int]:
         """Return the next status packet with byte stuffing removed, and the result code.
 
-        A fast reply has no byte stuffing and comes from the broadcast ID. A corrupted packet ends
-        the wait immediately, because it is not sent again.
+        The reply to a fast read has no byte stuffing and comes from the broadcast ID. If a packet
+        is corrupted, the wait ends immediately, because the servo does not send the packet again.
         """
         buffer = port.received
         while True:
@@ -158,7 +159,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
 
 class GroupRead:
-    """Sync read of one span from several servos.
+    """Sync read of one register span from several servos.
 
     After a successful :meth:`exchange`, ``data[id]`` contains the span's bytes and ``errors[id]``
     the servo's error byte. After a failure, their contents are undefined.
@@ -185,7 +186,7 @@ class GroupRead:
         self._reply = (_STATUS_SIZE + length) * len(ids)
 
     def exchange(self, until: float = math.inf) -> int:
-        """Exchange by the time ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Complete the exchange by ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler = self._handler
@@ -212,7 +213,7 @@ class FastGroupRead(GroupRead):
     instruction = _FAST_SYNC_READ
 
     def exchange(self, until: float = math.inf) -> int:
-        """Exchange by the time ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Complete the exchange by ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler, length = self._handler, self._length
@@ -237,7 +238,7 @@ class FastGroupRead(GroupRead):
 
 
 class GroupWrite:
-    """Sync write of one span to several servos."""
+    """Sync write of one register span to several servos."""
 
     def __init__(self, port: SerialPort, address: int, length: int, ids: Sequence[int]) -> None:
         self._port = port
@@ -300,7 +301,7 @@ class ServoLine:
         return found
 
     def read(self, servo_id: int, address: int, length: int) -> bytes | None:
-        """Return a register span, or None if there is no valid reply."""
+        """Read a register span; return None if there is no valid reply."""
         for _ in range(TRY_COUNT):
             data, result, error = self.handler.readTxRx(self.port, servo_id, address, length)
             if result == COMM_SUCCESS:
@@ -316,7 +317,10 @@ class ServoLine:
         GroupWrite(self.port, address, length, list(values)).send(list(values.values()))
 
     def store(self, address: int, values: Mapping[int, bytes]) -> list[int]:
-        """Write each servo's bytes and read them back; return the IDs of failed servos."""
+        """Write each servo's bytes and read them back.
+
+        Return the IDs of servos for which this failed.
+        """
         waiting = dict(values)
         for _ in range(TRY_COUNT):
             self.write(address, waiting)
@@ -330,7 +334,10 @@ class ServoLine:
 
 @contextlib.contextmanager
 def open_line(path: str, baud: int, low_latency: bool = True) -> Iterator[ServoLine]:
-    """Open a port, yield a line on it, and close it. Raises ServoError if it can't be opened."""
+    """Open a port, yield a `ServoLine` on it, and close the port afterwards.
+
+    Raises ServoError if the port can't be opened.
+    """
     port = SerialPort(path, baud, UNPACED_TIMEOUT, low_latency)
     port.openPort()
     try:

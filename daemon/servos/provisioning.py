@@ -1,8 +1,8 @@
 """Find servos on a port and configure the hand's servos: ID, baud rate and registers.
 
-Only :func:`provision` writes a servo's EEPROM. It runs only on request (`softfinger doctor --fix`)
-and with torque off. IDs and baud rates are written only to servos that are identified unambiguously
-(:func:`plan`).
+Only :func:`provision` writes a servo's EEPROM. This function runs only on request (`softfinger
+doctor --fix`) and with torque off. IDs and baud rates are written only to servos that are
+identified unambiguously (:func:`plan`).
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-SEARCH_TIME = 0.8  # s of listening per rate, enough for 253 servos at 1 Mbaud
+SEARCH_TIME = 0.8  # s, listening time per baud rate, enough for 253 servos at 1 Mbaud
 FACTORY_ID = 1
 ONE_SERVO_ONLY = (
-    "connect one servo alone and run `softfinger doctor --fix`; then add the next one and run it "
-    "again"
+    "connect only one servo and run `softfinger doctor --fix`; then connect the next servo as "
+    "well, and run the command again"
 )
 _READ_COUNT = 8  # number of full-table reads
-_REBOOT_TIMEOUT = 2.0  # s, maximum time until a servo responds after a reboot
-_WRITE_TIME = 0.05  # s for sending a packet and storing it in EEPROM
+_REBOOT_TIMEOUT = 2.0  # s, maximum time from a reboot until the servo responds
+_WRITE_TIME = 0.05  # s, time for sending a packet and storing its data in the EEPROM
 
 
 # --- finding servos ------------------------------------------------------------------------------
@@ -60,14 +60,14 @@ class FoundServo:
         return self.describe(str(self.baud))
 
     def describe(self, rates: str) -> str:
-        """Return the report line for a servo that replies at these rates [baud]."""
+        """Return the report line for a servo that replies at these baud rates."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
 
 @dataclass(frozen=True, slots=True)
 class Garbled:
-    """ID with corrupted replies: several servos share it, or the line is faulty."""
+    """ID with corrupted replies: several servos share the ID, or the line is faulty."""
 
     id: int
     baud: int
@@ -75,8 +75,8 @@ class Garbled:
     def __str__(self) -> str:
         factory = " (the factory setting)" if self.id == FACTORY_ID else ""
         return (
-            f"replies of ID {self.id} at {self.baud} baud are damaged: several servos have this "
-            f"ID{factory}, or the line is bad"
+            f"replies of ID {self.id} at {self.baud} baud are corrupted: several servos have this "
+            f"ID{factory}, or the line is faulty"
         )
 
 
@@ -86,10 +86,10 @@ class Found:
 
     servos: tuple[FoundServo, ...]
     garbled: tuple[Garbled, ...]
-    old: tuple[int, ...] = ()  # rates at which a servo replies in Protocol 1.0
+    old: tuple[int, ...] = ()  # baud rates at which a servo replies in Protocol 1.0
 
     def old_protocol(self) -> list[Finding]:
-        """Return a finding for each rate at which a servo uses Protocol 1.0."""
+        """Return a finding for each baud rate at which a servo uses Protocol 1.0."""
         problem, fix = OLD_PROTOCOL
         return [Finding("FAIL", f"a servo at {baud} baud", problem, fix) for baud in self.old]
 
@@ -100,9 +100,9 @@ def search(
     wait: float = SEARCH_TIME,
     ids: Iterable[int] = (FACTORY_ID,),
 ) -> Found:
-    """Search the port for servos for ``wait`` [s] at each rate, without changing registers.
+    """Search the port for servos for ``wait`` [s] at each baud rate, without changing registers.
 
-    Rates that the adapter does not support are skipped. If corrupted bytes arrive, ``ids`` are
+    Baud rates that the adapter does not support are skipped. If corrupted bytes arrive, ``ids`` are
     probed individually.
 
     Raises
@@ -178,24 +178,24 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Unambiguous ``changes`` and remaining differences from the settings."""
+    """Unambiguous ``changes``, and the remaining differences from the settings."""
 
     changes: tuple[Change, ...]
-    missing: tuple[int, ...]  # fingers with an unidentified servo
-    strangers: tuple[FoundServo, ...]  # replying servos not assigned to a finger
+    missing: tuple[int, ...]  # fingers whose servo could not be identified
+    strangers: tuple[FoundServo, ...]  # servos that reply but are not assigned to a finger
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
-    """Assign the servos found at ``rates`` to the joints.
+    """Assign the servos found at the baud ``rates`` to the joints.
 
-    If a servo of the right model replies at another rate with the ID of a missing servo, it is
-    taken to be that servo. Otherwise, a single unassigned servo is assigned to a single missing
-    one. Servos with corrupted replies are not changed.
+    If a servo of the configured model replies at another baud rate with the ID of a missing servo,
+    it is assumed to be the missing servo. Otherwise, if exactly one servo is unassigned and exactly
+    one is missing, they are matched. Servos with corrupted replies are not changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
-    # An emulator without line timing replies at every rate.
+    # An emulator without line timing replies at every baud rate.
     anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
@@ -206,8 +206,8 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
         and not (each.id in anywhere and each.baud != servos.baud)
         and (each.id, each.baud) not in bad
     ]
-    # A servo with a configured ID and rate belongs to that finger even if the finger is not in the
-    # scene.
+    # A servo with a finger's configured ID and baud rate belongs to that finger, even if the finger
+    # is not in the scene.
     others = {each for each in strangers if each.baud == servos.baud and each.id in servos.ids}
     fit = [each for each in strangers if each.number == model.number and each not in others]
     missing = [servo_id for servo_id in ids if servo_id not in home]
@@ -261,11 +261,11 @@ def provision(settings: Settings) -> list[Finding]:
             name, number = servo_name(servo_id, finger), line.ping(servo_id)
             if number is None:
                 if name not in [each.subject for each in result if each.status == "warn"]:
-                    result.append(Finding("warn", name, f"no answer at {servos.baud} baud"))
+                    result.append(Finding("warn", name, f"no reply at {servos.baud} baud"))
             elif number != model.number:
                 result.append(Finding("warn", name, *other_model(number, model)))
             elif is_garbled(line, servo_id):
-                result.append(Finding("warn", name, "its replies are damaged", ONE_SERVO_ONLY))
+                result.append(Finding("warn", name, "its replies are corrupted", ONE_SERVO_ONLY))
             else:
                 _set_up(line, settings, finger, model, result)
     return result
@@ -279,10 +279,10 @@ def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
     names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
     fit = ", ".join(f"ID {each.id} at {each.baud} baud" for each in what.strangers)
     if not fit:
-        fix = "check its power and cable"
-        return [Finding("warn", name, "no answer at any rate", fix) for name in names]
+        fix = "check its power supply and cable"
+        return [Finding("warn", name, "no reply at any baud rate", fix) for name in names]
     return [
-        Finding("warn", name, f"may be any of these servos: {fit}", ONE_SERVO_ONLY)
+        Finding("warn", name, f"could be any of these servos: {fit}", ONE_SERVO_ONLY)
         for name in names
     ]
 
@@ -295,12 +295,12 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
         result.append(Finding("warn", name, problem, fix))
 
     if change.baud not in model.baud_rates:
-        return failed(f"an {model.name} has no {change.baud} baud", "set servos.baud")
+        return failed(f"an {model.name} does not support {change.baud} baud", "set servos.baud")
     with open_line(path, change.servo.baud) as line:
         if line.store(reg.STATUS_RETURN_LEVEL, {old: b"\x02"}):
-            return failed("answers a ping but no read")
+            return failed("replies to a ping but not to a read")
         if new != old and line.ping(new) is not None:
-            return failed(f"ID {new} at {change.servo.baud} baud is taken by another servo")
+            return failed(f"ID {new} at {change.servo.baud} baud is used by another servo")
         if line.read(old, reg.TORQUE_ENABLE, 1) != b"\x00" and not _torque_off(
             line, old, name, result
         ):
@@ -315,7 +315,7 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
             time.sleep(_WRITE_TIME)
     with open_line(path, change.baud) as line:
         if line.ping(new) != model.number:
-            return failed(f"no answer after its rate was set to {change.baud} baud")
+            return failed(f"no reply after its baud rate was set to {change.baud} baud")
     result.append(Finding("fixed", name, str(change)))
     return None
 
@@ -327,17 +327,18 @@ def _set_up(
     model: ServoModel,
     result: list[Finding],
 ) -> None:
-    """Write all registers required by `register_table` and reboot the servo if needed."""
+    """Write all registers required by `register_table`, and reboot the servo if needed."""
     servo_id = settings.servos.ids[finger]
     name = servo_name(servo_id, finger)
 
     def failed(problem: str) -> None:
         result.append(Finding("warn", name, problem))
 
-    # At level 0, servos do not reply to reads, so set the level before the first read.
+    # At status return level 0, servos do not reply to reads, so set the level before the first
+    # read.
     if line.read(servo_id, reg.STATUS_RETURN_LEVEL, 1) is None:
         if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
-            return failed("answers a ping but no read")
+            return failed("replies to a ping but not to a read")
         result.append(Finding("fixed", name, "status return level 0 → 2"))
     table = line.read(servo_id, 0, CHECKED)
     if table is None:
@@ -366,7 +367,7 @@ def _reboot_if_needed(
     model: ServoModel,
     result: list[Finding],
 ) -> None:
-    """Reboot a servo with a hardware error or a lost turn; its limits are already corrected."""
+    """Reboot a servo with a hardware error or a lost turn, after its limits have been corrected."""
     servo_id = settings.servos.ids[finger]
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
     table = Registers(line.read(servo_id, 0, CHECKED) or b"")
@@ -376,29 +377,43 @@ def _reboot_if_needed(
     if error := table[reg.HARDWARE_ERROR_STATUS]:
         why = f"it had a hardware error: {reg.hardware_error_names(error)}"
     elif misplaced is not None and misplaced.fix == LOST_TURN_FIX:
-        why = f"its position was off by a turn: {table.long(reg.PRESENT_POSITION)} counts"
+        why = (
+            f"its position was wrong by at least one turn: {table.long(reg.PRESENT_POSITION)} "
+            "counts"
+        )
     else:
         return None
     match _reboot(line, servo_id):
         case None:
-            return result.append(Finding("warn", name, f"no answer after a reboot because {why}"))
+            return result.append(
+                Finding("warn", name, f"no reply after a reboot, which was necessary because {why}")
+            )
         case 0:
             return result.append(Finding("fixed", name, f"rebooted because {why}"))
         case error:
-            text = f"hardware error after a reboot: {reg.hardware_error_names(error)}"
-            return result.append(Finding("warn", name, text, "remove the cause"))
+            text = (
+                "it still reports a hardware error after a reboot: "
+                f"{reg.hardware_error_names(error)}"
+            )
+            return result.append(
+                Finding("warn", name, text, "remove the cause, and run the command again")
+            )
 
 
 def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]) -> bool:
     if line.store(reg.TORQUE_ENABLE, {servo_id: b"\x00"}):
         result.append(Finding("warn", name, "torque could not be switched off"))
         return False
-    result.append(Finding("fixed", name, "torque switched off, because it locks the EEPROM"))
+    result.append(
+        Finding(
+            "fixed", name, "torque switched off, because the EEPROM is locked while torque is on"
+        )
+    )
     return True
 
 
 def _reboot(line: ServoLine, servo_id: int) -> int | None:
-    """Reboot a servo and return its hardware errors, or None if it does not answer in time."""
+    """Reboot a servo and return its hardware errors, or None if it does not reply in time."""
     line.handler.reboot(line.port, servo_id)
     end = time.monotonic() + _REBOOT_TIMEOUT
     while time.monotonic() < end:

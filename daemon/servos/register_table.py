@@ -2,8 +2,8 @@
 
 :func:`required_registers` returns the table in the order of the e-Manual's control table. A servo
 retains its EEPROM permanently and its RAM until power is cut, so both may contain values from
-another program. EEPROM is checked at connect and written only by `softfinger doctor --fix`. RAM
-registers marked ``armed`` are written by `arm`, so they are correct even after a reboot.
+another program. The EEPROM is checked in `connect` and written only by `softfinger doctor --fix`.
+RAM registers marked ``armed`` are written by `arm`, so they are correct even after a reboot.
 
 The omitted registers do not affect goal tracking, limits or bus replies in the modes used by the
 hand. ID and baud rate are found by a search. Moving threshold, LED and external ports are only
@@ -23,8 +23,8 @@ from softfinger.daemon.servos.base import Status
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 
-# The return delays of both servos add up in one read. With more than 50 µs each, a read would
-# exceed a 500 Hz tick.
+# In one read, the return delays of both servos add up. If each delay were longer than 50 µs, a read
+# would exceed a tick at 500 Hz.
 RETURN_DELAY_MAX: Final = 25
 # Drive mode bits: follow another servo, and switch torque on when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
@@ -88,7 +88,10 @@ _AT: Final = {register.address: register for register in REGISTERS}
 
 
 class Requirement(NamedTuple):
-    """Required value of a register. A wrong value causes a finding with this ``status``."""
+    """Required value of a register.
+
+    If the value is wrong, a finding with this ``status`` is reported.
+    """
 
     register: Register
     holds: Callable[[int], bool]
@@ -119,7 +122,7 @@ def _exactly(
 
 
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
-    """Return the row for a limit at which the servo stops itself; ``high`` is the factory value."""
+    """Return the row for a limit at which the servo shuts down; ``high`` is the factory value."""
     register = _AT[address]
     expected = f"{low}" if low == high else f"{low} to {high}"
     return Requirement(
@@ -155,7 +158,7 @@ def required_registers(
             lambda found: not found & DRIVE_UNFIT,
             lambda found: found & ~DRIVE_UNFIT,
             lambda found: (
-                f"drive mode {found} switches torque on with any goal, or makes it follow "
+                f"drive mode {found} switches torque on with any goal, or makes the servo follow "
                 "another servo"
             ),
             "FAIL",
@@ -165,7 +168,7 @@ def required_registers(
             lambda found: found not in servos.ids,
             lambda _: 255,
             lambda found: (
-                f"shadow ID is {found}: it also obeys the commands for the servo with this ID"
+                f"shadow ID is {found}: the servo also executes commands for the servo with this ID"
             ),
             "FAIL",
         ),
@@ -178,7 +181,8 @@ def required_registers(
                 f"{math.degrees(abs(found) * scale.radian):.1f}°"
             ),
             "FAIL",
-            then="`softfinger calibrate joints`, unless servos.zero was found without the offset",
+            then="run `softfinger calibrate joints`, unless servos.zero was determined without "
+            "the offset",
         ),
         _within(reg.TEMPERATURE_LIMIT, hot, model.temperature_limit, "°C"),
         _within(reg.MAX_VOLTAGE_LIMIT, model.voltage_max, model.voltage_max, "× 0.1 V"),
@@ -199,8 +203,8 @@ def required_registers(
             lambda found: found & model.shutdown == model.shutdown,
             lambda found: found | model.shutdown,
             lambda found: (
-                f"shutdown is {found}, expected {model.shutdown}: it does not switch torque off "
-                f"after {reg.hardware_error_names(model.shutdown & ~found)}"
+                f"shutdown is {found}, expected {model.shutdown}: the servo does not switch "
+                f"torque off after {reg.hardware_error_names(model.shutdown & ~found)}"
             ),
             "warn",
         ),
@@ -208,7 +212,7 @@ def required_registers(
             _AT[reg.STATUS_RETURN_LEVEL],
             lambda found: found > 0,
             lambda _: 2,
-            lambda _: "status return level is 0, so it does not answer reads",
+            lambda _: "status return level is 0, so the servo does not reply to reads",
             "FAIL",
         ),
     ]
@@ -231,10 +235,10 @@ def required_registers(
     elif model.senses_current and safety.current_max <= model.stall_current:
         rows.append(_current_limit(model, safety.current_max))
     if firmware >= _STARTUP_FIRMWARE:
-        why = "at power-up it switches torque on (1) or restores a backup of its RAM (2)"
+        why = "at power-up the servo switches torque on (1) or restores a backup of its RAM (2)"
         rows.append(_exactly(reg.STARTUP_CONFIGURATION, 0, why))
     if model.pwm_slope is not None:
-        why = "the motor's voltage ramps at another rate"
+        why = "the motor voltage ramps at a different rate"
         row = _exactly(reg.PWM_SLOPE, slope := model.pwm_slope, why, "warn")
         rows.append(row._replace(holds=lambda found: found in (0, slope)))  # 0: not implemented
     rows += armed_registers(model)
@@ -266,7 +270,8 @@ def _current_limit(model: ServoModel, current_max: float) -> Requirement:
         lambda found: found >= needed,
         lambda _: needed,
         lambda found: (
-            f"current limit is {found * unit:.3f} A, below safety.current_max {current_max:g} A"
+            f"current limit is {found * unit:.3f} A, expected at least safety.current_max = "
+            f"{current_max:g} A"
         ),
         "FAIL",
     )
@@ -276,9 +281,12 @@ def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iter
     """Return the rows for position mode, where servos silently reject goals beyond their limits."""
     ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
     first, last = sorted(scale.position_counts(q) for q in ends)
-    needed = f"the joint needs {first} to {last}"
+    needed = f"the joint requires {first} to {last}"
     if not 0 <= first <= last <= _POSITION_MAX:
-        needed += ", more than one turn: `softfinger calibrate joints` finds zero and range"
+        needed += (
+            ", which exceeds one turn: run `softfinger calibrate joints` to determine zero and "
+            "range"
+        )
     yield Requirement(
         _AT[reg.MIN_POSITION_LIMIT],
         lambda found: found <= first,

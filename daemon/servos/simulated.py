@@ -16,8 +16,8 @@ from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.joint import JointScale, current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
-_HEALTH_INTERVAL = 0.25  # s between temperature and supply readings
-_OVERLOAD_TIME = 2.0  # s at the current limit before an overload error
+_HEALTH_INTERVAL = 0.25  # s between temperature and supply voltage readings
+_OVERLOAD_TIME = 2.0  # s at the current limit until an overload error occurs
 
 
 class MotorHeat(Protocol):
@@ -37,7 +37,7 @@ class HandPlant(JointPlant, Protocol):
         """Thermal model of each joint's motor."""
 
     def hold_torque_until(self, t: float) -> None:
-        """Keep torque on until time t [s], then switch it off."""
+        """Switch torque off at time t [s]."""
 
 
 class SimulatedServos:
@@ -58,7 +58,7 @@ class SimulatedServos:
         self._watchdog = settings.servos.watchdog or math.inf
         self._connected = False
         self._torque = False
-        self._tripped = False  # the watchdog has switched torque off
+        self._tripped = False  # True if the watchdog has switched torque off
         self._trips = 0
         self._last = -math.inf  # time of the last exchange
         self._goal_q = [0.0, 0.0]
@@ -125,7 +125,7 @@ class SimulatedServos:
             self._drive()
 
     def torque_on(self) -> None:
-        """Switch torque on with the goal at the present position and zero motor current."""
+        """Switch torque on with the current position as the goal and zero motor current."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -151,8 +151,8 @@ class SimulatedServos:
         self._exchange()
         if self._tripped:
             raise ServoError(
-                "the bus watchdog stopped the simulated servos because no packet arrived in "
-                "time: clear, then arm"
+                "the bus watchdog stopped the simulated servos because no packet arrived within "
+                "servos.watchdog: send `clear`, then `arm`"
             )
         for joint in self._joints:
             scale = self._scales[joint]
@@ -160,7 +160,7 @@ class SimulatedServos:
             limit = self._settings.current_limit[joint]
             bound = scale.bound_counts(min(abs(goal.current[joint]), limit))
             current = bound * scale.current_unit
-            if self._mode == reg.CURRENT_MODE:  # position loop of the daemon
+            if self._mode == reg.CURRENT_MODE:  # the daemon's position loop
                 q, dq = self._q[joint], self._dq[joint]
                 current = current_toward(self._settings, goal.q[joint], current, q, dq)
                 counts = min(max(scale.current_counts(current), -bound), bound)
@@ -169,7 +169,7 @@ class SimulatedServos:
         self._drive()
 
     def counters(self) -> dict[str, int]:
-        """Return ``timeouts`` and ``crc``, which are always 0, and the ``watchdog`` stops."""
+        """Count the ``watchdog`` stops; ``timeouts`` and ``crc`` are always 0."""
         return {"timeouts": 0, "crc": 0, "watchdog": self._trips}
 
     def close(self) -> None:
@@ -201,5 +201,5 @@ class SimulatedServos:
     def _drive(self) -> None:
         for joint in self._joints:
             goal_q, goal_current = self._goal_q[joint], self._goal_current[joint]
-            torque = self._torque and not self._errors[joint]  # like a real servo after a shutdown
+            torque = self._torque and not self._errors[joint]  # as in a real servo after a shutdown
             self._hand.drive(joint, self._mode, torque, goal_q, goal_current)

@@ -1,7 +1,7 @@
 """Switch torque on with verification of each step, switch it off, and manage the bus watchdog.
 
 Torque is switched on at the current angle with zero motor current. Indirect addresses make goal
-current and goal position adjacent. They are in RAM and are therefore set each time.
+current and goal position adjacent. Indirect addresses are in RAM and are therefore set each time.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _GOAL_BYTES = (
     *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
 _PACKET_COUNT = 2  # copies of each torque-off packet, which has no reply
-_ON_TIMEOUTS = 50  # reply timeouts allowed for switching on, which blocks the loop
-_MOTION_MAX = 8  # counts (0.7°), allowed motion of a limp joint before torque on
+_ON_TIMEOUTS = 50  # time limit for switching on, in reply timeouts; it blocks the loop
+_MOTION_MAX = 8  # counts (0.7°), allowed motion of a limp joint before torque is on
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
-    """Return the address of the goals written on a tick: a register, or indirect data for two."""
+    """Return the address for writing goals: a register, or indirect data if there are two goals."""
     if mode == reg.CURRENT_MODE:
         return reg.GOAL_CURRENT
     if mode == reg.POSITION_MODE:
@@ -40,7 +40,7 @@ def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
 
 
 class Torque:
-    """Torque of all joints on one line.
+    """Torque control for all joints on one line.
 
     ``goals`` writes the goals while torque is on; otherwise it is None. ``may_be_on`` is True from
     before torque is switched on until the servos have confirmed that it is off.
@@ -117,7 +117,7 @@ class Torque:
         self.may_be_on = False
 
     def _aim_here(self) -> dict[int, int]:
-        """Set the goals to the present positions until the joints stay there; return them."""
+        """Set the goals to the current positions until the joints stay there; return the goals."""
         while True:
             positions = self._positions()
             strayed = [
@@ -135,7 +135,7 @@ class Torque:
                 return positions
 
     def _choose_goals(self) -> GroupWrite:
-        """Return the sync write for a tick: goal current, goal position, or both adjacent."""
+        """Return a tick's sync write for goal current, goal position, or both as adjacent data."""
         address = goal_address(self._mode, self._model, self._firmware())
         if self._mode == reg.CURRENT_BASED_POSITION_MODE:
             self._map_goals()
@@ -152,19 +152,19 @@ class Torque:
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.FIRMWARE_VERSION, 1)
             if raw is None:
-                raise ServoError(f"{joint.name}: no answer")
+                raise ServoError(f"{joint.name}: no reply")
             found.add(raw[0])
         if len({self._model.indirect_blocks(version)[0] for version in found}) > 1:
             raise ServoError(
-                "servos: their firmware versions differ in the addresses of indirect data: "
-                "update both to the same version"
+                "servos: found firmware versions with different indirect data addresses: update "
+                "both servos to the same version"
             )
         return max(found)
 
     def _write_registers(self) -> None:
         """Restore RAM registers that another program may have changed.
 
-        A servo retains gains, profiles and the PWM limit until a power cut or reboot.
+        A servo retains gains, profiles and the PWM limit until it is rebooted or loses power.
         """
         for servo_id, joint in self._joints.items():
             held = self._line.read(servo_id, reg.RAM, reg.GOAL_POSITION - reg.RAM)
@@ -191,7 +191,9 @@ class Torque:
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
             if raw is None:
-                found.append(Finding("FAIL", joint.name, "no answer", "check its cable and power"))
+                found.append(
+                    Finding("FAIL", joint.name, "no reply", "check its cable and power supply")
+                )
             elif raw[0]:
                 error = f"hardware error: {reg.hardware_error_names(raw[0])}"
                 found.append(Finding("FAIL", joint.name, error, REBOOT_FIX))
@@ -201,7 +203,7 @@ class Torque:
     # --- checks while torque is on ---------------------------------------------------------------
 
     def holds_goal(self, joint: Joint, table: bytes, start: int) -> bool:
-        """Return True if a servo's goal is a recent one, or torque was not switched on here.
+        """Return True if a servo's goal is recent, or if this object did not switch torque on.
 
         ``table`` contains its registers, beginning at ``start``.
 
@@ -215,13 +217,13 @@ class Torque:
         watchdog = table[reg.BUS_WATCHDOG - start]
         if watchdog == reg.WATCHDOG_ERROR:
             raise ServoError(
-                f"{joint.name}: its bus watchdog stopped it because no packet arrived in time: "
-                "clear, then arm"
+                f"{joint.name}: its bus watchdog stopped the servo because no packet arrived "
+                "within servos.watchdog: send `clear`, then `arm`"
             )
         if watchdog != self._ticks:
             raise ServoError(
-                f"{joint.name}: its bus watchdog is off; it may have rebooted: check its supply, "
-                "then clear and arm"
+                f"{joint.name}: its bus watchdog is off, possibly because the servo has rebooted: "
+                "check the supply, then send `clear` and `arm`"
             )
         return goal_in(self._mode, table, start) in joint.sent
 

@@ -1,1 +1,1 @@
-"""Simulated hand: physics, and emulated servos and tactile boards on ptys."""
+"""Simulated hand: its physics, and emulated servos and tactile boards on pseudo-terminals."""

@@ -1,7 +1,7 @@
-"""Define faults of the emulated hand: text form, servo line faults and measurement faults.
+"""Define faults of the emulated hand: their syntax, servo line faults and measurement faults.
 
-A fault is written as ``[PART:]KIND[=VALUE][@START[..END]]``. It begins suddenly or increases from
-START to END. Faults do not change the physics of the hand.
+A fault is written as ``[PART:]KIND[=VALUE][@START[..END]]``. The fault begins suddenly at START, or
+increases linearly from START to END. Faults do not change the physics of the hand.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class LineFaults:
     """Fault probabilities (0 to 1) per instruction or reply, and the delay of all replies."""
 
     lose: float = 0.0  # an instruction is lost
-    lose_writes: float = 0.0  # additional loss of instructions other than reads
+    lose_writes: float = 0.0  # additional probability that an instruction other than a read is lost
     drop: float = 0.0  # a reply is lost
-    late: float = 0.0  # a reply arrives LATE_REPLY_DELAY later
+    late: float = 0.0  # a reply is late by LATE_REPLY_DELAY
     truncate: float = 0.0  # the end of a reply is missing
     corrupt: float = 0.0  # one bit of a reply is flipped
     duplicate: float = 0.0  # a reply is sent twice
@@ -99,7 +99,7 @@ REPLAY_TIME_MAX = 3.0  # s
 
 
 class MeasurementFault(NamedTuple):
-    """Type of measurement fault: its value without a fault and the limits of its value."""
+    """Type of measurement fault: its neutral value and its limits."""
 
     honest: float
     low: float
@@ -108,10 +108,12 @@ class MeasurementFault(NamedTuple):
 
 MEASUREMENT_FAULTS = {
     "gain": MeasurementFault(1.0, 0.0, 100.0),  # factor for the pressure of all cells
-    "shift-x": MeasurementFault(0.0, -255.0, 255.0),  # cells towards higher columns, zero-filled
+    # cells, shift towards higher columns, filled with zeros
+    "shift-x": MeasurementFault(0.0, -255.0, 255.0),
     "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # cells towards higher rows
     "mirror": MeasurementFault(0.0, 0.0, 1.0),  # 1 reverses the column order
-    "drift": MeasurementFault(0.0, -1.0, 1.0),  # offset of all cells, fraction of the maximum count
+    # offset of all cells as a fraction of the maximum count
+    "drift": MeasurementFault(0.0, -1.0, 1.0),
     "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # s of repeated frames
     "current": MeasurementFault(1.0, -100.0, 100.0),  # factor for the measured current
 }
@@ -119,7 +121,7 @@ SWITCHED_FAULTS = ("mirror", "replay")  # either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
-    """Raised for an invalid fault text. The message lists the expected forms."""
+    """Raised for an invalid fault text. The message lists the allowed fault texts."""
 
 
 class FaultEvent(NamedTuple):
@@ -129,11 +131,15 @@ class FaultEvent(NamedTuple):
     part: str  # ``servos``, ``object``, ``all``, or a finger (board or measurements)
     kind: str
     value: float = 1.0  # probability, servo ID, load, or measurement fault value
-    over: float = 0.0  # s over which the fault increases
+    over: float = 0.0  # s, duration of the fault's increase
 
     def __str__(self) -> str:
         if self.kind == WELL:
-            return "all faults ended" if self.part == ALL else f"{self.part}: all faults ended"
+            return (
+                "all faults have ended"
+                if self.part == ALL
+                else f"{self.part}: all faults have ended"
+            )
         value = "" if self.kind in _PORT_FAULTS else f"={self.value:g}"
         over = f" within {self.over:g} s" * bool(self.over)
         return f"fault: {self.part}: {self.kind}{value}{over}"
@@ -148,7 +154,7 @@ class _Form(NamedTuple):
     sided: bool = False  # the word may name a finger
 
     def fits(self, side: str | None, kind: str, valued: bool) -> bool:
-        """Return True if a word may have this form."""
+        """Return True if a word may have this syntax."""
         optional = self.value.startswith("[")
         return (
             kind in self.kinds
@@ -163,15 +169,16 @@ class _Form(NamedTuple):
         return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
 
 
-# The first matching form is used: `silent=2` and `frozen=2` are servo faults, whereas `left:silent`
-# and `silent` are board faults.
+# The first type that matches is used: `silent=2` and `frozen=2` are servo faults, whereas
+# `left:silent` and `silent` are board faults.
 _ID = "=ID"
 _FORMS = (
     _Form(SERVO_FAULTS, _ID, (SERVOS,)),
     _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True),
     _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
-    _Form(("push", "twist"), "=NUMBER", (OBJECT,)),  # N along the faces, away from the palm; N·m
+    # N, along the faces and away from the palm; N·m
+    _Form(("push", "twist"), "=NUMBER", (OBJECT,)),
     _Form(_PORT_FAULTS, "", (SERVOS,), sided=True),
     _Form((WELL,), "", (ALL,), sided=True),
 )
@@ -189,7 +196,7 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
     - ``unplug`` and ``plug`` affect the servo port, and ``left:unplug`` affects a board's port.
     - ``push=15`` and ``twist=0.3`` apply a permanent load to the object; 0 removes it.
     - ``well`` ends all faults; ``left:well`` ends those of one finger's board and measurements.
-      Loads of the object stay.
+      Loads on the object remain.
 
     The suffix ``@START`` is the start time [s]. With ``@START..END``, a measurement fault increases
     linearly from START to END.
@@ -220,22 +227,24 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     match = _WORD.fullmatch(word)
     side, kind, text, start, end = match.groups() if match else (None, "", None, None, None)
     if side is not None and side not in FINGERS:
-        raise refused(f"expected left: or right:, found {side}:")
+        raise refused(f"expected the prefix left: or right:, found {side}:")
     value = None if text is None else _number(text)
     if value is not None and not math.isfinite(value):
         raise refused(f"{text!r} is not a number")
     after = 0.0 if start is None else _number(start)
     if not 0.0 <= after < math.inf:
-        raise refused(f"start {start!r} is not a time of at least 0 s")
+        raise refused(f"start {start!r} is not a valid time, expected at least 0 s")
     until = after if end is None else _number(end)
     if not after <= until < math.inf:
-        raise refused(f"end {end!r} is not a time of at least {start} s")
+        raise refused(f"end {end!r} is not a valid time, expected at least {start} s")
     form = next((each for each in _FORMS if each.fits(side, kind, value is not None)), None)
     if form is None:
         known = (f"{', '.join(each.kinds)} {each.value}".strip() for each in _FORMS)
         raise refused(f"expected one of {'; '.join(known)}")
     if end is not None and (kind not in MEASUREMENT_FAULTS or kind in SWITCHED_FAULTS):
-        raise refused(f"{kind} changes at once; give one start time such as @{start}")
+        raise refused(
+            f"{kind} does not change gradually; give a single start time such as @{start}"
+        )
     if form.value == _ID and value not in ids:
         raise refused("no servo has this ID")
     if value is None:
@@ -280,7 +289,7 @@ class MeasurementFaults:
         self._ramps: dict[str, _Ramp] = {}
 
     def begin(self, kind: str, value: float, t: float, over: float = 0.0) -> None:
-        """Change one of MEASUREMENT_FAULTS linearly to ``value``, within ``over`` [s] from ``t``.
+        """Change one of MEASUREMENT_FAULTS linearly to ``value`` within ``over`` [s] from ``t``.
 
         The change starts from the value at ``t`` and replaces an unfinished change. Raises KeyError
         if ``kind`` is unknown.
@@ -299,7 +308,7 @@ class MeasurementFaults:
     def apply(self, signal: FloatArray, full_count: int, t: float) -> None:
         """Apply the faults at ``t`` [s] in place to a sensor's counts ``signal`` [rows, cols].
 
-        Shifts by fractions of a cell are interpolated.
+        A shift by a fraction of a cell is interpolated.
         """
         if not self._ramps:
             return
@@ -313,7 +322,7 @@ class MeasurementFaults:
 
 
 def _shift(count: int, cells: float) -> FloatArray:
-    """Return the matrix [count, count] for a linearly interpolated shift by ``cells``."""
+    """Return the matrix [count, count] that shifts by ``cells`` with linear interpolation."""
     places = np.arange(count)
     weights: FloatArray = np.maximum(1.0 - np.abs(places[:, None] - places - cells), 0.0)
     return weights

@@ -16,7 +16,7 @@ class TactileSensor(Protocol):
     """Pressure grid under one fingertip, which is read outside the tick."""
 
     def open(self) -> None:
-        """Open the sensor and wait for a valid frame. Raises TactileError if none arrives."""
+        """Open the sensor and wait for a valid frame. Raises TactileError if no frame arrives."""
 
     def latest(self) -> Frame | None:
         """Return the newest complete frame, or None before the first frame.
@@ -34,7 +34,7 @@ class TactileSensor(Protocol):
 def make_sensor(
     settings: Settings, clock: Clock, hand: object, finger: int
 ) -> TactileSensor | None:
-    """Create a finger's tactile backend without opening it; None in a scene without sensors.
+    """Create a finger's tactile backend, not yet open, or None in a scene without sensors.
 
     ``hand`` is the simulated hand, for backends that use it. Raises the same errors as the
     backend's constructor.

@@ -1,6 +1,6 @@
-"""Read boards with COBS framing, which is intended for custom boards and 44 × 44 sensors.
+"""Read boards with COBS framing, a format intended for custom boards and 44 × 44 sensors.
 
-The firmware sends each scan without a request at any baud rate (USB boards may ignore the rate):
+The firmware sends each scan without being asked, at any baud rate (USB boards may ignore the rate):
 
 1. Build the message with all numbers in little-endian order:
 
@@ -26,8 +26,8 @@ The firmware sends each scan without a request at any baud rate (USB boards may 
 
 3. Encode the message with COBS, which removes all zero bytes. Split the message at its zero bytes
    and drop them. Write each piece as one byte with the value length + 1, followed by the piece.
-   Split pieces of 254 bytes or more into blocks of 254, each preceded by the byte 255. The
-   remainder, which may be empty, follows as a separate piece. (An empty piece at the end of the
+   Split pieces of 254 bytes or more into blocks of 254, each preceded by the byte 255. The rest of
+   the piece, which may be empty, follows as a separate piece. (An empty piece at the end of the
    message may be omitted.)
 
 4. Send a zero byte. An additional zero byte before the first frame is allowed.
@@ -35,7 +35,7 @@ The firmware sends each scan without a request at any baud rate (USB boards may 
 A 44 × 44 frame of uint16 takes at most 3903 bytes on the wire. `encode` is the reference
 implementation. A reader that starts within a frame synchronises at the next zero byte. Incomplete
 and corrupted frames are dropped: the CRC detects every error of up to 16 adjacent bits, and all but
-1 in 65536 of other errors. Gaps in the sequence numbers indicate the number of missed frames.
+1 in 65536 of all other errors. Gaps in the sequence numbers indicate the number of missed frames.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _BLOCK = 254  # bytes, maximum block of a COBS code
 def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
     """Encode a frame: counts [rows, cols], sequence number and board time ``t`` [s].
 
-    This is the reference for firmware. Raises ValueError if the counts have another type.
+    This function is the reference for firmware. Raises ValueError if the counts have another type.
     """
     if counts.dtype not in (np.uint8, np.uint16) or counts.ndim != 2:
         raise ValueError(f"counts must be uint8 or uint16 [rows, cols], got {counts.dtype}")
@@ -91,7 +91,7 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
     within a block. The code has no data-dependent branches, because these would be unpredictable.
     """
     code = np.int64(_BLOCK + 1)  # code of the current block
-    left = np.int64(0)  # remaining bytes of the block
+    left = np.int64(0)  # number of remaining bytes of the block
     size = 0
     for byte in packet:
         value = np.int64(byte)
@@ -108,13 +108,13 @@ class CobsDecoder(DelimitedDecoder):
 
     def __init__(self, rows: int, cols: int) -> None:
         super().__init__(rows, cols, b"\0", longest_frame(rows, cols))
-        # Compile the kernel now instead of at the first frame.
+        # Compile the kernel now rather than at the first frame.
         unstuff(np.frombuffer(bytearray(b"\1"), np.uint8), np.zeros(1, np.uint8))
         self._bad_crc = 0
         self._missed = 0
         self._seq: int | None = None
         self._ticks = 0
-        self._wraps = 0  # overflows of the board clock
+        self._wraps = 0  # number of overflows of the board clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
         """Parse like :meth:`DelimitedDecoder.parse`, with the board's sequence number and time."""
@@ -124,7 +124,7 @@ class CobsDecoder(DelimitedDecoder):
         message = np.empty(self.longest, np.uint8)
         size = unstuff(np.frombuffer(packet, np.uint8), message) - _CRC.size
         if size < _HEADER.size:
-            self._reason = "packets that are too short or not COBS"
+            self._reason = "packets that are too short or not COBS-encoded"
             return None
         if (
             binascii.crc_hqx(message.data[:size], _CRC_START)
@@ -135,17 +135,17 @@ class CobsDecoder(DelimitedDecoder):
             return None
         kind, version, seq, ticks, rows, cols = _HEADER.unpack_from(message.data)
         if kind not in (1, 2) or version != 0:
-            self._reason = f"packets of the unknown kind {kind}.{version}"
+            self._reason = f"packets of unknown kind {kind}.{version}"
             return None
         if (rows, cols) != (self.rows, self.cols) or size != _HEADER.size + kind * rows * cols:
             self._reason = f"frames of {rows} × {cols} cells in {size} bytes"
             return None
         steps = 1 if self._seq is None else (seq - self._seq - 1) % 65536 + 1
-        if steps > 32768:  # The number has decreased, so the board has restarted.
+        if steps > 32768:  # The sequence number has decreased, so the board has restarted.
             steps = 1
         self._missed += steps - 1
         self._seq = seq
-        # The clock has wrapped, or the board has restarted, which SensorClock detects.
+        # The clock has wrapped around, or the board has restarted, which SensorClock detects.
         self._wraps += ticks < self._ticks
         self._ticks = ticks
         # Two-byte counts are not copied, because the buffer belongs to this frame alone.

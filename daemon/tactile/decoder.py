@@ -1,4 +1,4 @@
-"""Decode bytes from serial boards to frames: interface of the framings and common code.
+"""Decode bytes from serial boards into frames: interface of the decoders and shared code.
 
 A decoder works incrementally, without a port, clock or thread.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 __all__ = ["Decoded", "DelimitedDecoder"]
 
-_LOST_AFTER = 10  # frame lengths without a frame after which the stream counts as lost
+_LOST_AFTER = 10  # number of frame lengths without a frame after which the stream counts as lost
 
 
 @dataclass(slots=True)
@@ -24,7 +24,7 @@ class Decoded:
     t: float
     steps: int = 1  # increase in the board's sequence number since the previous frame
     t_sensor: float | None = None  # board clock at mid-scan [s]
-    behind: int = 0  # bytes after the frame in the same read
+    behind: int = 0  # number of bytes after the frame in the same read
 
 
 class Decoder(ABC):
@@ -38,7 +38,7 @@ class Decoder(ABC):
         self.rows = rows
         self.cols = cols
         self.frame_bytes = frame_bytes
-        self.locked = False  # the buffer begins at the start of a frame
+        self.locked = False  # True if the buffer begins at the start of a frame
         self._buffer = bytearray()
         self._frames = 0
         self._resyncs = 0
@@ -51,15 +51,18 @@ class Decoder(ABC):
 
     @abstractmethod
     def diagnosis(self) -> str:
-        """Explain in one line why the stream yields no frames."""
+        """Explain in one line why no frames are found in the stream."""
 
     @property
     def pending(self) -> bool:
-        """True if ``settle`` may return a complete but unconfirmed frame."""
+        """True if ``settle`` might return a complete but unconfirmed frame."""
         return False
 
     def settle(self) -> Decoded | None:
-        """Return the pending frame. Called when the line has been quiet since the last byte."""
+        """Return the pending frame.
+
+        The reader calls this method when the line is quiet after the last byte.
+        """
         return None
 
     @property
@@ -87,7 +90,7 @@ class Decoder(ABC):
 
 
 class DelimitedDecoder(Decoder):
-    """Decoder for packets that end with a byte that does not occur elsewhere.
+    """Decoder for packets that end with a delimiter byte, which does not occur elsewhere.
 
     A packet is complete at its delimiter. After any corruption, the decoder resynchronises at the
     next packet. The buffer is at most as long as the longest packet.
@@ -101,8 +104,9 @@ class DelimitedDecoder(Decoder):
         super().__init__(rows, cols, longest)
         self.longest = longest
         self._delimiter = delimiter
-        self._scanned = 0  # number of buffer bytes already searched for a delimiter
-        self._reason = ""  # short reason for the last rejected packet
+        # number of bytes in the buffer that were already searched for a delimiter
+        self._scanned = 0
+        self._reason = ""  # short reason for rejecting the last rejected packet
 
     @abstractmethod
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
@@ -127,7 +131,7 @@ class DelimitedDecoder(Decoder):
                 self.frame_bytes = end + 1
                 self._skipped_at_frame = self._skipped
             else:
-                # Bytes before the first delimiter may be the end of a frame.
+                # Bytes before the first delimiter may be the end of an incomplete frame.
                 self._resyncs += bool(packet) and self.locked
                 self._skipped += end + 1
             self.locked = True
@@ -144,4 +148,4 @@ class DelimitedDecoder(Decoder):
         if self._reason:
             return f"{self._reason}; expected {self._grid()}"
         end = self._delimiter.hex().upper()
-        return f"no packet that ends with {end}; check the board and its baud rate"
+        return f"no packet ended with {end}; check the board and its baud rate"

@@ -1,8 +1,8 @@
 """Read FlexiTac boards over a serial port.
 
-The stream (2,000,000 baud) repeats ``AA 55`` followed by rows × cols bytes in row-major order, one
-per count. It contains no length, sequence number or checksum, and ``AA 55`` may also occur among
-the counts.
+In the stream (2,000,000 baud), each frame is ``AA 55`` followed by rows × cols bytes in row-major
+order, one per count. A frame contains no length, sequence number or checksum, and ``AA 55`` may
+also occur among the counts.
 """
 
 from __future__ import annotations
@@ -18,26 +18,27 @@ from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
-_SEARCH_FRAME_COUNT = 12  # frames compared by a search before it drops the oldest
-_MARKER_COUNT_MAX = 96  # markers stored to recognise another grid size
+_SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest
+_MARKER_COUNT_MAX = 96  # number of markers stored to recognise another grid size
 _GAP_TIME = 1e-3  # s, minimum gap between frames
-_CELL_COUNT_MIN = 16  # cells; closer markers are image content
+_CELL_COUNT_MIN = 16  # cells; ``AA 55`` pairs that are closer than this are image content
 
 
 class FlexiTacDecoder(Decoder):
     """Decoder for FlexiTac streams.
 
-    *Lock.* A marker differs from two counts ``AA 55`` only in its position. The search requires two
-    markers one frame apart. If other ``AA 55`` pairs between them recur at the same distance, it
-    waits for more frames until only one position remains. The decoder cannot lock to a constant
-    image that contains ``AA 55``; this is counted as ``ambiguous``.
+    *Lock.* A marker can be distinguished from two counts ``AA 55`` only by its position. The search
+    requires two markers one frame apart. If other ``AA 55`` pairs between the markers recur at the
+    same distance, the search waits for more frames until only one position remains. The decoder
+    can't lock to a constant image that contains ``AA 55``; such searches are counted as
+    ``ambiguous``.
 
     *Hold.* After locking, a frame is returned when the next marker is found at its expected
     position, which proves that no byte of the frame was lost. On a line with gaps between frames,
-    this would delay every frame by one period. In this case, a complete frame is returned
-    immediately if it cannot be spliced from two frames: its counts contain no ``AA 55``, and its
-    bytes arrived within their transmission time. Otherwise, the decoder waits for the next marker
-    or for ``settle``.
+    waiting for the next marker would delay every frame by one period. On such a line, a complete
+    frame is returned immediately if it can't consist of parts of two frames: its counts contain no
+    ``AA 55``, and its bytes arrived within their transmission time. Otherwise, the decoder waits
+    for the next marker or for ``settle``.
 
     *Loss.* If a marker is not at its expected position, the preceding frame is dropped, and the
     search restarts.
@@ -47,14 +48,14 @@ class FlexiTacDecoder(Decoder):
         """Create a decoder; ``byte_time`` is the transmission time of one byte [s]."""
         super().__init__(rows, cols, len(MARKER) + rows * cols)
         self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # s, maximum per frame
-        self._t_whole = -math.inf  # completion time of the last returned frame
+        self._t_whole = -math.inf  # time at which the last returned frame was complete
         self._start = 0  # stream position of the buffer's first byte
-        # End position (in the stream) and read time of each piece in the buffer.
+        # Stream position of the end, and read time, of each piece in the buffer.
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
         self._markers: deque[int] = deque(
             maxlen=_MARKER_COUNT_MAX
-        )  # stream positions while not locked
+        )  # stream positions of markers while not locked
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
         self._buffer += data
@@ -72,7 +73,7 @@ class FlexiTacDecoder(Decoder):
         return newest
 
     def settle(self) -> Decoded | None:
-        """Settle like :meth:`Decoder.settle`; return None if the counts may contain a marker."""
+        """Settle as in :meth:`Decoder.settle`; return None if the counts may contain a marker."""
         return self._take() if self.pending and not self._may_be_spliced() else None
 
     @property
@@ -81,7 +82,7 @@ class FlexiTacDecoder(Decoder):
 
     @property
     def found_cells(self) -> int:
-        """Cells per frame according to the most common marker distance; 0 while locked."""
+        """Number of cells per frame, from the most common marker distance; 0 while locked."""
         apart = Counter(b - a for a, b in combinations(self._markers, 2))
         spacings = [each for each in apart if each >= _CELL_COUNT_MIN + len(MARKER)]
         spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)
@@ -99,9 +100,12 @@ class FlexiTacDecoder(Decoder):
             shape = f"{found} cells" + (f" ({side} × {side} if square)" if side**2 == found else "")
             return f"frames of {shape}, expected {expected}: set tactile.rows and tactile.cols"
         if self._ambiguous:
-            return f"several places in each frame of {expected} contain AA 55: move the sensor"
+            return (
+                f"the marker AA 55 occurs several times in each frame of {expected}, so the frame "
+                "boundary is ambiguous: load the sensor differently"
+            )
         if self._markers:
-            return f"markers AA 55, but not at the spacing of {expected}"
+            return f"found markers AA 55, but not at the distance of one frame of {expected}"
         return f"no marker AA 55; expected frames of {expected}: check the board and its baud rate"
 
     def _search(self) -> bool:
@@ -130,10 +134,10 @@ class FlexiTacDecoder(Decoder):
             self._skip(stride)
 
     def _only_place(self) -> Literal["yes", "no", "undecided", "ambiguous"]:
-        """Decide whether the marker at the buffer start is the only consistent marker.
+        """Check whether the marker at the start of the buffer is the only consistent marker.
 
-        Each level adds one frame, so the result depends only on the stream, not on how it was split
-        into pieces.
+        Each level of the search adds one frame, so the result depends only on the stream, not on
+        its division into pieces.
         """
         buffer, stride = self._buffer, self.frame_bytes
         rivals = self._between()
@@ -160,19 +164,19 @@ class FlexiTacDecoder(Decoder):
         return markers
 
     def _misplaced(self, marker: int) -> bool:
-        """Return True if the bytes received so far at position ``marker`` are not a marker."""
+        """Return True if the bytes received so far at position ``marker`` can't be a marker."""
         return not MARKER.startswith(self._buffer[marker : marker + len(MARKER)])
 
     def _may_be_spliced(self) -> bool:
         """Return True if the frame at the buffer start may contain another frame's marker."""
         first, end = len(MARKER), self.frame_bytes
-        # The last count and the byte after it may also form a marker.
+        # The last count and the byte after the frame may also form a marker.
         return self._buffer.find(MARKER, first) >= 0 or self._buffer.endswith(
             MARKER[:1], first, end
         )
 
     def _in_one_go(self) -> bool:
-        """Return True if the frame at the buffer start arrived after a gap and without gaps."""
+        """Return True if the frame at the buffer start arrived after a gap and in one piece."""
         first, whole = self._pieces[0][1], self._pieces[-1][1]
         return first - self._t_whole > _GAP_TIME and whole - first < self._longest
 
@@ -189,7 +193,7 @@ class FlexiTacDecoder(Decoder):
     def _lose(self) -> None:
         self.locked = False
         self._resyncs += 1
-        if self._buffer.startswith(MARKER):  # This is the marker of an incomplete frame.
+        if self._buffer.startswith(MARKER):  # This marker belongs to an incomplete frame.
             self._note(0)
             self._skip(len(MARKER))
 

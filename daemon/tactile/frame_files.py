@@ -6,13 +6,13 @@ Supported files:
   name. Optional arrays are ``t`` [n], ``live`` [rows, cols] bool, and the true contact of each
   frame, if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
 - ``.npy`` with one frame [rows, cols] or several frames [n, rows, cols], or a folder of such files.
-  The files are sorted by name, with numbers in numerical order. The folder may contain ``t.npy``
-  [n].
+  The files are sorted by name, and numbers in names are sorted by value. The folder may contain
+  ``t.npy`` [n].
 - Other files are read as Tekscan-style ASCII exports.
 
 Integer frames contain counts. Other frames are in Pa and are converted with ``pascal_per_count``. A
-cell that is NaN in all frames is dead. Negative readings are set to 0 if they can be explained by
-noise around a tared zero. Times are in s unless their step or date indicates another unit.
+cell that is NaN in all frames is dead. Negative readings are set to 0 if noise around a tared zero
+can explain them. Times are in seconds, unless their step or date indicates another unit.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ _COUNT_MAX = 65535
 _RANGE_ERROR = f"frames: found readings outside 0 to {_COUNT_MAX} counts"
 _LISTED_COUNT_MAX = 8  # maximum number of arrays listed in a message
 _SAMPLE_COUNT_MAX = 200  # maximum number of frames for estimating zero and noise
-_NOISE_SIGMA_MAX = 6.0  # standard deviations, maximum negative noise
+_NOISE_SIGMA_MAX = 6.0  # maximum negative noise in standard deviations
 _CLIPPED_COUNT_MIN = 3  # minimum number of cells that share the maximum reading
 _UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # time units other than s
 _DATE_RANGE = (1e9, 4e9)  # Unix time [s], from 2001 to 2096
-_INTERVAL_RATIO_MAX = 100.0  # maximum ratio to the expected interval for times in s
+_INTERVAL_RATIO_MAX = 100.0  # maximum ratio to the expected interval if times are in seconds
 _INTERVAL_RATIO_NOTED = 10.0  # ratio to the expected interval that triggers a note
 
 
 @dataclass(frozen=True)
 class FrameRecording:
-    """Counts uint16 [n, rows, cols] at times t float64 [n], which increase from 0 [s].
+    """Counts uint16 [n, rows, cols] at the times t float64 [n] [s], which increase from 0.
 
     ``live`` [rows, cols] is False where the sensor has no cell. ``truths`` contains the true
-    contact. ``largest`` is the maximum reading in the file's unit: counts if ``whole``, otherwise
-    Pa. ``notes`` lists corrections and suspicious values, one per line.
+    contact of each frame. ``largest`` is the maximum reading in the file's unit: counts if
+    ``whole``, otherwise Pa. ``notes`` lists corrections and suspicious values, one per line.
     """
 
     counts: NDArray[np.uint16]
@@ -153,39 +153,44 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
             part = _part(archive, name)
             left -= part.file_size
             if left < 0:
-                raise ValueError(f"{name}: unpacks to more data than its size allows")
+                raise ValueError(
+                    f"{name}: the unpacked data are suspiciously large for the size of the file"
+                )
             with archive.open(part) as unpacked:
                 held[ours] = _read_array(unpacked, part.file_size)
     return held
 
 
 def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) -> str:
-    """Return the name of the frames array. Raises ValueError if it is ambiguous."""
+    """Return the name of the frames array. Raises ValueError if the name is ambiguous."""
     if "frames" in names:
         return "frames"
     shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
     stacks = [name for name, (shape, kind) in shapes.items() if len(shape) == 3 and kind in "uif"]
     if len(stacks) == 1:
-        notes.append(f"found no array 'frames'; uses {stacks[0]!r}, the only 3-d array")
+        notes.append(
+            f"found no array 'frames'; using {stacks[0]!r}, the only three-dimensional array"
+        )
         return stacks[0]
     described = [f"{name} {shape}" for name, (shape, _) in [*shapes.items()][:_LISTED_COUNT_MAX]]
     described += ["…"] * (len(names) > _LISTED_COUNT_MAX)
     raise ValueError(
-        f"found no array 'frames', but {', '.join(described) or 'no other array'}: name the "
-        "array [n, rows, cols] frames"
+        f"found no array 'frames', but {', '.join(described) or 'no other array'}; rename the "
+        "array of shape [n, rows, cols] to frames"
     )
 
 
 def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     part = archive.getinfo(f"{name}.npy")
-    # NumPy uses only these methods; other methods may unpack to more than the stated size.
+    # NumPy uses only these compression methods. Other methods may unpack to more than the stated
+    # size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name}: found an unsupported compression, expected deflate")
     return part
 
 
 def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], str]:
-    """Return the shape and dtype kind of an array without reading it."""
+    """Return the shape and dtype kind of an array without reading its data."""
     with archive.open(_part(archive, name)) as unpacked:
         shape, _, kind = _read_header(unpacked)
     return shape, kind.kind
@@ -206,11 +211,15 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
 
 
 def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
-    """Read the array in a .npy file. Raises ValueError if it claims more than ``size`` bytes."""
+    """Read the array in a .npy file.
+
+    Raises ValueError if its header states more than ``size`` bytes.
+    """
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
         raise ValueError(
-            f"its header states the shape {shape} of {kind}, more than the file contains"
+            f"found a header with the shape {shape} of {kind}, expected at most as much data as "
+            "the file contains"
         )
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
@@ -265,7 +274,7 @@ def _checked(
 def _without_dead(
     frames: NDArray[Any], live: NDArray[np.bool_], most: float
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Mark cells as dead if they are NaN in all frames; clear dead cells' out-of-range readings."""
+    """Mark cells that are NaN in all frames as dead; clear out-of-range readings of dead cells."""
     if frames.dtype.kind == "f":
         unknown = np.isnan(frames)
         live = live & ~unknown.all(axis=0)
@@ -284,7 +293,10 @@ def _without_dead(
 def _check_below(
     frames: NDArray[Any], live: NDArray[np.bool_], noise: float, notes: list[str]
 ) -> None:
-    """Note negative readings due to noise. Raises ValueError for other negative readings."""
+    """Add a note about negative readings caused by noise.
+
+    Raises ValueError for other negative readings.
+    """
     lowest = float(frames.min())
     if lowest >= 0.0:
         return
@@ -293,15 +305,17 @@ def _check_below(
     noise = max(noise, 1.4826 * float(np.median(np.abs(sample - middle))))
     k, i, j = np.unravel_index(int(frames.argmin()), frames.shape)
     if middle < -noise:
-        expected = f"0 or noise; half of the readings are {middle:.3g} or less: tare them"
+        expected = (
+            f"0 or noise around 0; half of the readings are {middle:.3g} or less: tare the frames"
+        )
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     if lowest < -_NOISE_SIGMA_MAX * noise:
         expected = f"at least {-_NOISE_SIGMA_MAX * noise:.3g}, the range of noise around 0"
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     share = np.count_nonzero(frames < 0) / (len(frames) * np.count_nonzero(live))
     notes.append(
-        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: noise around a tared "
-        "zero, set to 0"
+        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: this is noise after a "
+        "tare, and these readings are set to 0"
     )
 
 
@@ -326,13 +340,18 @@ def _row(arrays: dict[str, NDArray[Any]], name: str, count: int) -> NDArray[Any]
 
 
 def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
-    """Convert times to s since the first frame. Raises ValueError if they do not increase."""
+    """Convert times to seconds since the first frame.
+
+    Raises ValueError if the times do not increase.
+    """
     first = t[0].item()
     since: FloatArray = (t - t[0]).astype(np.float64)
     steps = np.diff(since)
     if (steps <= 0.0).any():
         k = int(np.argmax(steps <= 0.0))
-        raise ValueError(f"t: the times must increase; t[{k}] is {t[k]}, t[{k + 1}] is {t[k + 1]}")
+        raise ValueError(
+            f"t: expected increasing times, found t[{k}] = {t[k]}, t[{k + 1}] = {t[k + 1]}"
+        )
     if not steps.size:
         return since
     step = float(np.median(steps))
@@ -343,24 +362,27 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
         factor = _factor(t, step, rate)
     if factor in _UNITS:
         notes.append(
-            f"t: read as {_UNITS[factor]}, which gives {step * factor:.4g} s between frames; "
-            f"tactile.rate gives {1.0 / rate:.4g} s"
+            f"t: interpreted as {_UNITS[factor]}, which gives {step * factor:.4g} s between "
+            f"frames, but tactile.rate corresponds to {1.0 / rate:.4g} s"
         )
     elif not 1.0 / _INTERVAL_RATIO_NOTED < step * rate < _INTERVAL_RATIO_NOTED:
         notes.append(
-            f"t: read as s, which gives {step:.4g} s between frames; tactile.rate gives "
-            f"{1.0 / rate:.4g} s"
+            f"t: interpreted as s, which gives {step:.4g} s between frames, but tactile.rate "
+            f"corresponds to {1.0 / rate:.4g} s"
         )
     return np.multiply(since, factor)
 
 
 def _factor(t: NDArray[Any], step: float, rate: float) -> float:
-    """Return the unit [s] of undated times based on their step. Raises ValueError."""
+    """Return the unit [s] of undated times, derived from their step. Raises ValueError."""
     whole = t.dtype.kind in "ui"
     if len(t) > 2 and (t % 1 == 0).all() and (np.diff(t) == 1).all():
         if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # a frame per second
             return 1.0
-        raise ValueError("t: whole numbers that increase by 1, expected times in s, or no t")
+        raise ValueError(
+            "t: found frame numbers that increase by 1, expected times in s; remove t if the "
+            "times are unknown"
+        )
     if not whole and step * rate <= _INTERVAL_RATIO_MAX:
         return 1.0
     return min((1.0, *_UNITS)[whole:], key=lambda factor: abs(math.log(step * factor * rate)))
@@ -374,12 +396,12 @@ def _clipped(found: FrameRecording, scale: float, full: int) -> str:
     cells = np.count_nonzero(at_top.any(axis=0))
     if top == 0 or top >= full or cells < _CLIPPED_COUNT_MIN:
         return ""
-    # If readings are round numbers, the next lower reading is just as frequent.
+    # If the readings are rounded, the next lower reading is just as frequent.
     below = int(counts[~at_top].max(initial=0))
     if below and np.count_nonzero(at_top) <= 2 * np.count_nonzero(counts == below):
         return ""
     unit = "counts" if found.whole else f"counts of {scale:g} Pa"
     return (
-        f"{cells} cells share the largest reading, {top} {unit}: if they are saturated, set "
-        f"tactile.full_count = {top}; otherwise d is too large"
+        f"{cells} cells have the same maximum reading, {top} {unit}: if these cells are "
+        f"saturated, set tactile.full_count = {top}; otherwise the estimated d is too large"
     )

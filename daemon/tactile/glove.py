@@ -3,11 +3,11 @@
 The board runs at 1,000,000 baud. The host writes ``a``, and the board replies with one frame of 2 +
 2 · rows · cols bytes: index + 11, then for each cell in row-major order the high 5 bits + 11 and
 the low 5 bits + 11, and finally a newline (10). Only the last byte can be a newline, so the decoder
-resynchronises at the next newline. There is no checksum, so a byte that is corrupted to another
-value in 11 … 42 is not detected.
+resynchronises at the next newline. There is no checksum, so a corrupted byte is not detected if its
+value is still in 11 … 42.
 
-Boards with a 12-bit converter use the same framing with 6 bits per half. They are selected by a
-``tactile.full_count`` from 1024 to 4095.
+Boards with a 12-bit converter use the same framing with 6 bits per half. A ``tactile.full_count``
+from 1024 to 4095 selects such a board.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ class GloveDecoder(DelimitedDecoder):
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
         if len(packet) != self.longest - 1:
             cells = (len(packet) - 1) // 2
-            self._reason = f"lines of {len(packet)} bytes, which is {cells} cells"
+            self._reason = f"lines of {len(packet)} bytes, which correspond to {cells} cells"
             return None
         halves = np.frombuffer(packet, np.uint8, len(packet) - 1, 1) - np.uint8(_OFFSET)
-        # Bytes below the offset wrap around to large values.
+        # Bytes below the offset wrap around to large values here.
         if packet[0] < _OFFSET or halves.max() >= self._values:
             self._reason = (
-                "a byte that is not half of a count; tactile.full_count = 4095 may be needed"
+                "a byte that is not half of a count; set tactile.full_count = 4095 if the board "
+                "sends 12-bit counts"
             )
             return None
         counts = halves[0::2].astype(np.uint16)
@@ -52,7 +53,7 @@ def bits_of(full_count: int) -> int:
 
 
 class Glove(SerialReader):
-    """Glove-style board under one fingertip. Each frame triggers a request for the next."""
+    """Glove-style board under one fingertip. After each frame, the next frame is requested."""
 
     request = b"a"
 

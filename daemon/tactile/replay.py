@@ -1,4 +1,4 @@
-"""Provide recorded frames instead of a sensor, at recorded times or set by the caller."""
+"""Provide recorded frames in place of a sensor, at recorded times or as set by the caller."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
-_PITCH_TOLERANCE = 0.01  # relative tolerance between pitch in file and settings
+_PITCH_TOLERANCE = 0.01  # relative tolerance between the pitch in the file and in the settings
 
 
 def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:
-    """Describe how a file's cell size differs from ``pitch`` (x, y) [m]; y = 0 means y = x.
+    """Describe how the cell size in a file differs from ``pitch`` (x, y) [m]; y = 0 means y = x.
 
-    The text is empty if they agree or the file does not state a size.
+    The text is empty if both agree or if the file does not state a cell size.
     """
     if recording.pitch is None:
         return ""
@@ -31,8 +31,8 @@ def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> s
         return ""
     x, y = (each * 1e3 for each in recording.pitch)
     return (
-        f"its header gives cells of {x:.4g} × {y:.4g} mm, tactile.pitch gives "
-        f"{wanted[0] * 1e3:.4g} × {wanted[1] * 1e3:.4g} mm: set tactile.pitch = {x * 1e-3:.6g}, "
+        f"found cells of {x:.4g} × {y:.4g} mm in its header, expected {wanted[0] * 1e3:.4g} × "
+        f"{wanted[1] * 1e3:.4g} mm as in tactile.pitch: set tactile.pitch = {x * 1e-3:.6g}, "
         f"tactile.pitch_y = {y * 1e-3:.6g}"
     )
 
@@ -55,7 +55,7 @@ class GivenFrames:
         """Do nothing: there is no port."""
 
     def latest(self) -> Frame | None:
-        """Return the frame set last."""
+        """Return the frame that was set last."""
         return self.frame
 
     def counters(self) -> dict[str, int]:
@@ -76,10 +76,13 @@ class ReplayTactile:
     """
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
-        """Load the recording. Raises TactileError if it is unreadable or has another grid."""
+        """Load the recording.
+
+        Raises TactileError if the recording is unreadable or has a different grid.
+        """
         path = settings.recording[finger]
         if not path:
-            raise TactileError(f"tactile.recording: found none for the {FINGERS[finger]} finger")
+            raise TactileError(f"tactile.recording: found no file for the {FINGERS[finger]} finger")
         try:
             recording = load_recording(
                 Path(path),
@@ -114,14 +117,14 @@ class ReplayTactile:
         self._frame: Frame | None = None
 
     def open(self) -> None:
-        """Start playing at the recording's first frame."""
+        """Start the replay at the recording's first frame."""
         self._start = self._due = self._clock.now()
         self._frame = None
         self.latest()
 
     def latest(self) -> Frame | None:
-        """Return the newest due frame, or None if the sensor is not open."""
-        now = self._clock.now() + 1e-9  # includes a frame due now
+        """Return the newest frame that is due, or None if the sensor is not open."""
+        now = self._clock.now() + 1e-9  # includes a frame that is due now
         if now < self._due:
             return self._frame
         turn = math.floor((now - self._start) / self._period)

@@ -24,16 +24,16 @@ from softfinger.daemon.types import Frame
 
 __all__ = ["SerialReader"]
 
-_READ_SIZE = 65536  # bytes per read, the capacity of a Linux tty
+_READ_SIZE = 65536  # bytes per read, equal to the capacity of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-_GAP_TIME = 5e-4  # s without a byte that count as a gap between frames
-_REQUEST_TIMEOUT = 0.1  # s beyond a frame's transmission time until the request is repeated
-_WAIT_MIN = 3e-4  # s; shorter timed waits cost more than the wake-ups they save
+_GAP_TIME = 5e-4  # s, time without a byte that counts as a gap between frames
+_REQUEST_TIMEOUT = 0.1  # s, time after a frame's transmission time at which the request is repeated
+_WAIT_MIN = 3e-4  # s; shorter waits cost more than the wake-ups they avoid
 _WAIT_MAX = 2e-3  # s, maximum delay if the number of missing bytes is wrong
 
 
 class SensorClock:
-    """Converter from a board's clock to the local clock, using the minimum recent delay as offset.
+    """Converter from a board's clock to the local clock; the minimum recent delay is the offset.
 
     Frames arrive with varying delays but never early, so using the minimum delay removes port
     jitter from t_sample. The offset may increase by 200 ppm, which exceeds the difference between
@@ -92,13 +92,16 @@ class SerialReader:
         self._bytes = 0
         self._error = ""
         self._port_lost = False
-        self._event = threading.Event()  # set by the first frame or when the port is lost
+        self._event = threading.Event()  # set on the first frame, or when the port is lost
         self._thread: threading.Thread | None = None
         self._port: serial.Serial | None = None
         self._stop: tuple[int, int] | None = None
 
     def make_decoder(self) -> Decoder:
-        """Create a decoder for the board's framing. Called each time the port is opened."""
+        """Create a decoder for the board's framing.
+
+        The reader calls this method each time it opens the port.
+        """
         raise NotImplementedError
 
     def open(self) -> None:
@@ -147,7 +150,10 @@ class SerialReader:
         return self._error
 
     def close(self) -> None:
-        """Stop the thread and close the port. Never raises; may be called repeatedly."""
+        """Stop the thread and close the port.
+
+        This method never raises an exception and may be called repeatedly.
+        """
         stop, thread, port = self._stop, self._thread, self._port
         self._stop = self._thread = self._port = None
         if stop is not None:
@@ -169,8 +175,8 @@ class SerialReader:
         within = f"within tactile.open_timeout = {self.settings.open_timeout:g} s"
         if self._bytes == 0:
             return (
-                f"no data {within}: check the board's power, tactile.port and its rate of "
-                f"{self.settings.baud} baud"
+                f"no data {within}: check the board's power supply, tactile.port and tactile.baud "
+                f"= {self.settings.baud}"
             )
         return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
 
@@ -194,7 +200,7 @@ class SerialReader:
             except OSError as error:
                 return self._end(f"the port is lost ({os.strerror(error.errno or errno.EIO)})")
             if not data:
-                return self._end("the port is lost (it reports data but has none)")
+                return self._end("the port is lost (it signals data, but a read returns nothing)")
             self._bytes += len(data)
             decoded = decoder.feed(data, self._clock.now())
             self._hand_over(decoded)
@@ -205,8 +211,8 @@ class SerialReader:
             else:
                 timeout = self._request_timeout if decoded is None else self._ask(port)
             wait = decoder.missing * self._byte_time
-            # The remaining bytes are being sent, so wait for the end of the frame instead of its
-            # next byte.
+            # The board is sending the remaining bytes, so wait for the end of the frame instead of
+            # its next byte.
             if wait > _WAIT_MIN and select.select((stop,), (), (), min(wait, _WAIT_MAX))[0]:
                 return None
 
@@ -220,7 +226,7 @@ class SerialReader:
     def _ask(self, port: int) -> float | None:
         """Request a frame from a polled board; return the maximum waiting time [s]."""
         if self.request:
-            with contextlib.suppress(OSError):  # The next read reports a lost port.
+            with contextlib.suppress(OSError):  # The next read will report a lost port.
                 os.write(port, self.request)
         return self._request_timeout
 
@@ -258,13 +264,13 @@ def open_port(path: str, baud: int) -> serial.Serial:
     except serial.SerialException as error:
         number = error.errno
         if number == errno.ENOENT:
-            why = "no such port; is the board plugged in?"
+            why = "port not found; check that the board is connected"
             if not path.startswith("/dev/"):
-                why = "no such port; is `softfinger emulate` running?"
+                why = "port not found; check that `softfinger emulate` is running"
         elif number in (errno.EACCES, errno.EPERM):
             why = f"no permission to open it: {grant(path)}"
         elif number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
-            why = "busy: another program uses this port"
+            why = "the port is in use by another program; end that program first"
         else:
             why = f"can't be opened as a serial port ({error})"
     except (OSError, ValueError) as error:

@@ -5,10 +5,11 @@ consists of a line ``Frame n``, which may contain more text, and the rows, with 
 sensor has no cell. A line ``@@`` may end the file. An export with a single frame has no ``Frame``
 line.
 
-Encoding, decimal sign and separator depend on the locale of the exporting machine and are detected
-from the file. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings are raw,
-pressures, or forces per cell. Free text follows ``COMMENTS:``; within it, only words in capitals
-are keys. Spreadsheets may add quotation marks, and separators at line ends.
+Encoding, decimal sign and separator depend on the locale of the exporting machine. The parser
+detects them from the file. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings
+are raw counts, pressures, or forces per cell. Free text follows ``COMMENTS:``; within this text,
+only words in capitals are keys. Spreadsheets may add quotation marks and may append separators to
+lines.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from softfinger.daemon.errors import SoftfingerError
 
 _SIZE_MAX = 1024  # maximum number of rows or cols
 _HEADER_LINES_MAX = 1000
-_READING_MAX = 1e12  # maximum reading in its unit
+_READING_MAX = 1e12  # maximum reading in the unit of the readings
 _RAW_SATURATION = 255  # the manufacturer's electronics have 8 bits
 _SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, to allow for rounding
 _EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
@@ -80,7 +81,7 @@ class Export:
 
 
 def decode(data: bytes) -> str:
-    """Decode UTF-8, UTF-16 or a single-byte encoding, with or without a byte order mark."""
+    """Decode text in UTF-8, UTF-16 or a single-byte encoding, with or without byte order mark."""
     for mark, code in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
         if data.startswith(mark):
             return data.decode(code, "replace")
@@ -121,7 +122,7 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     if "SECONDS_PER_FRAME" in header:
         step = _quantity(header, "SECONDS_PER_FRAME", _TIMES)
     if not step > 0.0:
-        raise TekscanError("SECONDS_PER_FRAME: expected a time above 0")
+        raise TekscanError("SECONDS_PER_FRAME: expected a positive number of seconds")
     t = (np.array(numbers, np.float64) - numbers[0]) * step
     return Export(values, live, t, raw, pitch, full if full > 0.0 else math.inf)
 
@@ -129,18 +130,18 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
 def _live_cells(
     values: NDArray[np.float64], places: list[list[int]]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Set missing and never-numeric cells to 0; return the values and a mask of the other cells.
+    """Set cells without numbers to 0; return the values and a mask of the cells with numbers.
 
-    Raises TekscanError if a cell is a number only in some frames.
+    Raises TekscanError if a cell contains a number only in some frames.
     """
     unknown = np.isnan(values)
     live: NDArray[np.bool_] = ~np.any([np.isneginf(values).any(0), unknown.all(0)], axis=0)
     wrong = np.argwhere(unknown & live)
     if wrong.size:
         k, i, _ = wrong[0].tolist()
-        raise TekscanError(f"line {places[k][i]}: a cell is not a number")
+        raise TekscanError(f"line {places[k][i]}: found a cell that is not a number")
     if not live.any():
-        raise TekscanError("contains no cells")
+        raise TekscanError("the file does not contain any cells")
     return np.where(live, values, 0.0), live
 
 
@@ -168,7 +169,7 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
             header[key] = value
             in_comments = key.startswith("COMMENT")
     raise TekscanError(
-        "found no line ASCII_DATA, expected a Tekscan-style export, .npz or .npy file"
+        "found no line ASCII_DATA, expected a Tekscan-style export, or an .npz or .npy file"
     )
 
 
@@ -186,7 +187,7 @@ def _frames(
             continue
         if line.lstrip(_EDGE_CHARACTERS).startswith("@@"):
             break
-        if re.match(r'"?[^\W\d]{2}', line):  # A row starts with a number or a single B.
+        if re.match(r'"?[^\W\d]{2}', line):  # A row starts with a number or a single letter B.
             match = re.match(r'"?[^\W\d]+[\s:#,;]*(\d{1,9})\b', line)
             if match is None:
                 if re.match(r'"?(nan|inf)', line, re.IGNORECASE) is None:
@@ -194,7 +195,7 @@ def _frames(
             else:
                 if frames and len(frames[-1]) < rows:
                     had = f"{len(frames[-1])} rows of {rows}"
-                    raise TekscanError(f"line {number}: frame {numbers[-1]} has {had}")
+                    raise TekscanError(f"line {number}: frame {numbers[-1]} has only {had}")
                 if numbers and int(match[1]) <= numbers[-1]:
                     raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
                 numbers.append(int(match[1]))
@@ -211,7 +212,7 @@ def _frames(
         frames[-1].append(_row(line, separator, cols, number))
         places[-1].append(number)
     if not frames:
-        raise TekscanError("contains no frames")
+        raise TekscanError("the file does not contain any frames")
     if len(frames[-1]) < rows:
         raise TekscanError(
             f"the file ends in frame {numbers[-1]}: {len(frames[-1])} rows of {rows}"
@@ -244,14 +245,14 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
     cells = [cell.strip(' "').upper() for cell in _cells(line, separator, cols)]
     missing = cells.count("B")
     if separator == "," and len(cells) != cols:
-        # Commas are decimal signs only if every number has one.
+        # Commas are decimal signs only if every number contains one.
         if len(cells) == 2 * cols - missing:
             parts = iter(cells)
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
         elif cols < len(cells) < 2 * cols and all(each.isdigit() or each == "B" for each in cells):
             raise TekscanError(
-                f"line {number}: {len(cells)} cells, expected {cols}: commas separate the cells "
-                "and their decimals; export with decimal points or another separator"
+                f"line {number}: {len(cells)} cells, expected {cols}: the comma is both the "
+                "separator and the decimal sign; export with decimal points or another separator"
             )
     if len(cells) != cols:
         raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
@@ -260,7 +261,7 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
     except ValueError as error:
         raise TekscanError(f"line {number}: {error}") from None
     if np.count_nonzero(np.isneginf(values)) != missing:
-        raise TekscanError(f"line {number}: a cell is not a number")
+        raise TekscanError(f"line {number}: found a cell that is not a number")
     return values
 
 
@@ -270,8 +271,8 @@ _GROUPS = str.maketrans("", "", "'\N{RIGHT SINGLE QUOTATION MARK}\N{NO-BREAK SPA
 def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
-    If both occur, the last one is the decimal sign, and the other one groups digits. Apostrophes
-    and narrow spaces only group digits.
+    If both characters occur, the last one is the decimal sign, and the other groups digits.
+    Apostrophes and narrow spaces only group digits.
     """
     text = text.translate(_GROUPS)
     if "," in text:
@@ -299,7 +300,9 @@ def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> floa
     unit = _plain_unit(match[2]) if match else ""
     if not math.isfinite(value) or unit not in units:
         known = ", ".join(name for name in units if 0 < len(name) <= 4)
-        raise TekscanError(f"{key}: found {header[key]!r}, expected a number in one of {known}")
+        raise TekscanError(
+            f"{key}: found {header[key]!r}, expected a number with one of the units {known}"
+        )
     return value * units[unit]
 
 
@@ -309,7 +312,7 @@ def _pitch(header: dict[str, str]) -> tuple[float, float]:
     for key in ("COL_SPACING", "ROW_SPACING"):
         value = _quantity(header, key, _LENGTHS) if key in header else math.nan
         if value <= 0.0:
-            raise TekscanError(f"{key}: expected a length above 0")
+            raise TekscanError(f"{key}: expected a positive length")
         found.append(value)
     return found[0], found[1]
 

@@ -1,14 +1,14 @@
-"""Unpack the requests that the gateway forwards to the loop, and reply to them.
+"""Unpack and answer the requests that the gateway forwards to the loop.
 
 The command server runs in the loop's thread, once per tick, without a lock. A ``stop`` takes
 precedence. Each request carries the number of stops that preceded it. If that number is lower than
-the current one, the request is refused, unless it is ``status``. A ``hold`` replaces the queued
-``hold`` directly before it on the same connection.
+the current number of stops, the request is refused, unless it is ``status``. A ``hold`` replaces a
+queued ``hold`` that directly precedes it on the same connection.
 
 A client may add a unique ``key`` to a request and send the same map again if it was refused as
 late. The daemon then carries out the command at most once. If another command has been carried out
-since that refusal, the repetition is refused, because the newest command prevails. Commands that
-can only make the hand safer (`NO_LEASE_COMMANDS`) are carried out every time.
+since the refusal, the repeated request is refused, because the newest command prevails. Commands
+that can only make the hand safer (`NO_LEASE_COMMANDS`) are carried out every time.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: reques
 
 _ANSWER_TIMEOUT = 0.4  # s, maximum wait for the gateway before a local stop is confirmed
 _COMMANDS_PER_TICK = 2  # maximum, not counting stops
-_UNPACKED_SIZE_MAX = 4096  # bytes; once reached, unpacking continues on the next tick
-_OUTCOME_COUNT_MAX = 256  # stored outcomes of keyed requests
+_UNPACKED_SIZE_MAX = 4096  # bytes; when this size is reached, unpacking continues on the next tick
+_OUTCOME_COUNT_MAX = 256  # number of stored outcomes of requests with a key
 _KEY_LENGTH_MAX = 64
 _VALUE_TYPES = (str, int, float)  # bool is a subclass of int
 
@@ -41,7 +41,7 @@ class _Outcome(NamedTuple):
     """Reply to a request that has a key."""
 
     stops: int  # stop count when the request was first refused or carried out
-    changes: int  # count of other commands carried out by that time
+    changes: int  # number of other commands carried out by that time
     reply: bytes  # empty if the request was late and may be repeated
 
 
@@ -60,8 +60,8 @@ class CommandServer:
         self._local = local
         self._clock = clock
         self._stops = 0
-        self._changes = 0  # executed commands other than status and stop
-        # Maps (client name from its access key, request) to an outcome, oldest first.
+        self._changes = 0  # number of executed commands other than status and stop
+        # Outcomes by (client name from its access key, request), oldest first.
         self._outcomes: OrderedDict[tuple[str, bytes], _Outcome] = OrderedDict()
         self._stopped: bytes | None = None  # reply to a local stop, pending gateway confirmation
         self._answer_by = 0.0
@@ -103,7 +103,7 @@ class CommandServer:
             try:
                 request = decode(ask.payload)
                 if ask.urgent and request["command"] != "stop":  # two keys are named "command"
-                    raise _malformed('expected one string under "command"')
+                    raise _malformed('expected exactly one string under the key "command"')
             except Refused as refused:
                 self._link.reply(ask, refusal(str(refused), refused.reason))
                 continue
@@ -112,7 +112,7 @@ class CommandServer:
             if request["command"] == "stop":
                 if not stopped:
                     stopped = accepted(handler({"command": "stop", "client": ask.name}, 0.0))
-                    self.raise_fence()  # before the reply, after which the client may continue
+                    self.raise_fence()  # done before the reply, after which the client may continue
                 self._link.reply(ask, stopped)
                 continue
             mine = [other for other in waiting if other[0].route[0] == ask.route[0]]
@@ -135,7 +135,7 @@ class CommandServer:
                     text = "rejected: received before the last stop, or too soon after it"
                     raise Refused(text, Reason.STOPPED)
                 if first.changes != self._changes:
-                    text = f"{name}: another command has been carried out since the first attempt"
+                    text = f"{name}: another command was carried out after the first attempt"
                     raise Refused(text, Reason.SUPERSEDED)
                 reply = accepted(handler(request, self._clock() - ask.came))
                 self._changes += name != "status"
@@ -181,18 +181,18 @@ def refusal(error: str, reason: str) -> bytes:
 def decode(payload: bytes) -> dict[str, Any]:
     """Unpack a command: a flat map of numbers and strings, with a string under ``command``.
 
-    Raises Refused for other data. Additional content of a stop is ignored.
+    Raises Refused for other data. Additional fields of a stop are ignored.
     """
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
     except msgpack.StackError:
-        raise _malformed("not msgpack: nested too deeply") from None
-    except Exception as error:  # msgpack has no common base class for its exceptions
-        raise _malformed(f"not msgpack: {str(error) or 'invalid format'}") from None
+        raise _malformed("not valid msgpack: nested too deeply") from None
+    except Exception as error:  # msgpack's exceptions have no common base class
+        raise _malformed(f"not valid msgpack: {str(error) or 'invalid format'}") from None
     if not isinstance(request, dict):
         raise _malformed(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):
-        raise _malformed('expected a string under "command"')
+        raise _malformed('expected a string under the key "command"')
     # Requests are published unchanged, so nested values are rejected.
     plain = {
         key: value

@@ -18,7 +18,7 @@ class EventKind(NamedTuple):
 
 
 _CALIBRATE_JOINTS = "Calibrate the joints: `softfinger calibrate joints my.toml`."
-_BUSY = "Find out which programs use the processors; see `[realtime]`."
+_BUSY = "Find the programs that load the processors; see also the settings in `[realtime]`."
 _CHECK_SENSOR = "Check the mounting of the sensor; tare and calibrate it again."
 
 KINDS: dict[str, EventKind] = {
@@ -26,31 +26,36 @@ KINDS: dict[str, EventKind] = {
     "start": EventKind("info", "The daemon is starting, or is ready and accepts commands."),
     "end": EventKind(
         "info, error",
-        "The daemon has ended. The error means that the servos did not confirm torque off.",
-        "After the error, switch off the servo supply.",
+        "The daemon has ended. If the level is error, the servos did not confirm torque off.",
+        "If the level is error, switch off the servo supply.",
     ),
     "mode": EventKind("info", "The mode has changed; the text contains the old and the new mode."),
     "compile": EventKind(
         "info, warning",
-        "Kernels are being compiled. The warning gives the reason why some were not compiled "
-        "ahead of time.",
-        "Run `softfinger compile` once. After a warning, remove the cause that the text names.",
+        "Kernels are being compiled. A warning states why some kernels were not compiled ahead "
+        "of time.",
+        "Run `softfinger compile` once. If there is a warning, fix the cause given in the text.",
     ),
     "settings": EventKind(
         "warning",
         "A setting is allowed but probably wrong, for example a sensor smaller than the footprint.",
-        "Correct the keys that the text names; `softfinger config check` repeats the warning.",
+        "Correct the keys named in the text. To see the warning again, run `softfinger config "
+        "check`.",
     ),
-    "calibration": EventKind("info", "A calibration file was loaded; the text summarises it."),
+    "calibration": EventKind(
+        "info", "A calibration file was loaded. The text summarises the calibration."
+    ),
     "material": EventKind(
         "info",
-        "The text states how much the smooth material law deviates from the measured points.",
+        "The material law was fitted to the measured points. The text states its deviation from "
+        "the points.",
         "If the deviation is large, remove outliers or measure more points.",
     ),
     "realtime": EventKind(
         "info, warning",
-        "Real-time measures were granted. The warning names a measure that the system denied.",
-        "Run the command in the text, which grants it, or disable the measure in `[realtime]`.",
+        "Real-time measures were applied. A warning names a measure that the system denied.",
+        "Run the command in the text, which grants the measure, or disable the measure in "
+        "`[realtime]`.",
     ),
     "late": EventKind(
         "warning", "The machine is busy: ticks were late, or a simulated hand was paused.", _BUSY
@@ -62,8 +67,10 @@ KINDS: dict[str, EventKind] = {
     ),
     "clients": EventKind(
         "warning",
-        "The process that serves the clients ended, was stopped, or rejected a client.",
-        "It restarts automatically. If the event recurs, look for a client that floods it.",
+        "The gateway process, which serves the clients, ended, was suspended, or rejected a "
+        "client.",
+        "The process restarts automatically. If the event recurs, look for a client that sends "
+        "too many messages.",
     ),
     "record": EventKind(
         "error", "The recorder of `run --record` ended.", "Check the free disk space."
@@ -71,64 +78,69 @@ KINDS: dict[str, EventKind] = {
     # Commands and grips
     "grasp": EventKind(
         "warning",
-        "No object was grasped, or the hand cannot hold an object of this size, friction and load.",
+        "No object was grasped, or the hand is unlikely to hold an object with this size, "
+        "friction and load.",
         "Place the object between the tips; check `object.width_min` and `softfinger envelope`.",
     ),
     "rotate": EventKind(
         "warning",
-        "A `rotate` that was waiting for the grip was discarded.",
-        "Grasp again, then send `rotate` while the hand holds.",
+        "A `rotate` command that was waiting for the grip was discarded.",
+        "Grasp again, and send `rotate` while the hand holds the object.",
     ),
     "short": EventKind(
         "warning",
-        "A joint stopped before its goal.",
+        "A joint stopped before it reached its goal.",
         "Remove the obstacle; check `control.joint_friction` and `safety.current_move`.",
     ),
     "lost": EventKind(
         "warning",
-        "The object is no longer in contact with both tips; the joints hold their position.",
-        "Release and grasp again, with more force if the object slipped.",
+        "The object is no longer in contact with both tips. The joints hold their positions.",
+        "Release and grasp again. If the object slipped, use more force.",
     ),
     "slip": EventKind(
         "warning",
-        "The object slips or turns, or the grip force was increased or a rotation was ended to "
-        "prevent this.",
+        "The object slips or rotates in the grip. The event also reports that the grip force "
+        "was increased, or a rotation was stopped, to prevent slip.",
         "Grasp with more force; check `control.tip_friction` and `control.object_load`.",
     ),
     "grip.slip": EventKind(
         "warning",
-        "The tangential force is close to the friction limit.",
+        "The shear force at the tips is close to the friction limit.",
         "Grasp with more force, or reduce the load.",
     ),
     "silence": EventKind(
         "warning",
-        "The lease of the client in control expired; `commands.on_silence` was carried out.",
-        "The client must send commands or setpoints at intervals shorter than `commands.lease`.",
+        "The lease of the client in control expired, and the action in `commands.on_silence` "
+        "was carried out.",
+        "Make the client send commands or setpoints at intervals shorter than `commands.lease`.",
     ),
     "task": EventKind(
         "warning",
         "The profile's task ended or restarted; the text states the reason.",
-        "Clear the fault, if any, arm the hand, and restart the daemon or send `demo`.",
+        "Clear any fault, then send `demo`, which arms the hand and restarts the task.",
     ),
     # Servos
     "servos": EventKind(
         "info, warning",
-        "The servos were reconnected. The warning lists the problems found while connecting.",
-        "`softfinger doctor --fix` corrects most problems.",
+        "The servos were reconnected. A warning lists the problems that were found in the process.",
+        "Run `softfinger doctor --fix`, which corrects most problems.",
     ),
     "servos.bus": EventKind(
         "error",
-        "The port was lost, a servo was stopped by its watchdog, or a servo rejects goals.",
+        "The port was lost, a servo was stopped by its watchdog, or a servo rejects its goals.",
         "Check the cable and the adapter, then run `softfinger send clear`.",
     ),
     "servos.silent": EventKind(
         "warning, error",
-        "No valid reading arrived within `servos.fault_after`. The warning, which is also given "
-        "while disarmed, means that most readings of the last second failed.",
-        "Run `softfinger doctor`: it times the servo replies and checks supply and cables.",
+        "No valid reading arrived within `servos.fault_after`. If the level is warning, most "
+        "readings in the last second failed; this is also checked while the hand is disarmed.",
+        "Run `softfinger doctor`, which measures the reply times and checks the supply voltage. "
+        "Check the cables.",
     ),
     "servos.frozen": EventKind(
-        "error", "A servo repeats old readings.", "Switch its supply off and on; check the cable."
+        "error",
+        "A servo repeats old readings.",
+        "Switch the servo supply off and on; check the cable.",
     ),
     "servos.alert": EventKind(
         "error",
@@ -137,12 +149,15 @@ KINDS: dict[str, EventKind] = {
     ),
     "servos.heat": EventKind(
         "warning, error",
-        "A servo will soon reach its temperature limit. The grip force is reduced if the load "
-        "allows this.",
-        "Grasp with less force, or pause. `safety.heat_action` selects the action otherwise.",
+        "A servo will soon reach its temperature limit. The daemon reduces the grip force if "
+        "the load allows it.",
+        "Grasp with less force, or let the servo cool. `safety.heat_action` selects what "
+        "happens if the force can't be reduced.",
     ),
     "servos.temperature": EventKind(
-        "error", "A servo is above `safety.temperature_max`.", "Let it cool; grasp with less force."
+        "error",
+        "A servo is above `safety.temperature_max`.",
+        "Let the servo cool; grasp with less force.",
     ),
     "servos.voltage": EventKind(
         "error",
@@ -161,21 +176,24 @@ KINDS: dict[str, EventKind] = {
     ),
     "torque.off": EventKind(
         "error, info",
-        "The servos have not confirmed torque off. The info reports the later confirmation.",
+        "The servos have not confirmed torque off. A later event of level info reports the "
+        "confirmation.",
         "Switch off the supply, then find out why the servos do not reply.",
     ),
     # Joints
     "joint.angle": EventKind(
         "error",
         "A joint is outside the range from `hand.q_min` to `hand.q_max`.",
-        f"Turn it back by hand. {_CALIBRATE_JOINTS}",
+        f"Turn the joint back by hand. {_CALIBRATE_JOINTS}",
     ),
     "joint.velocity": EventKind(
-        "error", "A joint is too fast.", "Check for an external push; reduce the control gains."
+        "error",
+        "A joint moves too fast.",
+        "Check whether something pushed the finger; otherwise reduce the control gains.",
     ),
     "joint.jump": EventKind(
         "error",
-        "A joint's angle changed more than its velocity allows.",
+        "A joint angle changed faster than its velocity allows.",
         "Check the encoder and the cable of the servo.",
     ),
     "joint.dead": EventKind(
@@ -195,29 +213,30 @@ KINDS: dict[str, EventKind] = {
     ),
     "joint.swapped": EventKind(
         "error",
-        "A joint moves the tip of the other finger, or an object turns opposite to its command.",
+        "A joint moves the tip of the other finger, or the object rotates opposite to its command.",
         f"Swap `servos.ids`, `zero` and `direction`. {_CALIBRATE_JOINTS}",
     ),
     "joint.opens": EventKind(
         "warning",
-        "By the joint angles the tips overlap in an approach, but one of them has no contact.",
+        "According to the joint angles the tips overlap during the approach, but one of them "
+        "has no contact.",
         f"Correct `servos.direction`, or `servos.zero`. {_CALIBRATE_JOINTS}",
     ),
     "joint.blocked": EventKind(
         "warning",
-        "A joint has stopped in the approach at maximum current, and its tip has no contact.",
+        "A joint has stopped at maximum current during the approach, but its tip has no contact.",
         f"Remove the obstacle, or correct `servos.direction`. {_CALIBRATE_JOINTS}",
     ),
     "joint.strained": EventKind(
         "warning",
-        "A grip needs the maximum current.",
+        "A grip requires the maximum current.",
         "Grasp with less force, or raise `safety.current_max`.",
     ),
     # Tips and sensors
     "tip.force": EventKind(
         "warning, error",
         "The force of a tip is close to or above `safety.force_max`.",
-        "Grasp with less force; check the calibration if the force is wrong.",
+        "Grasp with less force. If the measured force is wrong, check the calibration.",
     ),
     "tip.displacement": EventKind(
         "warning, error",
@@ -226,20 +245,21 @@ KINDS: dict[str, EventKind] = {
     ),
     "tip.tilt": EventKind(
         "warning, error",
-        "The tilt is close to or beyond the range of the contact model.",
-        "Turn the object back, or grasp with less force.",
+        "The tip's tilt is close to or beyond the limit of the contact model.",
+        "Rotate the object back, or grasp with less force.",
     ),
     "tactile": EventKind(
         "info, warning",
-        "A sensor was reopened. The warning gives the reason why this failed, or reports a sensor "
-        "size that does not fit the tip, or a problem in a replayed file.",
-        "Check the cable and `tactile.port`, or `tactile.rows`, `cols`, `pitch` and `tip.radius`.",
+        "A sensor was reopened. A warning states why this failed, or reports a sensor size that "
+        "does not match the tip, or a problem in a replayed file.",
+        "Check the cable and `tactile.port`. For a size mismatch, check `tactile.rows`, `cols`, "
+        "`pitch` and `tip.radius`.",
     ),
     "tactile.silent": EventKind(
         "error",
         "No valid frame arrived within `safety.frame_age_fault`.",
-        "The text states the reason, and the noise of the cells if it exceeds `tactile.noise`. "
-        "Check the board and its cable with `softfinger doctor`.",
+        "The text states the reason, and the cell noise if it exceeds `tactile.noise`. Check "
+        "the cable, and check the board with `softfinger doctor`.",
     ),
     "tactile.frozen": EventKind(
         "error",
@@ -255,17 +275,18 @@ KINDS: dict[str, EventKind] = {
     "tactile.misfit": EventKind(
         "warning",
         "The frames of a tip do not match its contact model.",
-        "Find the model with `softfinger calibrate law`; check `tactile.dead` and the noise.",
+        "Identify the contact model with `softfinger calibrate law`; check `tactile.dead` and "
+        "`tactile.noise`.",
     ),
     "tare": EventKind(
         "info, warning",
-        "A tare has ended; the text gives the median and the largest change of the zeros. The "
-        "warning means that the sensor was not tared, because most cells are saturated without "
-        "contact.",
-        "After the warning, check the board's gain and `tactile.full_count`. If the change is "
-        "large at every start, repeat `softfinger calibrate tare`.",
+        "A tare has ended. The text states the median and the largest change of the zero "
+        "offsets. If the level is warning, the sensor was not tared because most cells are "
+        "saturated without contact.",
+        "If the level is warning, check the board's gain and `tactile.full_count`. If the "
+        "change is large at every start, run `softfinger calibrate tare` again.",
     ),
-    # Consistency checks between the hand's parts
+    # consistency checks between components of the hand
     "hand.angle": EventKind(
         "warning, error",
         "The two fingers measure different angles of the object.",
@@ -273,7 +294,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "hand.width": EventKind(
         "error",
-        "The measured width of the held object has changed: a sensor or a joint has shifted.",
+        "The measured width of the held object has changed, which means that a sensor or a "
+        "joint's zero has shifted.",
         f"Fasten it. {_CALIBRATE_JOINTS}",
     ),
     "hand.force": EventKind(
@@ -302,6 +324,6 @@ KINDS: dict[str, EventKind] = {
     "consistency.force": EventKind(
         "error",
         "The commanded force increased, but the measured force did not follow.",
-        f"Remove what blocks the joints. {_CHECK_SENSOR}",
+        f"Remove any obstacle that blocks the joints. {_CHECK_SENSOR}",
     ),
 }

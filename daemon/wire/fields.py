@@ -49,13 +49,16 @@ class FieldSource(Generic[_From]):
         self.get = get
 
     def of(self, get: Callable[[_From], _Within]) -> "FieldSource[_Within]":
-        """Declare a source that is obtained by calling ``get`` on this one."""
+        """Declare a source that is obtained by calling ``get`` on this source."""
         return FieldSource(self, get)
 
     def __call__(
         self, unit: str, meaning: str, get: Callable[[_From], _Value] | None = None
     ) -> _Value:
-        """Declare a field. Without ``get``, its value is the attribute of the same name."""
+        """Declare a field.
+
+        Without ``get``, its value is the source's attribute of the same name.
+        """
         about = {"unit": unit, "meaning": meaning, "source": self, "get": get}
         return cast(_Value, dataclasses.field(metadata=about))
 
@@ -69,7 +72,7 @@ class FieldSource(Generic[_From]):
 
 
 class Member(NamedTuple):
-    """Field of a record, or nested map in it."""
+    """Field of a record, or nested map in a record."""
 
     name: str
     type: Any

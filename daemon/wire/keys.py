@@ -1,8 +1,8 @@
 """Manage CurveZMQ keys for the daemon and its clients: key files and socket options.
 
 The server and every client have their own key pairs. A client needs the server's public key. The
-server needs the public keys of its clients and rejects all others. `make_keys` creates a folder
-with these files:
+server needs the public keys of its clients and rejects all other clients. `make_keys` creates a
+folder with these files:
 
 ``server/server.key_secret``, ``server/server.key``
     the daemon's key pair, and its public key alone
@@ -50,9 +50,9 @@ class ServerKeys:
     clients: dict[bytes, str]  # public key → name
 
     def left(self, folder: Path) -> ServerKeys:
-        """Return the keys without clients whose files were removed. Raises KeyFileError.
+        """Return the keys without those of clients whose files were removed. Raises KeyFileError.
 
-        This method does not open files, so it works even without a free file descriptor.
+        This method does not open files, so it works even if no file descriptor is free.
         """
         clients = _place(folder) / "clients"
         _check_above(clients / "any")
@@ -87,13 +87,13 @@ def check_curve() -> None:
     """Raise KeyFileError if the installed libzmq does not support CURVE."""
     if not zmq.has("curve"):
         raise KeyFileError(
-            f"libzmq {zmq.zmq_version()} was built without CURVE: install one of pyzmq's "
-            "published wheels, or use addresses on this machine only"
+            f"libzmq {zmq.zmq_version()} was built without CURVE: install a published pyzmq "
+            "wheel, or use only addresses on this machine"
         )
 
 
 def make_keys(folder: Path, names: list[str]) -> list[Path]:
-    """Create a key pair for each client, and one for the server if it has none.
+    """Create a key pair for each client, and for the server if it does not have one yet.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     Raises
     ------
     KeyFileError
-        If a file can't be written, or if a client already exists. In the latter case nothing is
+        If a file can't be written, or if a client already exists. In the latter case, no files are
         written.
     """
     check_curve()
@@ -118,10 +118,10 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
             )
         there = [server / "clients" / f"{name}.key", folder / name]
         if any(path.exists() for path in there) or wanted.count(name) > 1:
-            raise KeyFileError(f"{folder}: client {name} already exists; choose another name")
+            raise KeyFileError(f"{folder}: the client {name} already exists; choose another name")
     if not wanted:
         raise KeyFileError(
-            f"{folder}: the server's keys already exist; give names of clients to add"
+            f"{folder}: the server's keys already exist; to add clients, give their names"
         )
     try:
         return _write_keys(folder, server, wanted, new)
@@ -141,7 +141,7 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
             client.mkdir()
             zmq.auth.create_certificates(client, "client")
             shutil.copyfile(server / "server.key", client / "server.key")
-            # This step is last, so that the server accepts only clients with complete keys.
+            # This step comes last, so that the server accepts only clients with complete keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     finally:
         os.umask(before)
@@ -164,7 +164,7 @@ def load_server(folder: Path) -> ServerKeys:
     clients = {_keys(path)[0]: path.stem for path in files}
     if not clients:
         raise KeyFileError(
-            f"{place / 'clients'}: found no client keys; create them with `softfinger keys`"
+            f"{place / 'clients'}: found no client keys; create client keys with `softfinger keys`"
         )
     return ServerKeys(public, secret, clients)
 
@@ -187,14 +187,14 @@ def _place(folder: Path) -> Path:
 
 def _unreadable(path: Path, error: OSError) -> KeyFileError:
     kind = NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
-    return kind(f"{path}: can't be read: {error.strerror}; `softfinger keys` creates key files")
+    return kind(f"{path}: can't be read: {error.strerror}; create key files with `softfinger keys`")
 
 
 def _pair(path: Path) -> tuple[bytes, bytes]:
     _check_above(path)
     public, secret = _keys(path, secret=True)
     if secret is None:
-        raise KeyFileError(f"{path}: contains no secret key")
+        raise KeyFileError(f"{path}: the file does not contain a secret key")
     return public, secret
 
 
@@ -207,7 +207,7 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
                 raise ValueError("a key has the wrong length")
     except OSError as error:
         raise _unreadable(path, error) from None
-    except (ValueError, LookupError, struct.error):  # struct.error: value exceeds the Z85 range
+    except (ValueError, LookupError, struct.error):  # struct.error: a value exceeds the Z85 range
         raise KeyFileError(f"{path}: not a key file") from None
     return keys
 
@@ -216,7 +216,9 @@ def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
     """Raise KeyFileError if another user owns or may write a file, or may read a secret key."""
     mode = stat.S_IMODE(status.st_mode)
     if secret and mode & 0o077:
-        raise KeyFileError(f"{path}: other users may read it ({mode:04o}): chmod 600 {path}")
+        raise KeyFileError(
+            f"{path}: other users can read this file ({mode:04o}); run chmod 600 {path}"
+        )
     if wrong := fault(path, status):
         raise KeyFileError(wrong)
 

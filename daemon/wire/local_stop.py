@@ -25,7 +25,7 @@ from softfinger.kinematics.compiled.own_folder import require_own
 _LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # equivalent to 127.0.0.1 on this machine
 _DATAGRAM_SIZE_MAX = 4096  # bytes
 _SENDER_COUNT_MAX = 16  # senders awaiting a reply
-_DATAGRAMS_PER_TICK = 4  # reads per tick; the system's queue holds only a few more
+_DATAGRAMS_PER_TICK = 4  # reads per tick; the system's queue holds only a few more datagrams
 
 
 class LocalStop:
@@ -88,7 +88,7 @@ class LocalStop:
 def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
     """Stop this user's daemon at the command address ``address``, and return its reply.
 
-    Returns None if this machine has no such daemon or the daemon does not respond.
+    Returns None if no such daemon runs on this machine or if it does not respond.
     """
     try:
         name = _name(address)
@@ -102,7 +102,8 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
             asking.settimeout(seconds)
             try:
-                asking.bind("")  # The system assigns a name, to which the daemon replies.
+                # The system assigns a name to the socket, and the daemon replies to this name.
+                asking.bind("")
                 asking.connect(str(folder / name))
                 asking.send(b"stop")
                 reply = msgpack.unpackb(asking.recv(_DATAGRAM_SIZE_MAX))
@@ -126,7 +127,7 @@ def _name(address: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Yield candidate folders: for a system service, for a login session, and fallbacks."""
+    """Yield candidate folders: those of a system service and of a login session, then fallbacks."""
     for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"):
         if place := os.environ.get(name):
             yield Path(place.split(":")[0]) / "softfinger"
@@ -141,7 +142,7 @@ def _folders() -> Iterator[Path]:
 
 
 def _own_folder() -> tuple[Path, str]:
-    """Return the first usable folder, created if necessary, and a notice about unusable ones.
+    """Return the first usable folder, creating it if necessary, and a notice about unusable ones.
 
     Raises OSError if all candidates are unusable.
     """
@@ -163,7 +164,7 @@ def _own_folder() -> tuple[Path, str]:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Return True if the folder is not a link and only this user owns and can access it."""
+    """Return True if the folder is not a link, and only its owner, this user, can access it."""
     try:
         require_own(folder)
     except OSError:

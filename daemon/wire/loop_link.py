@@ -1,8 +1,9 @@
-"""Connect the loop and the gateway by a socket pair: messages, and the loop's end.
+"""Connect the loop and the gateway by a socket pair; define the messages and the loop's end.
 
 Each message is a msgpack list whose first element is the message kind. Sending never blocks. If the
 socket buffer is full, the remaining bytes are sent later. Until then, stream messages are dropped,
-but replies and stops are queued. The gateway limits the number of pending requests.
+but replies and stops are queued. The gateway limits the number of pending requests, so this queue
+is bounded.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple
 import msgpack
 
 # From the loop
-PUBLISH = "publish"  # topic index, number of messages to repeat later, message
+PUBLISH = "publish"  # topic index, number of messages to keep for late subscribers, message
 REPLY = "reply"  # the request's `Ask.urgent` and `Ask.route`, reply
 FENCE = "fence"  # stop count so far
 
@@ -29,7 +30,7 @@ ASK = "ask"  # the `Ask` fields
 REPORT = "report"  # `Link.wanted`, `Link.refused`, `Link.stops`
 NOTICE = "notice"  # warning text
 
-RESTART_STATUS = 3  # exit status of a gateway that needs a restart and has sent the reason
+RESTART_STATUS = 3  # exit status of a gateway that must be restarted and has reported the reason
 
 _BUFFER_SIZE = 1 << 20  # bytes, requested socket buffer size; the kernel may allow less
 _CHUNK = 1 << 16  # bytes per receive call
@@ -39,7 +40,7 @@ _FIRST, _AGAIN = (msgpack.packb("again") + msgpack.packb(again) for again in (Fa
 
 
 class Ask(NamedTuple):
-    """A client's request that is within all limits but has not been unpacked yet.
+    """A client's request that satisfies all limits but has not been unpacked yet.
 
     ``came`` is the arrival time according to `machine_time`. ``stops`` is the number of stops that
     certainly arrived before the request. An ``urgent`` request looks like a stop. ``name`` is the
@@ -126,15 +127,16 @@ class Link:
 
     def __init__(self) -> None:
         self.wanted = 0  # bit mask of topics with subscribers
-        self.refused = 0  # requests refused by the gateway's rate and queue limits
+        self.refused = 0  # number of requests refused by the gateway's rate and queue limits
         self.stops = 0  # stop count with which the gateway stamps new requests
         self.asked: deque[Ask] = deque()  # received requests, urgent ones first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # queued for a later tick
         self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # gateway warnings
-        self.called = False  # True if the `watch` descriptor is readable
-        self._other = -1  # the `watch` descriptor
+        self.called = False  # True if the descriptor passed to `watch` is readable
+        self._other = -1  # the descriptor passed to `watch`
         self._fence = 0
-        self._kept: dict[int, deque[bytes]] = {}  # by topic, repeated to a restarted gateway
+        # each topic's last messages, for a restarted gateway
+        self._kept: dict[int, deque[bytes]] = {}
         self._channel: Channel | None = None
         self._offered: Channel | None = None
         self._poll = select.poll()
@@ -149,8 +151,9 @@ class Link:
         self._poll.register(descriptor, select.POLLIN)
 
     def look(self) -> None:
-        """Read the gateway's messages; this takes less than a microsecond if none have arrived."""
-        # The supervisor read the first message, and its receive call may have buffered others.
+        """Read the gateway's messages; this takes less than 1 µs if no message has arrived."""
+        # The supervisor read the first message, and its receive call may have buffered further
+        # messages.
         has_more = self._offered is not None
         if self._offered is not None:
             self._adopt(self._offered)
@@ -172,16 +175,19 @@ class Link:
             self._disconnect()
 
     def wait(self, seconds: float) -> None:
-        """Wait up to ``seconds`` for a message, then call `look`. Not for use within a tick."""
+        """Wait up to ``seconds`` for a message, then call `look`.
+
+        Do not call this method within a tick.
+        """
         self.look()
         channels = [] if self._channel is None else [self._channel]
         select.select(channels, [], [], seconds)
         self.look()
 
     def wait_for_room(self, seconds: float) -> None:
-        """Wait until all bytes have been sent. Not for use within a tick.
+        """Wait until all bytes have been sent. Do not call this method within a tick.
 
-        Give up if the gateway reads nothing for ``seconds``.
+        Give up if the gateway does not read any bytes for ``seconds``.
         """
         self.look()
         if (channel := self._channel) is not None:
@@ -189,7 +195,7 @@ class Link:
                 pass
 
     def _adopt(self, channel: Channel) -> None:
-        """Switch to a new gateway's channel; send the last fence and the stored messages."""
+        """Switch to a new gateway's channel; send the last stop count and the stored messages."""
         self._disconnect()
         self._offered, self._channel = None, channel
         self._poll.register(channel, select.POLLIN)

@@ -1,11 +1,11 @@
 """Pack stream messages according to the schema and send them to the gateway.
 
-Integers use the smallest msgpack form, so that JavaScript clients receive numbers wherever
+Integers use the shortest msgpack format, so that JavaScript clients receive plain numbers wherever
 possible. Floats always take 64 bits.
 
-The gateway serves the subscribers, so slow or dead subscribers do not affect the loop. The gateway
-repeats the settings and the last events to late subscribers, with ``again`` set. Messages of topics
-without subscribers are not packed.
+The gateway serves the subscribers, so slow or disconnected subscribers do not affect the loop. The
+gateway repeats the settings and the last events to late subscribers, with ``again`` set. Messages
+of topics without subscribers are not packed.
 """
 
 from __future__ import annotations
@@ -101,11 +101,11 @@ class Publisher:
         return self._link.wanted
 
     def look(self) -> None:
-        """Read the gateway's messages, as the loop does when it reads commands."""
+        """Read the gateway's messages; the loop does the same when it reads commands."""
         self._link.look()
 
     def send(self, topic: bytes, *arguments: object) -> None:
-        """Publish a message built from the topic's source arguments, declared in `wire.schema`."""
+        """Publish a message; ``arguments`` are those of the topic's source in `wire.schema`."""
         self._link.publish(_INDEX[topic], self._pack[topic](*arguments))
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Short texts and small pictures of the stream's records, for prompts and notebooks."""
+"""Format the stream's records as short texts and small pictures, for prompts and notebooks."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from softfinger.kinematics.estimation.invalid import Invalid
 if TYPE_CHECKING:
     from softfinger.daemon.wire.schema import FingerState, HandState, ObjectState, TactileFrame
 
-_COLOUR = "#0a8078"  # readable on light and dark pages
-_SHADES = 12  # shades of a picture; more make its text longer, but are not seen
+_COLOUR = "#0a8078"  # readable on light and on dark pages
+# number of shades in a picture; more shades lengthen the SVG without a visible difference
+_SHADES = 12
 _SIDE = 176  # longer side of a picture [px]
-_FULL = 10e3  # Pa, smallest full scale of a picture; noise on a free tip stays faint
+# Pa, minimum full scale of a picture, so that the noise of an unloaded tip stays faint
+_FULL = 10e3
 
 
 def state_parts(state: HandState) -> list[str]:
-    """Return mode, mean tip force, the object's angle and width, or the mode and its fault."""
+    """Return mode, tip forces, and object angle and width; in a fault, return mode and fault."""
     if state.fault:
         return [state.mode, state.fault]
     parts = [state.mode]
@@ -39,7 +41,7 @@ def state_parts(state: HandState) -> list[str]:
 
 
 def why_invalid(state: HandState) -> str:
-    """Return the reason why the fingers' estimates are invalid; empty if they are valid."""
+    """Return the reasons why the fingers' estimates are invalid; empty if they are valid."""
     reasons = {name: state.finger(name).invalid for name in FINGERS}
     return "; ".join(
         f"{name} not valid: {reason}"
@@ -67,7 +69,7 @@ def object_text(pose: ObjectState) -> str:
 
 def frame_text(frame: TactileFrame) -> str:
     """Return the finger, the size of the grid and the largest pressure."""
-    lost = "" if frame.valid else ", the board is lost"
+    lost = "" if frame.valid else ", the board is disconnected"
     highest = 1e-3 * frame.pressure.max()
     return f"{frame.finger}, {frame.rows} × {frame.cols} cells, {highest:.1f} kPa at most{lost}"
 
@@ -85,7 +87,7 @@ def _tilt(finger: FingerState) -> str:
 
 
 def state_html(state: HandState) -> str:
-    """Return a table of both fingers below the state in one line, in HTML."""
+    """Return an HTML table of both fingers, with a one-line summary of the state as its caption."""
     rows: dict[str, Callable[[FingerState], str]] = {
         "force [N]": lambda finger: _force(finger) if finger.contact else "",
         "d [mm]": lambda finger: _depth(finger) if finger.contact else "",
@@ -106,9 +108,9 @@ def state_html(state: HandState) -> str:
 
 
 def frame_html(frame: TactileFrame) -> str:
-    """Return the pressures as an SVG picture above the frame's text; row 0 is at the bottom."""
+    """Return an SVG picture of the pressures, with row 0 at the bottom, above the frame's text."""
     aspect = frame.rows * frame.pitch_y / (frame.cols * frame.pitch or math.nan)
-    if not 0.01 < aspect < 100.0:  # the stream is not trusted
+    if not 0.01 < aspect < 100.0:  # the values may be invalid, because the stream is not trusted
         aspect = frame.rows / frame.cols
     width, height = min(1.0, 1.0 / aspect) * _SIDE, min(1.0, aspect) * _SIDE
     paths = "".join(
@@ -124,7 +126,7 @@ def frame_html(frame: TactileFrame) -> str:
 
 
 def _outlines(pressure: NDArray[np.float64]) -> Iterator[tuple[int, str]]:
-    """Yield each shade in a frame with the SVG path of its cells, which joins those of a row."""
+    """Yield each shade in a frame with an SVG path of its cells, merged within each row."""
     full = max(pressure.max(), _FULL)
     levels = np.rint(np.nan_to_num(pressure / full) * _SHADES).astype(int)[::-1]
     for level in range(1, _SHADES + 1):

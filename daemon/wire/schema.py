@@ -1,11 +1,11 @@
-"""Define the stream schema: the single declaration of all topics and fields.
+"""Define the stream schema, the only declaration of all topics and fields.
 
-Each topic is a record. Each field has a unit, a meaning and a source. Its value is a function of
-the source or the source's attribute of the same name. The packers (`wire.publisher`), the records
-that clients read (`client.stream`), the ``STREAM.md`` page and the JSON Schemas of recordings
-(`wire.schema_docs`) are derived from these declarations.
+Each topic is a record. Each field has a unit, a meaning and a source. The value of a field is
+either a function of the source or the source's attribute of the same name. The packers
+(`wire.publisher`), the records that clients read (`client.stream`), the ``STREAM.md`` page and the
+JSON Schemas of recordings (`wire.schema_docs`) are derived from these declarations.
 
-New versions may add fields but never remove any. A float is always sent as a float. Values are in
+New versions may add fields but never remove them. A float is always sent as a float. Values are in
 SI units.
 """
 
@@ -76,11 +76,11 @@ TRUTH = b"hand/truth"
 NO_FRAME = Frame(0, t_sample=0.0, t_arrival=0.0, valid=False, data=np.zeros((0, 0), np.uint16))
 
 # Common first fields of several topics.
-_SCHEMA = "", "number of this schema; it changes only if the meaning of a field changes"
+_SCHEMA = "", "schema version; changes only if the meaning of a field changes"
 _SEQ = "", "sequence number of the tick, frame or event"
-_STEP = "", "decimation: every n-th message is sent"
+_STEP = "", "decimation factor n: every n-th message is sent"
 _UNIX = "s", "Unix time"
-_MONO = "ns", "time of the tick in the daemon's monotonic clock"
+_MONO = "ns", "time of the tick on the daemon's monotonic clock"
 _TEMPERATURE = "°C", "temperature of the servo, 0 if unknown"
 _VOLTAGE = "V", "supply voltage of the servo, 0 if unknown"
 
@@ -89,7 +89,7 @@ def _ns(t: float) -> int:
     return int(t * 1e9)
 
 
-# Fields shared by several sources are declared for only one of them.
+# Fields that several sources share are declared for only one of them.
 _tick = FieldSource["StateSource"]()
 _state = _tick.of(lambda m: m.state)
 _timing = _state.of(lambda s: s.timing)
@@ -115,7 +115,7 @@ class _Announcement:
     seq: int = _news(*_SEQ)
     again: bool = _news(
         "",
-        "true if repeated for a new subscriber, with the original seq and times",
+        "true if the message is repeated for a new subscriber, with the original seq and times",
         lambda _: False,
     )
     timestamp: float = _news(*_UNIX, lambda m: m.wall)
@@ -201,36 +201,44 @@ class FingerState:
         "N", "shear force of a solid tip normal to the hand's plane; 0 with springs"
     )
     gain: float = _contact("", "ratio of measured to modelled pressure")
-    modulus_scale: float = _contact("", "tip modulus divided by its setting, estimated in grips")
+    modulus_scale: float = _contact(
+        "", "tip modulus divided by its setting, as estimated during grips"
+    )
     modulus_scale_std: float = _contact("", "standard deviation of modulus_scale")
-    sensor_gain: float = _contact("", "sensor gain: gain divided by modulus_scale")
+    sensor_gain: float = _contact("", "gain of the sensor, equal to gain divided by modulus_scale")
     sensor_gain_std: float = _contact("", "standard deviation of sensor_gain")
     torque_scale: float = _contact(
-        "", "setting of the joint's torque constant divided by the estimated constant"
+        "", "configured torque constant of the joint divided by the estimated torque constant"
     )
     torque_scale_std: float = _contact("", "standard deviation of torque_scale")
     nis_angle: float = _contact(
-        "", "consistency of the angle channel: mean normalised innovation squared, expected 1"
+        "",
+        "consistency of the angle channel: mean normalised innovation squared, which should be 1",
     )
     nis_footprint: float = _contact("", "consistency of the footprint channel (d)")
     nis_amplitude: float = _contact("", "consistency of the amplitude channel (pressure)")
     misfit: bool = _contact(
-        "", "the frame does not fit the contact model; d and theta may be biased"
+        "", "the frame does not match the contact model; d and theta may be biased"
     )
     contact: bool = _contact("", "the tip is in contact")
     frame_seq: int = _contact(
         "", "sequence number of the estimated tactile frame, 0 before the first", lambda c: c.seq
     )
-    frame_age_s: float = _finger("s", "time since this frame was sampled", _frame_age)
+    frame_age_s: float = _finger("s", "time since this frame was scanned", _frame_age)
     invalid: str = _finger(
         "", "reason why the finger is not valid, or empty", lambda f: _invalid(f).text
     )
     winding: float = _heat("°C", "temperature of the motor winding, from the thermal model")
     winding_std: float = _heat("°C", "standard deviation of winding")
-    case: float = _heat("°C", "temperature of the case, from the thermal model, not quantised")
+    case: float = _heat(
+        "°C",
+        "temperature of the case, from the thermal model, without quantisation",
+    )
     case_std: float = _heat("°C", "standard deviation of case")
     time_to_limit: float = _heat(
-        "s", "time until safety.temperature_max at the present current; 3600 means one hour or more"
+        "s",
+        "time until safety.temperature_max is reached at the current motor current; 3600 "
+        "means at least one hour",
     )
 
     def __repr__(self) -> str:
@@ -244,14 +252,17 @@ class ObjectState:
     valid: bool = _pose("", "both contacts are valid and determine the pose")
     angle: float = _pose(
         "rad",
-        "object angle in the hand's frame: angle of the bisector of the faces, or of the line "
-        "between the contacts of a disc",
+        "object angle in the hand's frame: angle of the bisector between the faces, or of the "
+        "line between the two contacts of a disc",
     )
     width: float = _pose("m", "width of the object between the tips")
     nis_torque: float = _pose(
-        "", "consistency of the torque channel: mean normalised innovation squared, expected 1"
+        "",
+        "consistency of the torque channel: mean normalised innovation squared, which should be 1",
     )
-    nis_balance: float = _pose("", "consistency of the balance channel (forces of both tips)")
+    nis_balance: float = _pose(
+        "", "consistency of the balance channel (difference between the forces of both tips)"
+    )
 
     def __repr__(self) -> str:
         return f"ObjectState: {record_text.object_text(self)}"
@@ -270,20 +281,22 @@ class HandState(_TickMessage):
     fault: str = _state("", "text of the latched fault, or empty")
     fault_name: str = _state("", "name of the fault in `softfinger.daemon.safety.limits`, or empty")
     torque: bool = _state("", "torque is on, or torque off is not confirmed")
-    tick_s: float = _timing("s", "time between the starts of the last tick and this one")
+    tick_s: float = _timing("s", "time from the start of the last tick to the start of this one")
     compute_s: float = _timing("s", "computing time of the last tick")
     wake_late_s: float = _timing("s", "delay of the start of this tick after its deadline")
     overruns: int = _timing("", "number of ticks that took longer than the period")
     behind_s: float = _timing(
-        "s", "total time for which a hand simulated in the daemon has paused on a busy machine"
+        "s",
+        "total time by which the simulation in the daemon has paused because the machine was busy",
     )
     goal_force: float = _goal(
         "N",
-        "target of the mean tip force, including an increase against slip; NaN without a grip",
+        "target of the mean tip force, including any increase that counteracts slip; NaN "
+        "without a grip",
         lambda g: g.force,
     )
     goal_angle: float = _goal(
-        "rad", "target of the object angle; NaN unless the object is steered", lambda g: g.angle
+        "rad", "target of the object angle; NaN unless the angle is controlled", lambda g: g.angle
     )
     left: FingerState = _tick.part("left finger: ", lambda m: _Finger(m.state, m.scene, 0))
     right: FingerState = _tick.part("right finger: ", lambda m: _Finger(m.state, m.scene, 1))
@@ -326,20 +339,22 @@ _info = _tactile.of(lambda m: m.info)
 )
 @record
 class TactileFrame:
-    """One ``hand/tactile`` message. Raises ValueError if its data is not a rows × cols grid."""
+    """One ``hand/tactile`` message. Raises ValueError if the data is not a rows × cols grid."""
 
     schema: int = _tactile(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _frame(*_SEQ)
     seq_step: int = _tactile(*_STEP, lambda m: m.step)
-    number: int = _tactile("", "number of this message of the sensor; a gap means lost messages")
+    number: int = _tactile(
+        "", "sequence number of this sensor's messages; a gap means that messages were lost"
+    )
     timestamp: float = _tactile(*_UNIX, lambda m: m.wall)
     mono_ns: int = _frame(
-        "ns", "time of the board's scan in the daemon's clock", lambda f: _ns(f.t_sample)
+        "ns", "time of the board's scan on the daemon's clock", lambda f: _ns(f.t_sample)
     )
     delay_s: float = _frame(
         "s", "time from the scan to the arrival of the frame", lambda f: f.t_arrival - f.t_sample
     )
-    valid: bool = _frame("", "false if the board is lost and this is its last frame")
+    valid: bool = _frame("", "false if the board was disconnected after this frame")
     finger: str = _tactile("", "left or right", lambda m: FINGERS[m.finger])
     rows: int = _tactile("", "number of cells along y", lambda m: m.data.shape[0])
     cols: int = _tactile("", "number of cells along x", lambda m: m.data.shape[1])
@@ -347,9 +362,9 @@ class TactileFrame:
     pitch_y: float = _info("m", "distance between the rows")
     centre_x: float = _info("m", "x offset of the tip's centre from the grid's centre")
     centre_y: float = _info("m", "y offset of the tip's centre from the grid's centre")
-    rotation: float = _info("rad", "rotation of the sensor's axes relative to the finger's")
+    rotation: float = _info("rad", "rotation of the sensor's axes relative to the finger's axes")
     unit: str = _info("", "`count`: as sent by the board; `Pa`: as used by the estimator")
-    scale: float = _info("Pa", "pressure per step of the data, exact for linear sensors")
+    scale: float = _info("Pa", "pressure per count in data; exact for linear sensors")
     calibrated: bool = _info("", "data × scale is the calibrated pressure")
     calibration: str = _info("", "name and date of the calibration, or empty")
     data: bytes = _tactile(
@@ -373,7 +388,7 @@ class TactileFrame:
 
     @property
     def counts(self) -> NDArray[np.uint16]:
-        """The data, uint16 [rows, cols], read-only."""
+        """The frame's data, uint16 [rows, cols], read-only."""
         return np.frombuffer(self.data, dtype="<u2").reshape(self.rows, self.cols)
 
     @property
@@ -398,7 +413,7 @@ _event = FieldSource[EventSource]()
 
 @topic(
     EVENT,
-    "Events: mode changes, faults, warnings. New subscribers receive the last 50 again.",
+    "Events: mode changes, faults and warnings. New subscribers first receive the last 50 events.",
     EventSource,
 )
 @record
@@ -466,7 +481,7 @@ class LoopStatistics(_TickMessage):
     compute: Spread = _stats.part("total time of a tick: ", lambda m: m.spreads["compute"])
     bus: Spread = _stats.part("reading and writing the servos: ", lambda m: m.spreads["bus"])
     publish: Spread = _stats.part("publishing: ", lambda m: m.spreads["publish"])
-    rates: Rates = _stats.part("over the last second: ", lambda m: m.rates)
+    rates: Rates = _stats.part("in the last second: ", lambda m: m.rates)
 
 
 class SettingsSource(NamedTuple):
@@ -483,7 +498,7 @@ _hand_info = FieldSource[SettingsSource]().of(lambda m: m.info)
 
 @topic(
     SETTINGS,
-    "Description of this hand, sent once, and again to each new subscriber.",
+    "Description of this hand, sent at startup and to each new subscriber.",
     SettingsSource,
 )
 @record
@@ -495,7 +510,7 @@ class HandSettings(_Announcement):
     calibration_left: str = _hand_info("", "calibration of the left sensor as JSON, or empty")
     calibration_right: str = _hand_info("", "calibration of the right sensor as JSON, or empty")
     table_left: str = _hand_info(
-        "", "contact table of the left tip: form, tolerance, certificate (bound on the error)"
+        "", "contact table of the left tip: form, tolerance and certificate (error bound)"
     )
     table_right: str = _hand_info("", "contact table of the right tip")
 
@@ -514,12 +529,14 @@ class CommandSource(NamedTuple):
 _command = FieldSource[CommandSource]()
 
 
-@topic(COMMAND, "Each command that was answered, from any client, except `status`.", CommandSource)
+@topic(
+    COMMAND, "Every command from any client that received a reply, except `status`.", CommandSource
+)
 @record
 class AnsweredCommand(_Announcement):
     """One ``hand/command`` message."""
 
-    tick: int = _command("", "seq of the tick that answered the command")
+    tick: int = _command("", "seq of the tick that replied to the command")
     command: str = _command("", "name of the command", lambda m: str(m.request.get("command", "")))
     client: str = _command(
         "", "name of the client, or empty", lambda m: str(m.request.get("client", ""))
@@ -563,7 +580,7 @@ class InputReading:
     t: float = _reading("s", "time of the last valid reading, −∞ before the first")
     valid: bool = _reading("", "the reading of this tick is valid")
     alert: int = _reading("", "bit i: the servo of finger i reports a hardware error")
-    error: str = _read("", "error of the bus, or empty", lambda s: s.read_error)
+    error: str = _read("", "bus error, or empty", lambda s: s.read_error)
     lost: int = _reading("", "bit i: the servo of finger i has not received the last goals")
     frozen: int = _reading("", "bit i: the servo of finger i repeats old readings")
 
@@ -583,16 +600,14 @@ class InputFinger:
     frame_seq: int = _newest(
         "", "sequence number of the newest tactile frame, 0 before the first", lambda f: f.seq
     )
-    frame_t: float = _newest("s", "time of its scan in the daemon's clock", lambda f: f.t_sample)
-    frame_arrival: float = _newest(
-        "s", "time of the arrival of its last byte", lambda f: f.t_arrival
-    )
-    frame_valid: bool = _newest("", "false if the board is lost", lambda f: f.valid)
+    frame_t: float = _newest("s", "time of its scan on the daemon's clock", lambda f: f.t_sample)
+    frame_arrival: float = _newest("s", "arrival time of its last byte", lambda f: f.t_arrival)
+    frame_valid: bool = _newest("", "false if the board is disconnected", lambda f: f.valid)
 
 
 @topic(
     INPUT,
-    "All inputs of each tick; `replay --recompute` computes the tick from them again.",
+    "All inputs of each tick, from which `replay --recompute` recomputes the tick.",
     InputSource,
 )
 @record
@@ -603,13 +618,13 @@ class TickInput:
     seq: int = _state(*_SEQ)
     timestamp: float = _state(*_UNIX, lambda s: s.wall)
     mono_ns: int = _state(*_MONO, lambda s: _ns(s.t))
-    t: float = _state("s", "time of the tick in full precision")
+    t: float = _state("s", "time of the tick with full precision")
     late_in_row: int = _timing("", "number of consecutive overruns")
-    busy_s: float = _timing("s", "duration of a recent delay of the loop on a busy machine")
+    busy_s: float = _timing("s", "duration of a recent loop delay caused by a busy machine")
     reading: InputReading = _input.part("", lambda m: m.state)
     left: InputFinger = _input.part("left finger: ", lambda m: _input_finger(m, 0))
     right: InputFinger = _input.part("right finger: ", lambda m: _input_finger(m, 1))
-    write_error: str = _state("", "error of the bus during the write, or empty")
+    write_error: str = _state("", "bus error during the write, or empty")
     torque_off: bool = _state("", "the servos confirmed torque off in this tick")
 
 

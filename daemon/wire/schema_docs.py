@@ -23,20 +23,21 @@ _INTRODUCTION = f"""\
 # The stream
 
 To read the hand's state in any language, subscribe to the daemon's ZeroMQ socket
-(`stream.address`) and unpack each message with msgpack. In Python, `softfinger.Hand` does this for
-you. This page lists all messages and their fields. It is generated from `daemon/wire/schema.py` by
-`python -m softfinger.daemon.wire.schema_docs`.
+(`stream.address`) and unpack each message with msgpack. In Python, the class `softfinger.Hand`
+subscribes and unpacks. This page lists all messages and their fields. It is generated from
+`daemon/wire/schema.py` by `python -m softfinger.daemon.wire.schema_docs`.
 
 Each message has two frames: the topic, and a msgpack map whose keys are strings. Values are in SI
-units. The field `left.q` is the entry `q` of the map `left`. A message always contains all fields.
-This is schema {SCHEMA}. New versions may add fields, but never remove a field or change its type.
-A float is always sent as a float. An integer is sent in the smallest msgpack form, so JavaScript
-reads integers below 2³² as numbers and may read `mono_ns` as a BigInt.
+units. `left.q` means the entry `q` in the map that is stored under the key `left`. A message always
+contains all fields. This page describes schema {SCHEMA}. New versions may add fields, but never
+remove a field or change its type. A float is always sent as a float. An integer is sent in the
+smallest msgpack format. JavaScript therefore reads integers below 2³² as numbers, and may read
+`mono_ns` as a BigInt.
 
 A subscriber that needs only the newest state can use `ZMQ_CONFLATE`. This option does not support
-messages with two frames. Therefore set `stream.latest = "tcp://127.0.0.1:9874"` in the profile. The
-daemon then also publishes each `hand/state` at that address, as a single frame that contains the
-map. Subscribe to all messages there:
+messages with two frames. For such subscribers, set `stream.latest = "tcp://127.0.0.1:9874"` in the
+profile. The daemon then also publishes each `hand/state` at this address, as a single frame that
+contains only the map. Subscribe to all messages at this address:
 
 ```python
 newest = zmq.Context.instance().socket(zmq.SUB)
@@ -46,10 +47,10 @@ newest.connect("tcp://127.0.0.1:9874")
 state = msgpack.unpackb(newest.recv())
 ```
 
-`timestamp` is Unix time. For time differences use `mono_ns`, the daemon's clock, which is normally
-the machine's monotonic clock. If the hand is simulated in the daemon, this clock pauses while the
-machine is too busy to keep up (`loop.clock`, `behind_s`). Durations (`tick_s`, `compute_s`,
-`hand/stats`) are always measured in the machine's time.
+`timestamp` is Unix time. To compute time differences, use `mono_ns`, the time of the daemon's
+clock. This clock is normally the machine's monotonic clock. If the hand is simulated in the daemon,
+the daemon's clock pauses while the machine is too busy to keep up (`loop.clock`, `behind_s`).
+Durations (`tick_s`, `compute_s`, `hand/stats`) are always measured with the machine's clock.
 """
 
 
@@ -68,27 +69,28 @@ _KEYS = """\
 
 Send commands from a REQ socket, with or without `REQ_CORRELATE`, or from a DEALER socket. As with a
 REP socket, the reply begins with all frames of the request up to and including the first empty
-frame. A DEALER socket may omit the empty frame; the reply then omits it too. A command that spans
-several frames is rejected with the reason `request`. So is an envelope of more than 14 frames or
-1,024 bytes.
+frame. A DEALER socket may omit the empty frame; the reply then omits the empty frame as well. The
+daemon rejects commands that span several frames, and envelopes of more than 14 frames or 1,024
+bytes. The reason in the reply is then `request`.
 
 **Late commands.** If the daemon stalls, commands wait longer than their clients expect. The daemon
-therefore rejects `arm`, and all commands that move the hand or change its grip, as `late` if they
-are older than 0.2 s (or than `servos.watchdog`, if that is shorter). `disarm`, `tare`, `clear`, and
-`hold` during a grip are accepted up to an age of 1 s. `status` and `stop` are always accepted.
+therefore rejects outdated commands as `late`. `arm` and all commands that move the hand or change
+its grip are rejected if they are older than 0.2 s (or than `servos.watchdog`, if that is shorter).
+`disarm`, `tare`, `clear`, and `hold` during a grip are accepted up to an age of 1 s. `status` and
+`stop` are always accepted.
 
-**Repeated commands.** To repeat a late command safely, add a `key`: a unique string of 1 to 64
-characters, for example a random number. Then send the same map again. The daemon carries out the
-command at most once, and answers each repetition with the first reply. If the hand was stopped
-after the first rejection, the repetition is rejected as `stopped`. If another command has been
-carried out since then, it is rejected as `superseded`. `disarm` needs no key, because it may be
-carried out repeatedly. `Hand`, `AsyncHand`, `softfinger send`, `monitor` and `view` repeat late
-commands automatically.
+**Repeated commands.** To be able to repeat a late command safely, add a `key` to the command: a
+unique string of 1 to 64 characters, for example a random number. To repeat the command, send the
+same map again. The daemon carries out the command at most once, and sends the reply of the executed
+command again for each further repetition. If the hand was stopped after the first rejection, the
+repetition is rejected as `stopped`. If another command was carried out after the first rejection,
+the repetition is rejected as `superseded`. `disarm` needs no key, because repeating it is harmless.
+`Hand`, `AsyncHand`, `softfinger send`, `monitor` and `view` repeat late commands automatically.
 """
 
 
 def json_schema(topic: bytes) -> dict[str, Any]:
-    """Return the JSON Schema of a topic's map, with bytes as base64, NaN and infinity as null."""
+    """Return the JSON Schema of a topic's map: bytes are base64, NaN and infinity are null."""
     schema: dict[str, Any] = {
         "title": topic.decode(),
         "description": TOPICS[topic].summary,

@@ -40,19 +40,20 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD_RESPONSE = 0.2  # fraction of the median response, below which a cell is dead
+DEAD_RESPONSE = 0.2  # fraction of the median response below which a cell is considered dead
 _EXPONENTS = (0.3, 3.0)
-_UNREST_SIGMA = 8.0  # multiple of the median noise, above which a cell is unsteady
-_UNREST_CELL_COUNT = 4  # unsteady cells at which the tare fails; fewer cells may be faulty
-_TILT_MIN = math.radians(3.0)  # minimum tilt range that determines the rotation
+_UNREST_SIGMA = 8.0  # multiple of the median noise above which a cell is unsteady
+# Minimum number of unsteady cells for a failed tare; fewer cells may be faulty.
+_UNREST_CELL_COUNT = 4
+_TILT_MIN = math.radians(3.0)  # minimum tilt range from which the rotation can be determined
 _UPRIGHT_ERROR = math.radians(0.5)
-_PRESSED_SIGMA = 6.0  # multiple of the noise that the largest reading of a contact must exceed
+_PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, relative to the noise
 _LAG_MAX = 8  # cells, maximum lag of the noise correlation
-_SIGNIFICANT_SIGMA = 4.0  # standard errors of a significant result
-# Noise standard deviations; a zero offset below this is affected by clipping at 0.
+_SIGNIFICANT_SIGMA = 4.0  # standard errors above which a result is significant
+# Clipping at 0 affects zero offsets below this number of noise standard deviations.
 _CLIPPED_SIGMA = 4.0
 _HOLD_RATIO_MIN = 2.0  # minimum hold time, relative to the longest time constant
-_ITERATIONS = 25  # alternating iterations for the strengths and the press
+_ITERATIONS = 25  # number of iterations that alternate between the strengths and the press
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -64,10 +65,10 @@ class Tare:
     """Result of `tare`: zero offset and noise of the cells.
 
     ``zero`` and ``noise`` are the mean and the standard deviation of the unloaded counts, both
-    float64 [rows, cols]. ``correlation`` [k, m] is the noise correlation of two cells by their
-    distance in rows and columns; it is empty if it is not significant. ``drift`` [counts] is the
-    standard deviation of the motion common to all cells. ``excess`` [counts] is the mean of
-    max(reading − zero, 0).
+    float64 [rows, cols]. ``correlation`` [k, m] is the noise correlation of two cells that are k
+    rows and m columns apart; the array is empty if the correlation is not significant. ``drift``
+    [counts] is the standard deviation of the drift common to all cells. ``excess`` [counts] is the
+    mean of max(reading − zero, 0).
     """
 
     zero: FloatArray
@@ -80,7 +81,7 @@ class Tare:
 def tare(frames: ArrayLike) -> Tare:
     """Determine the zero offset and noise of each cell from unloaded frames [n, rows, cols].
 
-    Raises CalibrationError if several cells vary much more than the others, which indicates a
+    Raises CalibrationError if several cells vary much more than other cells, which indicates a
     contact.
     """
     stack = _stack(frames, "tare")
@@ -90,7 +91,8 @@ def tare(frames: ArrayLike) -> Tare:
     restless = np.count_nonzero(noise > _UNREST_SIGMA * max(float(np.median(noise)), 0.5))
     if restless >= _UNREST_CELL_COUNT:
         raise CalibrationError(
-            f"tare: the readings of {restless} cells change; is the tip in contact?"
+            f"tare: found changing readings in {restless} cells, expected constant readings; "
+            "check that the tip is not in contact"
         )
     zero = stack.mean(axis=0)
     excess = float(np.maximum(stack - zero, 0.0).mean())
@@ -114,7 +116,7 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     shape = rows + _LAG_MAX, cols + _LAG_MAX
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
-    # Average over both signs of one lag, and therefore over both diagonal directions.
+    # Average the correlation over both signs of one lag, i.e. over both diagonal directions.
     both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAG_MAX, :_LAG_MAX]
     pairs = (n - 1.0) * np.outer(rows - np.arange(_LAG_MAX), cols - np.arange(_LAG_MAX))
     if rows < _LAG_MAX or cols < _LAG_MAX or not both[0, 0] > 0.0:
@@ -154,16 +156,18 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     if the frames show no pressure.
     """
     if not loads:
-        raise CalibrationError("equilibrate: expected at least one uniform pressure")
+        raise CalibrationError("equilibrate: found no uniform pressure, expected at least one")
     readings = np.stack([_stack(load, "equilibrate").mean(axis=0) - zero for load in loads])
     response = readings.sum(axis=0)
     typical = float(np.median(response))
     if not typical > 0.0:
-        raise CalibrationError("equilibrate: most cells read no pressure above their zero")
+        raise CalibrationError("equilibrate: most cells read no pressure above their zero offset")
     active = response > DEAD_RESPONSE * typical
     target = np.array([reading[active].mean() for reading in readings])
     if (target <= 0.0).any():
-        raise CalibrationError("equilibrate: one of the pressures reads nothing above the zero")
+        raise CalibrationError(
+            "equilibrate: one of the pressures gives no reading above the zero offset"
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = np.tensordot(target, readings, 1) / (readings**2).sum(axis=0)
     gain = np.where(active, gain, 0.0)
@@ -192,8 +196,8 @@ def fit_curve(
 ) -> SensorCurve:
     """Fit the pressure curve of the cells to known forces.
 
-    The sum of pressure times cell area over all cells is fitted to the forces. The fit minimises
-    the squared relative errors.
+    The pressure times the cell area, summed over all cells, is fitted to the forces. The fit
+    minimises the squared relative errors.
 
     Parameters
     ----------
@@ -207,7 +211,7 @@ def fit_curve(
     area
         Cell area [m²].
     full
-        Maximum possible x. A cubic curve must increase up to this value.
+        Maximum possible value of the reading x. A cubic curve must be increasing up to this value.
 
     Raises
     ------
@@ -218,12 +222,12 @@ def fit_curve(
     x = x.reshape(len(x), -1)
     known = np.asarray(force, np.float64)
     if known.shape != (len(x),) or not (np.isfinite(known).all() and (known > 0.0).all()):
-        raise CalibrationError("curve: each load needs a force above 0")
+        raise CalibrationError("curve: expected a force above 0 for each load")
     need = 2 if kind == "power" else 3
     if len(np.unique(known)) < need:
-        raise CalibrationError(f"curve: a {kind} needs at least {need} different forces")
+        raise CalibrationError(f"curve: a {kind} requires at least {need} different forces")
     if (x.max(axis=1) <= 0.0).any():
-        raise CalibrationError("curve: one of the loads reads nothing above the zero")
+        raise CalibrationError("curve: one of the loads gives no reading above the zero offset")
     if kind == "power":
         coefficients, errors = _power(x, known, area, full)
     else:
@@ -238,10 +242,12 @@ def _cubic(
     rows = np.stack([(u**j).sum(axis=1) * area / force for j in (1, 2, 3)], axis=1)
     c, _, rank, _ = np.linalg.lstsq(rows, np.ones(len(force)), rcond=1e-10)
     if rank < 3:
-        raise CalibrationError("curve: the loads are too similar for a cubic; try a power")
+        raise CalibrationError("curve: the loads are too similar for a cubic; use a power law")
     at = np.linspace(0.0, 1.0, 201)
     if (c[0] + 2 * c[1] * at + 3 * c[2] * at**2 <= 0.0).any():
-        raise CalibrationError("curve: the cubic through these loads decreases; try a power")
+        raise CalibrationError(
+            "curve: the cubic through these loads is not increasing; use a power law"
+        )
     scaled = (1.0, float(c[0] / full), float(c[1] / full**2), float(c[2] / full**3))
     return scaled, rows @ c - 1.0
 
@@ -267,15 +273,18 @@ def _power(
     low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
     exponent = golden_section(cost, low, high, 1e-9)
     if not _EXPONENTS[0] + 0.02 < exponent < _EXPONENTS[1] - 0.02:
-        raise CalibrationError(f"curve: these loads need an exponent outside {_EXPONENTS}")
+        raise CalibrationError(
+            f"curve: these loads require an exponent outside the range {_EXPONENTS}"
+        )
     factor, errors = fit(exponent)
     return (exponent, factor / full**exponent, 0.0, 0.0), errors
 
 
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
-    """Set mean readings [rows, cols] over ``frames`` frames to 0 if they are within 4 σ of 0.
+    """Set mean readings [rows, cols] over ``frames`` frames to 0 where they are within 4 σ of 0.
 
-    Clipped noise has a positive mean. Summed over all cells, it may be as large as a contact.
+    Clipped noise has a positive mean. Summed over all cells, this mean may be as large as the force
+    of a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)
@@ -330,28 +339,30 @@ def fit_centre(
 ) -> Centre:
     """Determine centre and rotation from presses at known tilts ``theta`` [n] [rad].
 
-    The tilts are in the finger's plane. All cells of the ``frames`` [n, rows, cols] [Pa] are
-    fitted. The modulus of a spring tip need not be known. Raises CalibrationError if a frame shows
-    no contact, or if all tilts are equal but not zero.
+    The tilts are in the finger's plane. The fit uses all cells of the ``frames`` [n, rows, cols]
+    [Pa]. For a spring tip, a known modulus is not required. Raises CalibrationError if a frame does
+    not show a contact, or if all tilts are equal but nonzero.
     """
     stack = _stack(frames, "centre")
     s = np.sin(np.asarray(theta, np.float64))
     if s.shape != (len(stack),):
-        raise CalibrationError("centre: each press needs its tilt, 0 for upright ones")
+        raise CalibrationError("centre: expected a tilt for each press, 0 for an upright press")
     tilted = float(np.ptp(s)) > math.sin(_TILT_MIN)
     if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT_ERROR):
         raise CalibrationError(
             f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so tilt and "
-            "position can't be separated; press upright alone, or upright and tilted further"
+            "position can't be separated; use only upright presses, or both upright presses and "
+            "presses with a larger tilt"
         )
     for k, frame in enumerate(stack):
         if not frame.max() > _PRESSED_SIGMA * noise:
-            raise CalibrationError(f"centre: press {k + 1} gives no valid contact")
+            raise CalibrationError(f"centre: press {k + 1} does not give a valid contact")
     used = np.broadcast_to(True if active is None else active, stack.shape)
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
-    # Add the uncertainty of the upright orientation, which shifts the centroid by lever × angle.
+    # Add the uncertainty of the upright orientation, which shifts the centroid by moment arm ×
+    # angle.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
     std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
     return Centre(found.centre, found.rotation if tilted else None, residual, std)
@@ -362,7 +373,7 @@ class Modulus:
     """Result of `fit_modulus` for the model F(d − d₀, θ).
 
     ``modulus`` is E [Pa], ``offset`` is d₀ [m], ``errors`` [n] are the relative force errors, and
-    ``trend`` contains the value of E from each load alone.
+    ``trend`` contains the value of E from each individual load.
     """
 
     modulus: float
@@ -381,15 +392,15 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
-        raise CalibrationError("modulus: each frame needs its d and its force")
+        raise CalibrationError("modulus: expected a d and a force for each frame")
     used = (depth > 0.0) & (load > 0.0)
     if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
         raise CalibrationError(
-            "modulus: expected at least three frames of different d with contact"
+            "modulus: expected at least three frames in contact with different d"
         )
     depth, tilt, load = depth[used], tilt[used], load[used]
     if not np.polyfit(depth, load, 1)[0] > 0.0:
-        raise CalibrationError("modulus: the force does not rise with d")
+        raise CalibrationError("modulus: the force does not increase with d")
     unit, offset, modulus = ContactTable.build(tip, Material.constant(1.0)), 0.0, 0.0
     for _ in range(30):
         c = unit(np.maximum(depth - offset, 1e-9), tilt)
@@ -420,7 +431,7 @@ class Relaxation:
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
-    """Integrate ḣ = (F∞ − h)/τ from h = 0; ``lasting`` is F∞, linear between the times ``t``."""
+    """Integrate ḣ = (F∞ − h)/τ from h = 0, with F∞ = ``lasting`` interpolated linearly in ``t``."""
     out = np.zeros_like(lasting)
     for k in range(1, t.size):
         step = (t[k] - t[k - 1]) / time
@@ -433,14 +444,14 @@ def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
 def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
     """Fit non-negative relaxation strengths to the force of a press and the following hold.
 
-    F∞ is constant during the hold. During the press, it follows from F and the strengths.
-    Therefore F∞ and the strengths are determined alternately.
+    F∞ is constant during the hold. During the press, F∞ follows from F and the strengths. Therefore
+    F∞ and the strengths are determined alternately.
 
     Parameters
     ----------
     t, force
-        Time [s] and force [N]. The press may have any speed and depth. It must begin without
-        contact, because earlier relaxation would not be included.
+        Time [s] and force [N]. The press may have any speed and depth. The press must begin without
+        contact, because the fit does not include earlier relaxation.
     times
         Time constants τ_i [s]. If a time constant is shorter than two frames, its strength cannot
         be determined and is set to 0.
@@ -452,13 +463,15 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
     """
     at, load = np.asarray(t, np.float64), np.asarray(force, np.float64)
     if at.size < 8 or not load.max() > 0.0:
-        raise CalibrationError("relaxation: expected at least eight frames of one press and hold")
+        raise CalibrationError(
+            "relaxation: expected at least eight frames of a single press that is held"
+        )
     noise = float(np.std(np.diff(load[at.size // 2 :]))) / math.sqrt(2.0)
     held = int(np.argmax(load >= load.max() - _SIGNIFICANT_SIGMA * noise))  # start of the hold
     told = [k for k, time in enumerate(times) if time > 2.0 * (at[-1] - at[0]) / (at.size - 1)]
     if told and at[-1] - at[held] < _HOLD_RATIO_MIN * max(times[k] for k in told):
         raise CalibrationError(
-            f"relaxation: found {at[-1] - at[held]:.1f} s of hold, expected at least "
+            f"relaxation: found {at[-1] - at[held]:.1f} s of holding, expected at least "
             f"{_HOLD_RATIO_MIN:g} times the longest of tip.relaxation_times, {max(times):g} s"
         )
     lasting = np.maximum(load, 0.0)
@@ -467,7 +480,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
         memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
         columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
         fits = []
-        # There are few terms, so try every subset and keep the best one with positive strengths.
+        # Try every subset of the few terms, and keep the best subset with positive strengths.
         for chosen in itertools.product((False, True), repeat=len(told)):
             used = np.flatnonzero((True, *chosen))
             found = np.linalg.lstsq(columns[:, used], load[held:], rcond=None)[0]

@@ -1,8 +1,8 @@
-"""Fit the law of a tip to the displacement and force of a testing machine.
+"""Fit a tip's material law to the displacement and force measured by a testing machine.
 
-A platen presses the tip along the platen's normal and sticks to it, so the machine measures
-∂U/∂d. The zeros of d and F of each run, and the first contact of an uneven surface (the toe of the
-curve), are not known beforehand.
+The machine presses a platen onto the tip along the platen's normal. The tip sticks to the platen,
+so the measured force is ∂U/∂d. Three quantities of each run are initially unknown: the zero offsets
+of d and F, and the toe of the curve, where an uneven surface makes first contact.
 """
 
 from __future__ import annotations
@@ -25,23 +25,25 @@ from softfinger.kinematics.contact.table import ContactTable
 FloatArray = NDArray[np.float64]
 
 _UNIT = Material.constant(1.0)
-_SLACK = 0.02  # of the range of d; smaller reversals are noise of the encoder
-_TURNS = 5  # rows per reversal of d, below which the rows are not in the order of the test
-_DEEP = 0.9  # of the deepest d; a shallower cycle is preconditioning
-TOE = 0.1  # of the depth, on either side of the first contact
-_STEEP = 0.2  # of the largest force, above which the curve shows where it begins
-_POWER = 0.55  # makes F(d) of springs and solid rubber nearly straight
-_FEWEST = 6  # rows of a run that are fitted
-_LOADED = 20.0  # times the noise, least force of a run
-_SMOOTHEST = 1e-4  # of the largest force, least noise: rounding and interpolation
+_SLACK = 0.02  # fraction of the range of d; smaller reversals are encoder noise
+_TURNS = 5  # minimum number of rows per reversal of d; with fewer, the rows are not in test order
+_DEEP = 0.9  # fraction of the maximum d; shallower cycles are preconditioning
+TOE = 0.1  # half width of the toe around the first contact, as a fraction of the depth
+_STEEP = 0.2  # fraction of the maximum force; only the curve above it is extrapolated to zero force
+_POWER = 0.55  # exponent that makes F(d) of springs and solid rubber nearly linear
+_FEWEST = 6  # minimum number of fitted rows per run
+_LOADED = 20.0  # minimum force range of a run, relative to the noise
+# Minimum noise due to rounding and interpolation, as a fraction of the maximum force.
+_SMOOTHEST = 1e-4
 _ROUNDS = 60
-_CLIP = 0.02  # of the depth, largest step of the zero of d
-_STEP = 1e-8  # m, step of numerical derivatives
-_TOLERANCE = 1e-7  # of the tables
-_EDGE = 1.0 - 1e-4  # of the range of a table, with room for the step
-_TOO_DEEP = "the run is deeper or more tilted than its data"
-_NO_BEGINNING = "no zero of d fits: the run must show where the contact begins"
-# Further coefficients of the laws whose forces span those of σ = c_1 ε + c_2 ε² + c_3 ε³.
+_CLIP = 0.02  # maximum step of the zero of d, as a fraction of the depth
+_STEP = 1e-8  # m, step for numerical derivatives
+_TOLERANCE = 1e-7  # relative tolerance of the tables
+_EDGE = 1.0 - 1e-4  # usable fraction of a table's range; leaves room for the step
+_TOO_DEEP = "the run exceeds the depth or tilt range of the model's data"
+_NO_BEGINNING = "no zero offset of d fits the run: the run must include the onset of contact"
+# Higher-order coefficients of three laws. The forces for σ = c_1 ε + c_2 ε² + c_3 ε³ are linear
+# combinations of the forces for these laws.
 _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
 
 
@@ -49,8 +51,9 @@ _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), F
 class Run:
     """Loading branch of one compression at a fixed tilt.
 
-    ``theta`` is in rad, ``d`` [n] in m and ``force`` [n] in N, both with zeros of their own.
-    ``begin`` [m] is where the curve begins, ``dropped`` the number of rows of other branches.
+    ``theta`` is in rad, ``d`` [n] in m and ``force`` [n] in N; d and force have unknown zero
+    offsets. ``begin`` [m] is the value of d at which the curve begins. ``dropped`` is the number of
+    rows that belong to other branches.
     """
 
     theta: float
@@ -82,23 +85,23 @@ class Run:
 
 
 def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
-    """Find the loading branch of a test, and where its curve begins.
+    """Find the loading branch of a test and the beginning of its curve.
 
-    Of several cycles, the last one that reaches the full depth is used, because rubber softens in
-    its first cycles (Mullins, 1948). The branch ends within 0.5 % of the largest d, so that a hold
-    is not part of it.
+    If there are several cycles, the last one that reaches the full depth is used, because rubber
+    softens in its first cycles (Mullins, 1948). The branch ends as soon as d is within 0.5 % of its
+    maximum, so that it does not include a hold.
 
     Parameters
     ----------
     d, force
-        Displacement [m] and force [N] in the order of the test, both [n].
+        Displacement [m] and force [N] in test order, both [n].
     theta
         Tilt of the platen [rad].
 
     Raises
     ------
     CalibrationError
-        If the rows are not in the order of a test, are an unloading, or carry no load.
+        If the rows are not in test order, contain only unloading, or do not show a load.
     """
     depth, load = np.asarray(d, np.float64), np.asarray(force, np.float64)
     used, cycles = rising(depth)
@@ -107,35 +110,37 @@ def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
     run = Run(theta, depth[used], load[used], begin, cycles, dropped)
     if (count := np.count_nonzero(run.pressed)) < _FEWEST:
         raise CalibrationError(
-            f"found {count} rows of loading beyond the toe, expected at least {_FEWEST}"
+            f"found {count} loading rows beyond the toe region, expected at least {_FEWEST}"
         )
     if np.ptp(run.force[run.pressed]) < _LOADED * _noise([run]):
         raise CalibrationError(
             f"found a force of {np.ptp(run.force):.3g} N with a scatter of {_noise([run]):.2g} N, "
-            f"expected {_LOADED:g} times the scatter: the tip was not loaded"
+            f"expected {_LOADED:g} times the scatter: check that the tip was loaded"
         )
     return run
 
 
 def rising(d: FloatArray) -> tuple[slice, int]:
-    """Return the rows of the last rising branch of ``d`` to its full depth, and their number.
+    """Return the rows of the last branch that rises to full depth, and the number of such branches.
 
-    Raises CalibrationError as `loading`.
+    Raises CalibrationError in the same cases as `loading`.
     """
     span = float(np.ptp(d)) if d.size else 0.0
     if not span > 0.0:
-        raise CalibrationError("found one displacement in all rows, expected a run that presses")
+        raise CalibrationError(
+            "found the same displacement in all rows, expected a run with increasing displacement"
+        )
     turns = _turning_points(d, _SLACK * span)
     if len(turns) - 2 > max(2, d.size // _TURNS):
         raise CalibrationError(
-            f"found {len(turns) - 2} reversals of d in {d.size} rows, expected the order of the "
-            "test: sort the rows by time"
+            f"found {len(turns) - 2} reversals of d in {d.size} rows, expected rows in the order "
+            "of the test: sort the rows by time"
         )
     top = d.max() - (1.0 - _DEEP) * span
     found = [(i, j) for i, j in itertools.pairwise(turns) if d[j] > d[i] and d[j] >= top]
     if not found:
         raise CalibrationError(
-            "found only falling d, the unloading; expected d to rise with the compression"
+            "found only decreasing d, which is unloading; expected d to increase during compression"
         )
     start, peak = found[-1]
     reached = np.argmax(d[start : peak + 1] >= d[peak] - 0.25 * _SLACK * span)
@@ -143,7 +148,7 @@ def rising(d: FloatArray) -> tuple[slice, int]:
 
 
 def _turning_points(d: FloatArray, slack: float) -> list[int]:
-    """Return the first and last index and the reversals of ``d`` that exceed ``slack``."""
+    """Return the indices of the first and last row and of reversals of ``d`` above ``slack``."""
     turns, extreme, way = [0], 0, 0
     for k in range(1, d.size):
         moved = d[k] - d[extreme]
@@ -160,25 +165,27 @@ def _turning_points(d: FloatArray, slack: float) -> list[int]:
 
 
 def _begin(d: FloatArray, force: FloatArray) -> float:
-    """Return the d at which the steep part of the curve, made straight, meets the zero of F."""
+    """Return the d at which the linearised steep part of the curve extrapolates to zero force."""
     zero = float(np.median(force[: max(1, force.size // 50)]))
     rise = force - zero
     most = float(rise.max())
     if most <= 0.0 or rise[np.argmax(d)] < 0.5 * most:
         raise CalibrationError(
-            "found no force that rises with d; compression counts as positive in d and F"
+            "found no force that increases with d, expected positive d and F in compression"
         )
     begin = float(d[0])
-    for _ in range(4):  # the zero of F follows from the rows before the contact, if there are any
+    for _ in range(4):  # improve the zero of F using the rows before contact, if any
         steep = rise > _STEEP * most
         if (count := np.count_nonzero(steep)) < 3:
             raise CalibrationError(
-                f"found {count} rows above {_STEEP:.0%} of the largest force, expected at least "
+                f"found {count} rows above {_STEEP:.0%} of the maximum force, expected at least "
                 f"{_FEWEST}"
             )
         slope, start = np.polyfit(d[steep], rise[steep] ** _POWER, 1)
         if not slope > 0.0:
-            raise CalibrationError("found a force that falls with d, expected it to rise")
+            raise CalibrationError(
+                "found a force that decreases with d, expected a force that increases with d"
+            )
         begin = float(-start / slope)
         before = d < begin - TOE * (d.max() - begin)
         if np.count_nonzero(before) < 3:
@@ -190,14 +197,14 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class CompressionFit:
-    """Fit of one law to runs of a testing machine.
+    """Fit of one material law to testing machine runs.
 
     ``factors`` [k] [Pa] multiply the powers 1 to k of the strain or, if k = 1, the shape ``law``.
-    ``std`` is the largest relative standard deviation of the law's force from a quarter of the
-    deepest d on; if k = 1, it is that of the modulus. ``zeros`` [runs][4] are the zero of d [m] and
-    of F [N], and their standard deviations. ``residual`` [N] is the rms residual, ``chi2`` its
-    square over that of the scatter about a smooth curve. ``score`` is the Bayesian information
-    criterion: the best law has the lowest.
+    ``std`` is the maximum relative standard deviation of the force above a quarter of the maximum
+    d; for k = 1, it equals that of the modulus. For each run, ``zeros`` contains the zero offsets
+    of d [m] and F [N] and their standard deviations. ``residual`` [N] is the rms residual. ``chi2``
+    is its square divided by the squared scatter about a smooth curve. ``score`` is the Bayesian
+    information criterion; the best law has the lowest score.
     """
 
     tip: Fingertip
@@ -221,7 +228,7 @@ class CompressionFit:
         return np.asarray(self.modulus * self.law.stress(strain))
 
     def force(self, run: Run, zeros: FloatArray) -> FloatArray:
-        """Return the force of a run [N] with its row of ``zeros``."""
+        """Return the modelled force of a run [N] for the run's row in ``zeros``."""
         tables = _tables(self.tip, self.law if len(self.factors) == 1 else None)
         theta = np.full(len(run.d), run.theta)
         return np.asarray(_shapes(tables, run.d - zeros[0], theta)[0] @ self.factors + zeros[1])
@@ -233,24 +240,24 @@ def _power_law(factors: FloatArray, strain: ArrayLike, derivative: int = 0) -> F
 
 
 def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -> CompressionFit:
-    """Fit a law to runs by least squares, with the zeros of d and F of each run.
+    """Fit a law, and the zero offsets of d and F in each run, to runs by least squares.
 
     Correlated residuals increase the standard deviations.
 
     Parameters
     ----------
     runs
-        The loading branches.
+        Loading branches.
     tip
-        Its radius and physics.
+        Fingertip with its radius and physics.
     law
-        Shape of the stress-strain law for a modulus of 1 Pa. None stands for springs with
-        σ = c_1 ε + c_2 ε² + c_3 ε³, whose modulus changes with the depth.
+        Shape of the stress-strain law for a modulus of 1 Pa. None selects springs with σ = c_1 ε +
+        c_2 ε² + c_3 ε³, whose modulus depends on the strain.
 
     Raises
     ------
     CalibrationError
-        If the runs are too deep for the law, or contradict it.
+        If the runs are too deep for the law or contradict the law.
     """
     tables, deepest = _tables(tip, law), max(run.depth for run in runs)
     end = _end(tables[0], tip, max(abs(run.theta) for run in runs))
@@ -307,11 +314,11 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
 def compare_laws(
     runs: Sequence[Run], radius: float, poisson: float, material: Material
 ) -> tuple[list[CompressionFit], list[str]]:
-    """Fit springs and solid rubber to runs; return the fits, the best first, and notes.
+    """Fit spring and solid rubber models to runs; return the fits, best first, and notes.
 
-    Springs are fitted with a constant modulus, with the shape of ``material`` if that is not
-    linear, and with a modulus that changes with the depth. Solid rubber has the given Poisson's
-    ratio, which F(d) does not show.
+    Springs are fitted with a constant modulus, with a strain-dependent modulus and, if ``material``
+    is nonlinear, with the shape of its law. Solid rubber has the given Poisson's ratio, because
+    F(d) does not determine it.
     """
     springs, solid = Fingertip(radius), Fingertip(radius, "solid", poisson)
     tried: list[tuple[str, Fingertip, Material | None]] = [("springs", springs, _UNIT)]
@@ -335,14 +342,14 @@ def compare_laws(
 
 
 def _end(table: ContactTable, tip: Fingertip, theta: float) -> float:
-    """Return the largest d [m] of a table at a tilt; 0 if the tilt is outside it."""
+    """Return the maximum d [m] of a table at a tilt, or 0 if the tilt is outside the table."""
     if tip.physics == "solid":
         return _EDGE * table.header.deepest if theta <= table.header.tilt else 0.0
     return _EDGE * tip.radius * min(7.0 / 8.0, 1.0 - math.sin(theta))
 
 
 def _tables(tip: Fingertip, law: Material | None) -> list[ContactTable]:
-    """Return the tables whose forces the fit adds."""
+    """Return the tables whose forces are combined linearly in the fit."""
     if law is not None:
         return [ContactTable.build(tip, law, _TOLERANCE)]
     return [ContactTable.build(tip, Material((Fraction(1), *each)), _TOLERANCE) for each in _POWERS]
@@ -351,7 +358,7 @@ def _tables(tip: Fingertip, law: Material | None) -> list[ContactTable]:
 def _shapes(
     tables: Sequence[ContactTable], d: FloatArray, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the normal forces of the powers of the strain and their slopes by d, both [n, k]."""
+    """Return the normal force of each power of the strain and its derivative in d, both [n, k]."""
     touching, depth = d > 0.0, np.maximum(d, _STEP)
 
     def forces(at: FloatArray) -> FloatArray:
@@ -363,7 +370,7 @@ def _shapes(
 
 
 def _variance_inflation(left: FloatArray) -> float:
-    """Return the factor of the variance for residuals with the lag-1 correlation of ``left``."""
+    """Return the variance factor due to the lag-1 correlation of the residuals ``left``."""
     lag = float(left[1:] @ left[:-1]) / float(left @ left)
     lag = min(max(lag, 0.0), 0.99)
     return (1.0 + lag) / (1.0 - lag)

@@ -13,22 +13,24 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 FloatArray = NDArray[np.float64]
 
 DURATION_MAX = 3600.0  # s, maximum recording time; limits memory
-_STEP = 0.01  # s, time grid for motion and torque
-_WINDOW = 6  # steps on either side in the fit of velocity and acceleration
+_STEP = 0.01  # s, step of the time grid for motion and torque
+_WINDOW = 6  # steps on either side of an instant, for fitting velocity and acceleration
 _GAP_MAX = 0.035  # s, maximum gap in the data to interpolate across
-_SLIDING_SPEED = 0.2  # rad/s, above which static friction has mostly vanished (XL330: 0.12 rad/s)
-_REST_SPEED = 0.02  # rad/s, below which a joint is at standstill; one count of 1.5 mrad in 0.08 s
+# rad/s, speed above which static friction has mostly vanished (XL330: 0.12 rad/s).
+_SLIDING_SPEED = 0.2
+# rad/s, speed below which a joint is at standstill; one count of 1.5 mrad in 0.08 s.
+_REST_SPEED = 0.02
 # rad, travel from standstill at break-away: three counts, ten times the gear compliance.
 _BREAK_AWAY_DISTANCE = 5e-3
-# rad/s over a number of steps: maximum goal velocity at break-away; limits the inertial torque.
+# Maximum goal velocity at break-away [rad/s], over a number of steps; limits the inertial torque.
 _BREAK_AWAY_RATE = 0.1, 20
 _MOTION_TIME_MIN = 0.5  # s, minimum motion time in each direction
 _CORRELATION_TIME = 0.2  # s, correlation time of the residuals
-_BREAK_AWAY_COUNT_MIN = 3  # number of break-aways needed for a mean
+_BREAK_AWAY_COUNT_MIN = 3  # minimum number of break-aways for a mean
 # N·m·s/rad, mean and standard deviation of the prior. Values identified for similar servos range
 # from 0.015 to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
 _VISCOUS_PRIOR = 0.02, 0.02
-_INERTIA_ERROR = 0.5  # relative error of the configured inertia
+_INERTIA_ERROR = 0.5  # relative standard deviation of the configured inertia
 
 
 class FrictionFit(NamedTuple):
@@ -38,7 +40,7 @@ class FrictionFit(NamedTuple):
     coulomb_std: float
     viscous: float  # [N·m·s/rad]
     viscous_std: float
-    stiction: float  # at break-away; NaN for fewer than three slow starts from standstill
+    stiction: float  # friction at break-away; NaN for fewer than three slow starts from standstill
     stiction_std: float
 
 
@@ -56,8 +58,8 @@ def fit_friction(
 
         torque = F sign(q̇) + b q̇ + J q̈ + c0 + c1 q + c2 q²
 
-    where F is the Coulomb friction and b ≥ 0 the viscous friction. The polynomial covers torques
-    that do not depend on the direction of motion: weight, cables and the current offset. The
+    where F is the Coulomb friction and b ≥ 0 the viscous friction. The polynomial models torques
+    that do not depend on the direction of motion, i.e. weight, cables and the current offset. The
     break-away friction is the maximum torque during a start from standstill with a slow goal.
 
     Parameters
@@ -85,7 +87,8 @@ def fit_friction(
     place, rate, acceleration = _motion(shown)
     after = np.clip(np.searchsorted(at, grid, "right"), 1, at.size - 1)
     whole = at[after] - at[after - 1] < _GAP_MAX
-    # Use only instants whose whole smoothing window has the same direction of motion.
+    # Use only instants at which the direction of motion is constant over the whole smoothing
+    # window.
     closes, opens = (_throughout(whole & (sign * rate > _SLIDING_SPEED)) for sign in (1.0, -1.0))
     seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
     if min(seconds) < _MOTION_TIME_MIN:
@@ -116,7 +119,8 @@ def duration_error(seconds: float) -> str:
 def _too_little(closing: float, opening: float) -> str:
     return (
         f"found {closing:.1f} s of closing and {opening:.1f} s of opening above "
-        f"{_SLIDING_SPEED:g} rad/s in air, expected at least {_MOTION_TIME_MIN:g} s of each"
+        f"{_SLIDING_SPEED:g} rad/s without contact, expected at least {_MOTION_TIME_MIN:g} s of "
+        "each"
     )
 
 
@@ -145,24 +149,24 @@ def _least_squares(
     )
     rounding = step * step / 12.0
     variance = rounding
-    for _ in range(2):  # the second pass uses the noise estimate of the first
+    for _ in range(2):  # the second pass uses the noise estimate from the first pass
         per_sample = _STEP / _CORRELATION_TIME / variance
         covariance = np.linalg.inv(per_sample * columns.T @ columns + weight)
         found = covariance @ (per_sample * columns.T @ values + weight @ prior)
         variance = max(float(np.mean((values - columns @ found) ** 2)), rounding)
     std = np.sqrt(np.diag(covariance))
-    if found[1] < 0.0:  # b cannot be negative: use the solution for b = 0
+    if found[1] < 0.0:  # b cannot be negative, so use the solution for b = 0
         found = found - covariance[:, 1] * (found[1] / covariance[1, 1])
-    # A constant current between two counts always has the same quantisation error.
+    # A constant current always has the same quantisation error, so averaging does not reduce it.
     std[0] = math.hypot(float(std[0]), math.sqrt(rounding))
     return found, std
 
 
 def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatArray) -> FloatArray:
-    """Return torque and standard deviation of each start from standstill with a slow goal, [n, 2].
+    """Return the torque and its standard deviation for each slow start from standstill, [n, 2].
 
-    Goal and torque increase in whole counts, so the break-away torque is between the maximum torque
-    and the value before it.
+    The goal and the torque increase in whole counts, so the break-away torque lies between the
+    maximum torque and the preceding value.
     """
     found = []
     speed, steps = _BREAK_AWAY_RATE

@@ -11,7 +11,8 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
 
 _PRIOR_STD = (0.4, 0.4, 3.0)  # prior standard deviations of rise, time (relative), ambient [°C]
-_READING_ERROR = 0.4  # °C, rounding to whole degrees and similar reading errors
+# °C, standard deviation of rounding to whole degrees and similar reading errors.
+_READING_ERROR = 0.4
 _STEP = 1.0  # s
 _RISE_MIN = 8.0  # °C, minimum temperature rise of the case
 _ITERATIONS = 12
@@ -63,8 +64,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
     if warmed < _RISE_MIN:
         raise CalibrationError(
-            f"heat: found {warmed:.0f} °C of warming, expected at least {_RISE_MIN:g} °C: hold "
-            "longer, or with more force"
+            f"heat: found {warmed:.0f} °C of temperature rise, expected at least {_RISE_MIN:g} "
+            "°C: hold the grip longer, or use more force"
         )
     grid = np.arange(at[0], at[-1], _STEP)
     squares, readings = np.interp(grid, at, square), np.interp(grid, at, shown)
@@ -72,8 +73,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
 
     def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
         case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
-        # Equal readings share one rounding error, so each degree counts once, however long it
-        # lasts.
+        # Equal readings share one rounding error, so each degree counts once regardless of its
+        # duration.
         weight = np.sqrt(warmed / grid.size) / _READING_ERROR
         return np.concatenate([(case - readings) * weight, (x - prior) / _PRIOR_STD])
 

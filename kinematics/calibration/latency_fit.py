@@ -15,15 +15,15 @@ FloatArray = NDArray[np.float64]
 
 _STEP = 1e-3  # s, time grid and spacing of the initial delays
 _DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # s, range of latencies to search
-# m/s and s: a ramp closes faster than this speed, averaged over this time.
+# Minimum closing speed in a ramp [m/s], and the time over which the speed is averaged [s].
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
-_RAMP_MARGIN = 0.2  # s, time before and after a ramp that is included in the ramp
-_CLOSING_MIN = 8e-4  # m, minimum closing of a ramp, seven encoder counts
+_RAMP_MARGIN = 0.2  # s, time before and after a ramp that still counts as part of the ramp
+_CLOSING_MIN = 8e-4  # m, minimum closing distance in a ramp, seven encoder counts
 _FRAME_COUNT_MIN = 8  # minimum number of frames
-_TIME_ERROR = 1e-3  # s, standard deviation of the tick, reading and frame times
+_TIME_ERROR = 1e-3  # s, standard deviation of the times of ticks, readings and frames
 # Widening of a growing footprint, see `perception.frame_channels`.
 _WIDENING, _SPREAD_MAX = 1.4, 0.1
-_ITERATIONS = 3  # alternating iterations for the first touch and the fit
+_ITERATIONS = 3  # number of iterations that alternate between the first touch and the fit
 
 
 class LatencyFit(NamedTuple):
@@ -31,7 +31,7 @@ class LatencyFit(NamedTuple):
 
     delay: float
     std: float
-    scale: float  # ratio of d from the frames to d from the joints
+    scale: float  # ratio of the d estimated from frames to the d computed from joint angles
     residual: float  # rms residual of d [m]
     ramps: int
 
@@ -90,14 +90,14 @@ def fit_latency(
         shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # The error of an encoder at standstill is constant, and half of it shifts the ramp.
+    # The encoder error at standstill is constant, and half of it shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))
 
 
 class _Ramps(NamedTuple):
-    """Frames in the ramps: times, d, standard deviations, and the ramp of each frame."""
+    """Frames in the ramps: times, d, standard deviations, and ramp numbers."""
 
     t: FloatArray
     d: FloatArray
@@ -146,8 +146,8 @@ def _fit(
 
 def _too_little(widest: float) -> str:
     return (
-        f"found a ramp of {widest * 1e3:.1f} mm by the joints, expected at least "
-        f"{_CLOSING_MIN * 1e3:g} mm while both tips touch"
+        f"found a d ramp of {widest * 1e3:.1f} mm computed from the joints, expected at least "
+        f"{_CLOSING_MIN * 1e3:g} mm while both tips are in contact"
     )
 
 

@@ -25,8 +25,8 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 _PRESS_COUNT_MIN = 6  # minimum number of presses
 _UPRIGHT_TILT = math.radians(1.0)
 _TILTED_MIN = math.radians(5.0)
-_CURVE_ERROR_MAX = 0.05  # maximum curve error, relative to the force and to the radius
-_STAGE_ERROR = 2e-3  # minimum relative error of a stage and a sensor
+_CURVE_ERROR_MAX = 0.05  # maximum errors of the curves, relative to the force and to the radius
+_STAGE_ERROR = 2e-3  # minimum assumed relative error of a stage and a sensor
 
 
 class CurvesError(SoftfingerError, ValueError):
@@ -37,10 +37,10 @@ class CurvesError(SoftfingerError, ValueError):
 class PressSums:
     """Presses at d [n] [m] and θ [n] [rad] in the finger's plane.
 
-    ``frames`` contains the frames of each press [k, rows, cols] [Pa], as the daemon will receive
-    them. ``pressures`` [n, rows, cols] are the mean frames, corrected for the bias of noise clipped
-    at 0. ``rest`` [rows, cols] is this bias without contact. ``gain`` is the ratio of the true
-    force to the sensor's force.
+    ``frames`` contains the frames [k, rows, cols] [Pa] of each press, processed as in the daemon.
+    ``pressures`` [n, rows, cols] are the mean frames, corrected for the bias of noise clipped at 0.
+    ``rest`` [rows, cols] is the bias without contact. ``gain`` is the ratio of the true force to
+    the sensor's force.
     """
 
     d: FloatArray
@@ -68,8 +68,8 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     ):
         raise CurvesError(
             f"found {len(d)} presses at {len(np.unique(d))} depths, {tilted.sum()} of them "
-            f"tilted; expected at least {_PRESS_COUNT_MIN} at 3 depths, some upright and 2 "
-            "tilted by 5° or more"
+            f"tilted; expected at least {_PRESS_COUNT_MIN} at 3 depths, including upright presses "
+            "and 2 presses tilted by 5° or more"
         )
     frames = [each for each, use in zip(presses.frames, used, strict=True) if use]
     first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
@@ -159,7 +159,7 @@ def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """Return the covariance [4, 4] of one frame's sums, from the frames of each press."""
     if min(map(len, frames)) < 5:
-        raise CurvesError("expected at least five frames of each press, to measure their noise")
+        raise CurvesError("expected at least five frames of each press to measure the noise")
     each = [weights @ every.reshape(len(every), -1).T for every in frames]
     return np.asarray(np.mean([np.cov(sums) for sums in each], axis=0))
 
@@ -171,7 +171,7 @@ def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], fl
     weight /= weight.sum()
     centre = float(weight @ x), float(weight @ y)
     along = np.sin(theta) * sums[0]
-    # In sensor axes, the finger's x axis is (cos, −sin) of the rotation.
+    # For a rotation ρ, the finger's x axis is (cos ρ, −sin ρ) in sensor axes.
     return centre, math.atan2(-float(along @ (y - centre[1])), float(along @ (x - centre[0])))
 
 

@@ -27,7 +27,8 @@ _ROTATION_STEP = 1e-4  # rad
 _ROTATION_STARTS = 8  # number of initial rotations to try
 _GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
 _POISSON_TOLERANCE = 4e-3  # tolerance of ν
-_REPEATED_D, _REPEATED_THETA = 5e-5, 0.009  # m, rad; presses that differ by less are repetitions
+# m, rad; presses whose d and θ differ by less are repetitions.
+_REPEATED_D, _REPEATED_THETA = 5e-5, 0.009
 _DRIFT_MIN = 0.02  # minimum significant relative drift of E; accuracy of presses and tables
 
 
@@ -72,17 +73,17 @@ class Trend:
 
     @property
     def drifts(self) -> bool:
-        """True if E drifts by more than its scatter, so the model does not fit the tip."""
+        """True if E drifts by more than its scatter, i.e. if the model does not fit the tip."""
         return abs(self.drift) > max(2.0 * self.std, _DRIFT_MIN)
 
     @property
     def cause(self) -> str:
         """Probable cause of the drift."""
         if self.drift > 0.0:
-            return "the tip stiffens more than this model: try another base or face, or springs"
+            return "the tip stiffens more than this model; try a different base or face, or springs"
         return (
-            "the tip stiffens less than this model: try another base or face, or solid; or it "
-            "softens"
+            "the tip stiffens less than this model or softens; try a different base or face, or "
+            "solid"
         )
 
 
@@ -101,9 +102,9 @@ def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
 def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | None:
     """Return the mean relative excess force of first presses compared with their repetitions.
 
-    Filled rubber softens over its first cycles (Mullins, 1948), so a fit to both would describe
-    neither. The mean is taken over all pairs of ``d`` [n] [m] and ``theta`` [n] [rad] that are
-    pressed more than once. The result is None if there are no such pairs.
+    Filled rubber softens over its first cycles (Mullins, 1948), so one fit cannot describe both
+    first and repeated presses. The mean is taken over all pairs of ``d`` [n] [m] and ``theta`` [n]
+    [rad] that are pressed more than once. The result is None if no pair is repeated.
     """
     poses = np.round(np.stack([d / _REPEATED_D, theta / _REPEATED_THETA], axis=1))
     _, which = np.unique(poses, axis=0, return_inverse=True)
@@ -114,15 +115,15 @@ def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | 
 
 @dataclass(frozen=True)
 class TipFit:
-    """Fit of one tip model to the presses.
+    """Result of fitting one tip model to the presses.
 
-    ``law`` is the material law for a modulus of 1 Pa at zero strain. The fitted values are
-    ``modulus`` [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the
-    mean squared residual per cell divided by the noise variance. The errors are those of the
-    estimator with this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors.
+    ``law`` is the material law for a modulus of 1 Pa at zero strain. The fit determines ``modulus``
+    [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the mean
+    squared residual per cell divided by the noise variance. The following errors are errors of the
+    estimator for this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors.
     ``force_error`` is the rms difference between the estimated force and the frame sum, divided by
     the rms frame sum. The errors include only frames with a valid estimate; ``valid`` is the
-    fraction of such frames. ``trend`` contains E of each press alone.
+    fraction of such frames. ``trend`` contains the value of E from each individual press.
     """
 
     tip: Fingertip
@@ -149,7 +150,7 @@ def _scaled(law: Material, factor: float) -> Material:
 def fit_tip(
     presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT_MATERIAL
 ) -> TipFit:
-    """Fit the modulus and the zero offset of d for one ``tip`` model using Gauss-Newton."""
+    """Fit the modulus and the zero offset of d for one ``tip`` model by the Gauss-Newton method."""
     readings = presses.frames[presses.used]
     offset = 0.0
     for _ in range(6):
@@ -176,9 +177,9 @@ def compare_tips(
 ) -> list[TipFit]:
     """Fit spring and solid models of the tip and return the fits, best first.
 
-    Springs are fitted with a constant modulus. If ``material`` is not linear, they are also fitted
-    with its law. Solid rubber is fitted with its best ν: with a frictionless face on either base,
-    and with a sticking face on the better base.
+    Springs are fitted with a constant modulus. If ``material`` is nonlinear, springs are also
+    fitted with its law. Solid rubber is fitted with its best ν: with a frictionless face on either
+    base, and with a sticking face on the better base.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
     if not material.is_linear:
@@ -202,7 +203,7 @@ def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
 
 
 def golden_section(cost: Callable[[float], float], low: float, high: float, within: float) -> float:
-    """Return the minimum of ``cost`` between ``low`` and ``high`` to the tolerance ``within``."""
+    """Return the minimiser of ``cost`` on [low, high], to the tolerance ``within``."""
     left, right = high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low)
     at_left, at_right = cost(left), cost(right)
     while high - low > within:
@@ -260,9 +261,9 @@ def fit_place(
 ) -> tuple[SensorGrid, float, float]:
     """Fit the tip centre and, if ``rotate`` is True, the sensor rotation.
 
-    The tilts are known. Gauss-Newton fits the position, the rotation, the depth of each press
-    (starting from ``presses.d``) and, for springs, the modulus. Returns the grid, the last step [m]
-    and the standard deviation of the centre [m].
+    The tilts are known. The Gauss-Newton method fits the position, the rotation, the depth of each
+    press (starting from ``presses.d``) and, for springs, the modulus. Returns the grid, the last
+    step [m] and the standard deviation of the centre [m].
     """
     gain, free_gain = 1.0, tip.physics == "springs"
     readings = presses.frames[presses.used] / material.reference_modulus

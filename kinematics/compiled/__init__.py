@@ -1,4 +1,4 @@
 """Compilation and caching of kernels, and their record types.
 
-The package is independent of the computations in the kernels.
+The package does not depend on what the kernels compute.
 """

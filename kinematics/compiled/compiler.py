@@ -3,22 +3,22 @@
 No other module uses Numba's private interfaces. This module is imported only with tested Numba
 versions; otherwise `plain` replaces it.
 
-`KernelCompiler` runs only the passes that kernels need. It omits the passes for closures, `with`
-statements and parallel loops. It also omits the pruning of constant branches, which LLVM does
-anyway, and the type listing, which would fill the cache. The compiler caches the result types of
-operations and the sizes of LLVM types. Without these caches, Numba would search dozens of
-candidates for each operation and let LLVM parse a module for each size.
+`KernelCompiler` runs only the passes that kernels need. The compiler omits the passes for closures,
+`with` statements and parallel loops. `KernelCompiler` also omits the pruning of constant branches,
+which LLVM performs anyway, and the type annotations, which would fill the cache. The compiler
+caches the result types of operations and the sizes of LLVM types. Without these caches, Numba would
+search dozens of candidates for each operation and let LLVM parse a module for each size.
 
-A `BitcodeKernel` can be called only by other kernels. It is compiled to LLVM bitcode and never to
+A `BitcodeKernel` can be called only by other kernels and is compiled to LLVM bitcode, never to
 machine code. By default, Numba compiles each function called by a kernel as if Python might call
-it. It optimises the function with its callees, compiles it to machine code, adds two wrappers and
-caches it; the callers then link the bitcode and repeat the work. Stopping at bitcode reduces the
-compile time by a third and the cache size to a quarter.
+it. Numba then optimises the function together with its callees, compiles it to machine code, adds
+two wrappers and caches it. The callers link the bitcode and repeat this work. Stopping at bitcode
+reduces the compile time by a third and the cache size to a quarter.
 
-`KernelCache` stores the machine code of a kernel but not its bitcode. Another kernel that calls
-this kernel needs the bitcode and therefore compiles it again. To load a kernel, Numba normally
-imports its entire library of supported functions, which takes a third of a second and 50 MB. This
-cache avoids the import.
+`KernelCache` stores the machine code of a kernel but not its bitcode. If another kernel calls the
+stored kernel, it needs the bitcode and therefore compiles the kernel again. Before loading a stored
+kernel, Numba normally imports all its implementations of Python and NumPy functions, which takes a
+third of a second and 50 MB. `KernelCache` skips this import.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder
 
 _operation: Any = types.Function
 _resolve = _operation.get_call_type
-_SIGNATURES: dict[Any, Any] = {}  # operation signatures, by argument types and arithmetic flags
+# Signatures of operations; the keys contain the argument types and arithmetic flags.
+_SIGNATURES: dict[Any, Any] = {}
 _context: Any = BaseContext
 _size = _context.get_abi_sizeof
 _SIZES: dict[Any, int] = {}  # LLVM type sizes [bytes]
@@ -86,8 +87,8 @@ class KernelCompiler(CompilerBase):
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
-        """Return the compiler passes in execution order."""
-        # Prune branches such as `if blur is None` that cannot be typed for some arguments.
+        """Return the compiler passes in the order of execution."""
+        # Branches such as `if blur is None` cannot be typed for some arguments, so prune them.
         nones = types.none in self.state.args
         passes: list[Any] = [TranslateByteCode, FixupArgs, IRProcessing]
         passes += [RewriteSemanticConstants, DeadBranchPrune] if nones else []
@@ -126,7 +127,7 @@ def _with_cached_lookups(flags: Any) -> Iterator[None]:
                 return None
             _SIGNATURES[key] = found, function._impl_keys[found.args]
         found, body = _SIGNATURES[key]
-        function._impl_keys[found.args] = body  # Numba looks up the implementation here
+        function._impl_keys[found.args] = body  # Numba looks up the implementation in this map
         return found
 
     def size(context: Any, kind: Any) -> int:
@@ -158,7 +159,7 @@ class BitcodeKernel(plain.InnerKernel):
             no_cfunc_wrapper=True,
             **options,
         )(self.py_func)
-        # Without this, Numba recompiles for each literal argument, which LLVM would fold anyway.
+        # Without this, Numba recompiles for each literal argument; LLVM folds the constants anyway.
         resolve = self.dispatcher.get_call_template
         self.dispatcher.get_call_template = lambda args, kws: resolve(
             tuple(types.unliteral(each) for each in args), kws
@@ -174,7 +175,7 @@ class _Bitcode(JITCodeLibrary):
     """Code library that is linked into its callers and never compiled to machine code."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        # Do what Numba does for its own libraries, also for functions that are only declared here.
+        # Repeat Numba's finalisation of its own libraries, also for functions only declared here.
         ll_module.data_layout = self._codegen._data_layout
         for function in ll_module.functions:
             if not function.is_declaration:
@@ -270,7 +271,7 @@ class _MachineCode(CompileResultCacheImpl):
 
 
 class _Files:
-    """Storage with one file per overload, replacing Numba's index and data files."""
+    """Storage with one file per overload; replaces Numba's index and data files."""
 
     def __init__(self, folder: OwnFolder, name: str, stamp: str) -> None:
         self._folder, self._name, self._stamp = folder, name, stamp
@@ -287,7 +288,7 @@ class _Files:
 
 
 class KernelCache(FunctionCache):
-    """Numba cache that stores only machine code. Raises RuntimeError if there is no folder."""
+    """Numba cache that stores only machine code; raises RuntimeError without a cache folder."""
 
     _impl_class = _MachineCode
 
@@ -299,7 +300,7 @@ class KernelCache(FunctionCache):
         self._cache_file: Any = _Files(folder, self._impl.filename_base, stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load an overload without importing Numba's library of supported functions."""
+        """Load an overload without importing Numba's implementations of supported functions."""
         _add_symbols()
         return self._load_overload(sig, target_context)
 

@@ -1,9 +1,10 @@
 """Decorators for compiled kernels.
 
-A kernel is a pure function of arrays, records and scalars. A ``kernel`` can be called from Python.
-Numba compiles it on the first call, together with all functions that it calls, and stores it in the
-folder given by `compiled.kernel_folder`. An ``inner_kernel`` (also ``fast_inner_kernel`` and
-``inlined_kernel``) can only be called from other kernels and compiles in a fraction of the time.
+A kernel is a pure function of arrays, records and scalars. A function decorated with ``kernel`` can
+be called from Python. Numba compiles the function on the first call, together with all functions
+that it calls, and stores the code in the folder given by `compiled.kernel_folder`. An
+``inner_kernel`` (also ``fast_inner_kernel`` and ``inlined_kernel``) can be called only from other
+kernels, and is compiled in a fraction of the time.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 TESTED_NUMBA = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
 # index(k) converts k to an unsigned index. Numba checks signed indices for negative values, which
-# count from the end; this check prevents vectorisation. Do not mix both kinds in a sum.
+# count from the end; this check prevents vectorisation. Do not mix signed and unsigned integers in
+# a sum.
 index: Callable[[int], int] = cast(Any, np.uint64)
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}
@@ -38,9 +40,14 @@ class JitDisabled(SoftfingerError):
 def _chosen_compiler() -> tuple[ModuleType, str]:
     """Return the compiler module and the reason for using `plain`, or an empty string."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        raise JitDisabled("NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset it")
+        raise JitDisabled(
+            "NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset this variable"
+        )
     if ".".join(numba.__version__.split(".")[:2]) not in TESTED_NUMBA:
-        return plain, f"Numba {numba.__version__} is not one of {', '.join(TESTED_NUMBA)}"
+        return plain, (
+            f"Numba {numba.__version__} has not been tested, expected one of "
+            f"{', '.join(TESTED_NUMBA)}"
+        )
     try:
         from softfinger.kinematics.compiled import compiler
     except (ImportError, AttributeError) as error:
@@ -54,8 +61,8 @@ _compiler, why_plain = _chosen_compiler()
 def kernel(function: Function) -> Function:
     """Compile ``function`` with Numba, with an on-disk cache and IEEE arithmetic.
 
-    The kernel keeps the GIL, because the control loop might wait a whole switch interval to
-    reacquire it.
+    The kernel keeps the GIL. If the GIL were released, the control loop might wait a whole switch
+    interval to reacquire it.
     """
     return cast(Function, _compiler.compiled(function, _OPTIONS))
 

@@ -1,4 +1,4 @@
-"""Cache folder for compiled kernels, one for each state of the sources and the compiler.
+"""Manage the cache folders for compiled kernels, one for each state of the sources and compiler.
 
 The folder name is a digest of all sources that a kernel may depend on, the versions of Python,
 Numba, llvmlite and NumPy, and the processor. Outdated kernels are therefore never loaded. The files
@@ -31,7 +31,8 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 ROOT = Path(__file__).resolve().parents[2]  # directory of the package `softfinger`
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-_FOLDERS_MAX = 4  # other cache folders to keep, from other checkouts or the previous release
+# Number of other cache folders to keep, e.g. from other checkouts or the previous release.
+_FOLDERS_MAX = 4
 _RECENT = 600.0  # s; folders used this recently are kept, because they may still be in use
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
@@ -51,8 +52,8 @@ def kernel_folder() -> OwnFolder | None:
         return find_kernel_folder()
     except (OSError, RuntimeError) as error:
         warnings.warn(
-            f"compiled kernels can't be stored, so every start compiles them again: {error} "
-            "(NUMBA_CACHE_DIR selects another folder)",
+            "compiled kernels can't be stored, so they will be recompiled at every start: "
+            f"{error} (to use another folder, set NUMBA_CACHE_DIR)",
             RuntimeWarning,
             stacklevel=2,
         )
@@ -78,7 +79,7 @@ def find_kernel_folder() -> OwnFolder:
 
 
 def keep(folder: OwnFolder, name: str, content: bytes) -> None:
-    """Store a kernel. On failure, issue a warning; the next start then compiles it again."""
+    """Store a kernel; on failure, issue a warning, and the next start recompiles the kernel."""
     try:
         folder.write(name + _KERNEL, hashlib.sha256(content).digest() + content)
     except OSError as error:
@@ -99,12 +100,12 @@ def kept(folder: OwnFolder, name: str) -> bytes | None:
 def _without_checksum(data: bytes) -> bytes:
     content = data[_DIGEST:]
     if hashlib.sha256(content).digest() != data[:_DIGEST]:
-        raise ValueError("kernels are damaged")
+        raise ValueError("stored kernels are corrupted")
     return content
 
 
 def damaged(folder: OwnFolder) -> list[str]:
-    """Return the names of corrupted or unreadable kernel files; takes a few ms in total."""
+    """Return the names of corrupted or unreadable kernel files. The check takes a few ms."""
     found = []
     for name in folder.names():
         if name.endswith(_KERNEL):
@@ -116,7 +117,7 @@ def damaged(folder: OwnFolder) -> list[str]:
 
 
 def remove_damaged(folder: OwnFolder) -> int:
-    """Remove corrupted files and the marks of compiled parts; return the corrupted file count.
+    """Remove corrupted files and the marks of compiled parts; return the number of corrupted files.
 
     Raises OSError.
     """
@@ -132,7 +133,7 @@ def is_marked(folder: OwnFolder, part: str) -> bool:
 
 
 def mark(folder: OwnFolder, part: str) -> None:
-    """Mark the kernels of ``part`` as compiled; on failure, the next start checks them again."""
+    """Mark the kernels of ``part`` as compiled; on failure, the next start checks all of them."""
     with contextlib.suppress(OSError):  # another process may have pruned the folder
         folder.write(part + _MARK, b"")
 

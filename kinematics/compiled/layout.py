@@ -44,7 +44,7 @@ class Records(Protocol, Generic[Each]):
 
 
 class _Slotted(type):
-    """Metaclass that allows only fields as attributes, so a misspelt name raises an error."""
+    """Metaclass that allows only fields as attributes, so that a misspelt name raises an error."""
 
     def __new__(meta, name: str, bases: tuple[type, ...], names: dict[str, Any]) -> _Slotted:
         return super().__new__(meta, name, bases, {"__slots__": (), **names})
@@ -81,7 +81,7 @@ class Record(metaclass=_Slotted):
 
 
 class _Views(dict[str, Any]):
-    """Cached views of a record's fields; creating a view takes ten times as long as using it."""
+    """Cached views of a record's fields. Creating a view takes ten times as long as using it."""
 
     def __init__(self, kind: type[Record], one: Any) -> None:
         self._kind = kind
@@ -128,7 +128,7 @@ class _Compound:
 
     def __set__(self, record: Any, value: Any) -> None:
         if self.inner is not None:
-            raise AttributeError(f"{self._name} is a record: set its fields")
+            raise AttributeError(f"{self._name} is a record: set its individual fields")
         record._fields[self._name][...] = value
 
 

@@ -1,4 +1,4 @@
-"""Folders that only the current user can modify, and atomic file writes.
+"""Check that only the current user can modify a folder, and write files atomically.
 
 A user who can write to a parent folder can replace the folder, even between the check and its use.
 Therefore all parent folders are checked, the folder is opened once, files are read through its
@@ -13,7 +13,7 @@ import stat
 from functools import cache
 from pathlib import Path
 
-# Windows has no owner or mode bits to check, and a folder cannot be held open there. The access
+# On Windows, there are no owner or mode bits to check, and a folder cannot be held open. The access
 # control lists of the user profile protect the folder instead.
 HAS_OWNERS = hasattr(os, "geteuid")
 NO_FOLLOW: int = getattr(os, "O_NOFOLLOW", 0)
@@ -21,13 +21,13 @@ _PLAIN: int = NO_FOLLOW | getattr(os, "O_BINARY", 0)
 
 
 def user_cache() -> Path:
-    """Return this program's cache directory. Raises RuntimeError without a home directory."""
+    """Return this program's cache directory. Raises RuntimeError if there is no home directory."""
     base = os.environ.get("XDG_CACHE_HOME")
     return Path(base) / "softfinger" if base else Path.home() / ".cache" / "softfinger"
 
 
 def fault(path: Path, found: os.stat_result) -> str:
-    """Return the reason why other users can modify ``path``, or an empty string if they cannot.
+    """Return the reason why other users can modify ``path``, or "" if they cannot modify it.
 
     ``found`` is the stat result for the path. The owner must be this user or root. Folders with the
     sticky bit, such as /tmp, are allowed: only the owner of an entry can replace it.
@@ -46,7 +46,7 @@ def _written_by_others(path: Path, found: os.stat_result) -> str:
         return ""
     others = stat.S_IWOTH | (0 if _alone_in(found.st_gid) else stat.S_IWGRP)
     mode = stat.S_IMODE(found.st_mode)
-    return f"{path}: other users may write to it ({mode:04o}): chmod go-w {path}" * bool(
+    return f"{path}: other users can write to it ({mode:04o}): chmod go-w {path}" * bool(
         mode & others
     )
 

@@ -1,8 +1,8 @@
 """Replacement for `compiler` that uses only Numba's public interface and works with any version.
 
-The results are the same. The first start takes twice as long, and later starts import Numba's
-entire library of supported functions. Numba stores the kernels in the same folder, but without a
-digest; the folder name depends on the sources and the Numba version.
+The computed results are identical. The first start takes twice as long, and later starts import
+Numba's implementations of Python and NumPy functions. Numba stores the kernels in the same folder,
+but without a digest; the folder name depends on the sources and the Numba version.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class InnerKernel:
     def __call__(self, *values: Any) -> Any:
         """Raise TypeError; only kernels can call inner kernels."""
         raise TypeError(
-            f"{self.__module__}.{self.__name__} is an inner kernel, which only kernels may call; "
-            "mark it with @kernel to call it from Python"
+            f"{self.__module__}.{self.__name__} is an inner kernel, which can be called only by "
+            "kernels; decorate it with @kernel to call it from Python"
         )
 
 

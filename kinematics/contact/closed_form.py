@@ -7,9 +7,9 @@ along its normal, which is tilted by θ from the base normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
-The formulas are exact because strain × area is an axisymmetric measure about the face's normal on
-the spherical cap, so all its moments are elementary. Beyond the limit on θ, the face touches the
-base plate.
+The formulas are exact: on the spherical cap, strain × area is an axisymmetric measure about the
+face's normal, so all its moments are elementary. Beyond the limit on θ, the face touches the base
+plate.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ __all__ = ["ClosedForms", "Fingertip", "closed_forms"]
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
-RADIUS_MAX = 1.0  # m; a larger value was probably given in millimetres
-POISSON = (0.45, 0.4995)  # range of Poisson's ratio in the solid tip data
+RADIUS_MAX = 1.0  # m; larger values were probably given in millimetres
+POISSON = (0.45, 0.4995)  # range of Poisson's ratio covered by the solid tip data
 
 
 Physics = Literal["springs", "solid", "measured"]
@@ -56,7 +56,7 @@ class Fingertip:
     face
         Whether the surface of a solid tip is "frictionless" or "sticking" on the object.
     law
-        Measured curves. They are required if ``physics`` is "measured", and must be None otherwise.
+        Measured curves; required if ``physics`` is "measured", otherwise None.
 
     Raises
     ------
@@ -79,11 +79,11 @@ class Fingertip:
                 raise ValueError(f"{name} must be {expected}, not {getattr(self, name)!r}")
         if not POISSON[0] <= self.poisson <= POISSON[1]:
             low, high = POISSON
-            raise ValueError(f"poisson must be {low} to {high}, not {self.poisson!r}")
+            raise ValueError(f"poisson must be between {low} and {high}, not {self.poisson!r}")
         if (self.physics == "measured") != (self.law is not None):
             raise ValueError(
-                "a measured tip requires a law, and other tips must not have one; "
-                f"physics: {self.physics!r}"
+                "law must be given if and only if physics is 'measured'; found physics "
+                f"{self.physics!r}"
             )
         radius = float(self.radius)
         if not (radius > 0.0 and math.isfinite(radius)):
@@ -98,7 +98,7 @@ class Fingertip:
     def theta_limit(self, d: ArrayLike) -> FloatArray:
         """Return the maximum |θ| [rad] at d [m]: asin((a − d)/a), π/2 for d ≤ 0, 0 for d ≥ a.
 
-        ``d`` is a number or an array, and so is the result.
+        The result is a number or an array, like ``d``.
         """
         h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
         # cos θ is the footprint radius divided by a. Unlike asin(h/a), this is accurate as d → 0.
@@ -108,7 +108,7 @@ class Fingertip:
 
 
 class ClosedForms(NamedTuple):
-    """Results of the closed forms, as arrays broadcast from d and θ or as NumPy scalars."""
+    """Results of the closed forms: arrays broadcast from d and θ, or NumPy scalars."""
 
     force: FloatArray  # F [N]
     energy: FloatArray  # U [J]
@@ -131,7 +131,7 @@ def theta_limit(radius: float, d: float) -> float:
 
 
 def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
-    """Broadcast the arguments; return the shape and each argument as a flat float64 array.
+    """Broadcast the arguments; return the common shape and the arguments as flat float64 arrays.
 
     Raises TypeError for arguments that are not real numbers.
     """
@@ -156,7 +156,8 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 
     ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN input.
-    The formulas are valid up to the limit on θ and are evaluated unchanged beyond it.
+    The formulas are valid up to the limit on θ. Beyond the limit, they are evaluated without
+    change.
     """
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)

@@ -1,14 +1,14 @@
 """Lookup kernels for contact tables, and the table format of spring tips.
 
 A spring tip's table stores the ratio of each quantity to its closed form for the modulus at zero
-strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, they are
-exactly 1 and the table has no coefficients.
+strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, the ratios
+are exactly 1 and the table has no coefficients.
 
 Two coordinates make the ratios analytic up to the edges of the domain: the height h = (a − d)/a,
-and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The coordinate y is even in θ. It is 1 at θ = 0 and 0 at
-the limit on θ; the peak strain is 1 − u. The domain is divided into slabs of h, 16 per octave, and
-each slab into as many pieces of y as the tolerance requires. The domain ends at h = 1/8, because
-the ratios grow as log h towards h = 0.
+and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The coordinate y is even in θ. The value of y is 1 at θ
+= 0 and 0 at the limit on θ. The peak strain is 1 − u. The domain is divided into slabs of h, 16 per
+octave, and each slab into as many pieces of y as the tolerance requires. The domain ends at h =
+1/8, because the ratios diverge as log h for h → 0.
 
 The kernels accept the record of any tip. Solid and measured tips are evaluated by `solid_lookup`.
 """
@@ -43,7 +43,7 @@ FloatArray = NDArray[np.float64]
 HALF_PI = math.pi / 2
 H_END = 0.5**OCTAVES  # h at the end of the domain
 _H_MIN = H_END * (1.0 + 2.0**-52)  # smallest number above H_END
-_END = H_END * (1.0 - 1e-12)  # h limit of the domain, with a rounding margin
+_END = H_END * (1.0 - 1e-12)  # limit of h at the end of the domain, with a rounding margin
 
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
@@ -55,8 +55,8 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bits of the smallest number abov
 def _slab(h: float) -> tuple[int, float]:
     """Return the slab index of h in (H_END, 1] and the position of h within the slab, −1 to 1.
 
-    Both are taken from the bits of the float: the exponent gives the octave, and the mantissa gives
-    the slab and the position. A slab includes its upper end but not its lower end.
+    Both results are computed from the bits of h: the exponent gives the octave, and the mantissa
+    gives the slab and the position. Each slab includes its upper end but not its lower end.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
     fraction = ((number << SLAB_BITS) & _FRACTION) | _ONE
@@ -66,7 +66,7 @@ def _slab(h: float) -> tuple[int, float]:
 
 @inlined_kernel
 def _ratios(table: Table, h: float, y: float) -> Lanes:
-    """Return the five ratios of the quantities to their closed forms."""
+    """Return the ratios of the five quantities to their closed forms."""
     slab, position = _slab(h)
     splits = table.splits
     place = y * splits
@@ -122,7 +122,7 @@ def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
 
 @inner_kernel
 def lookup_at(table: Table, d: float, theta: float) -> SixFloats:
-    """Evaluate :func:`lookup` for one table record."""
+    """Evaluate :func:`lookup` for a single table record."""
     if table.is_solid:
         return solid_lookup(table, d, theta)
     return _springs_lookup(table, d, theta)

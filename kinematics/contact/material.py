@@ -1,7 +1,7 @@
 """Stress-strain laws of tip materials.
 
 A law σ(ε) is a single polynomial on the strain range ε ∈ [0, 1], with σ(0) = 0 and a positive slope
-everywhere. It is smooth and monotone, so numerical integration converges fast.
+everywhere. The law is smooth and monotonic, so numerical integration converges quickly.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TABLE_I_STRAIN = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 TABLE_I_MODULUS = (0.135e6, 0.149e6, 0.182e6, 0.201e6, 0.207e6, 0.255e6)
 TABLE_I_MAXIMUM = 0.304e6
 # Exact coefficients c_1, c_2, … [Pa] of σ. The modulus is the lowest-degree polynomial that passes
-# through these values with zero slope at zero strain; σ is its integral.
+# through these values and has zero slope at zero strain; σ is the integral of the modulus.
 _TABLE_I = "135000 0 610000/9 4671875/12 -3015625/3 14453125/18 -4296875/21"
 
 
@@ -71,7 +71,7 @@ class Material:
         while len(c) > 1 and c[-1] == 0:
             c = c[:-1]
         if not c or c[0] <= 0:
-            raise MaterialError("the law needs a positive modulus at zero strain")
+            raise MaterialError("the law must have a positive modulus at zero strain")
         object.__setattr__(self, "coefficients", c)
         stress = (Fraction(0), *c)
         object.__setattr__(self, "law", _floats(stress))
@@ -82,8 +82,8 @@ class Material:
         if not np.all(slope > 0.0):
             worst = int(np.argmin(slope))
             raise MaterialError(
-                f"stress must rise with strain everywhere; its slope is {slope[worst]:.4g} Pa at "
-                f"strain {worst / 512:.3f}"
+                "stress must increase with strain everywhere, but its slope is "
+                f"{slope[worst]:.4g} Pa at strain {worst / 512:.3f}"
             )
 
     def __repr__(self) -> str:
@@ -104,29 +104,30 @@ class Material:
         """Return a smooth law of the polyurethane measured in Table I of the paper.
 
         The paper gives slopes of the stress-strain curve ('Young's modulus, which corresponds to
-        the slope'). They are used as the tangent modulus dσ/dε: 0.135 MPa at zero strain, then
-        0.149, 0.182, 0.201, 0.207 and 0.255 MPa at 20 to 100 %. The modulus is interpolated by the
-        lowest-degree polynomial with zero slope at zero strain, because the paper calls the first
-        value the smallest. This polynomial increases on [0, 1]. The largest modulus in the paper,
-        0.304 MPa, occurs above 100 % and is not used.
+        the slope'). These slopes are used as the tangent modulus dσ/dε: 0.135 MPa at zero strain,
+        then 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at strains of 20 to 100 %. The modulus is
+        interpolated by the lowest-degree polynomial with zero slope at zero strain, because the
+        paper calls the first value the smallest. This polynomial increases on [0, 1]. The largest
+        modulus in the paper, 0.304 MPa, occurs above 100 % strain and is not used.
         """
         return cls(tuple(map(Fraction, _TABLE_I.split())), name="table_i")
 
     @classmethod
     def from_points(cls, strain: ArrayLike, stress: ArrayLike) -> Material:
-        """Fit a smooth monotone law to measured points.
+        """Fit a smooth, monotonic law to measured points.
 
         Parameters
         ----------
         strain, stress
             Strain (a ratio) and stress [Pa]. The origin is implied. Points beyond strain 1 are
-            ignored. If the points end before strain 1, the law continues with their final slope.
+            ignored. If the points end before strain 1, the law continues with the slope at the last
+            point.
 
         Returns
         -------
         Material
-            Fitted material. Its ``misfits`` [2, n] contain the strain of each point and the
-            distance between law and point [Pa].
+            Fitted material. The material's ``misfits`` [2, n] contain the strain of each point and
+            the absolute difference between law and point [Pa].
 
         Raises
         ------
@@ -144,16 +145,16 @@ class Material:
 
     @property
     def fit_error(self) -> float:
-        """Maximum distance between the law and the fitted points [Pa]; 0 without points."""
+        """Maximum difference between the law and the fitted points [Pa]; 0 without points."""
         return 0.0 if self.misfits is None else float(self.misfits[1].max())
 
     def force_error(self, ratio: ArrayLike) -> FloatArray:
         """Return the relative force error of an upright tip due to the misfit of the law.
 
-        The force is F = 2π h² ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d. Its error is the
-        same integral over the misfits, relative to F; the misfits are interpolated linearly,
-        starting from 0 at zero strain. ``ratio`` is d/a in (0, 1], a number or an array, and so is
-        the result.
+        The force is F = 2π h² ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d. The force error is
+        the same integral over the misfits, divided by F. The misfits are interpolated linearly,
+        starting from 0 at zero strain. ``ratio`` is d/a in (0, 1]. The result is a number or an
+        array, like ``ratio``.
         """
         ratios = np.asarray(ratio, np.float64)
         if self.misfits is None:
@@ -186,7 +187,7 @@ class Material:
         return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:
-        """Return the energy density w(ε) = ∫₀^ε σ [J/m³] likewise; 0 for ε ≤ 0, NaN for NaN."""
+        """Return the energy density w(ε) = ∫₀^ε σ [J/m³]; 0 for ε ≤ 0, NaN for NaN."""
         return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:

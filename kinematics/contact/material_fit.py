@@ -1,7 +1,7 @@
-"""Fit a smooth monotone stress-strain law, or a modulus, to measured points.
+"""Fit a smooth, monotonic stress-strain law, or a modulus, to measured points.
 
-The tangent modulus is a Bernstein polynomial on [0, 1], fitted by bounded least squares. Its
-coefficients are positive, so the modulus is positive everywhere.
+The tangent modulus is a Bernstein polynomial on [0, 1], fitted by bounded least squares. The
+polynomial's coefficients are positive, so the modulus is positive everywhere.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ __all__ = ["MaterialError"]
 FloatArray = NDArray[np.float64]
 
 MIN_POINTS = 4
-_DEGREES = range(11)  # polynomial degrees of the modulus, tried in turn
+_DEGREES = range(11)  # polynomial degrees tried for the modulus, in this order
 _NEGLIGIBLE_MISFIT = 1e-9  # negligible misfit, relative to the maximum stress
-_MISFIT_RATIO_MAX = 1.5  # a lower degree is accepted up to this multiple of the smallest misfit
-_MISFIT_MAX = 0.05  # misfit above which the fit fails, relative to the maximum stress
+# Maximum misfit of an accepted lower degree, relative to the smallest misfit.
+_MISFIT_RATIO_MAX = 1.5
+_MISFIT_MAX = 0.05  # maximum misfit of a successful fit, relative to the maximum stress
 _MODULUS_MIN = 1e-3  # minimum modulus, relative to the mean
 _EXTENSION_WEIGHT = 0.1  # weight of the points that extend the curve
 _SMOOTHING = 1e-7  # weight of the modulus's second differences; prevents oscillation between points
@@ -33,7 +34,7 @@ class MaterialError(SoftfingerError, ValueError):
 
 
 def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the points up to strain 1 without the origin; raise MaterialError if invalid."""
+    """Return the points up to strain 1, without the origin; raise MaterialError if invalid."""
     x = np.asarray(strain, dtype=np.float64)
     y = np.asarray(stress, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape:
@@ -43,31 +44,41 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
     wrong = []
     bad = np.flatnonzero(~(np.isfinite(x) & np.isfinite(y)))
     if bad.size:
-        raise MaterialError(f"point {bad[0] + 1} is not a number: ({x[bad[0]]}, {y[bad[0]]})")
+        raise MaterialError(f"point {bad[0] + 1} is not finite: ({x[bad[0]]}, {y[bad[0]]})")
     if x.size < MIN_POINTS:
-        wrong.append(f"too few points: {x.size}, at least {MIN_POINTS} are needed")
+        wrong.append(f"too few points: found {x.size}, expected at least {MIN_POINTS}")
     if x.size and x[0] < 0.0:
-        wrong.append(f"strain starts below zero, at {x[0]:.6g}; compression counts as positive")
+        wrong.append(
+            f"strain must not be negative, but the first point has {x[0]:.6g}; compression "
+            "counts as positive"
+        )
     for i in np.flatnonzero(np.diff(x) <= 0.0)[:3]:
-        wrong.append(f"strain must rise: point {i + 2} has {x[i + 1]:.6g} after {x[i]:.6g}")
+        wrong.append(f"strain must increase, but point {i + 2} has {x[i + 1]:.6g} after {x[i]:.6g}")
     for i in np.flatnonzero(np.diff(y) <= 0.0)[:3]:
         wrong.append(
-            f"not monotone: stress must rise, but point {i + 2} has {y[i + 1]:.6g} Pa after "
+            f"not monotonic: stress must increase, but point {i + 2} has {y[i + 1]:.6g} Pa after "
             f"{y[i]:.6g} Pa"
         )
     top = float(np.max(np.abs(y))) if y.size else 0.0
     if x.size and abs(x[0]) <= 1e-9 and abs(y[0]) > 1e-3 * top:
-        wrong.append(f"the curve starts off zero: {y[0]:.6g} Pa at zero strain; tare it first")
+        wrong.append(
+            f"the curve must start at zero stress, but its first point has {y[0]:.6g} Pa at zero "
+            "strain; subtract this offset first"
+        )
     elif x.size and x[0] > 1e-9 and y[0] <= 0.0:
-        wrong.append(f"the curve starts off zero: {y[0]:.6g} Pa at strain {x[0]:.6g}")
+        wrong.append(
+            f"the curve must start at zero stress, but its first point has {y[0]:.6g} Pa at "
+            f"strain {x[0]:.6g}"
+        )
     if not wrong and x[-1] > 2.0:
-        wrong.append(f"strain reaches {x[-1]:.6g}; it is a ratio, not per cent")
+        wrong.append(f"strain reaches {x[-1]:.6g}; strain must be a ratio, not a percentage")
     if wrong:
         raise MaterialError("the stress-strain points can't be used: " + "; ".join(wrong))
     used = (x > 1e-9) & (x <= 1.0)
     if used.sum() < MIN_POINTS - 1:
         raise MaterialError(
-            f"too few points between strain 0 and 1: {used.sum()}, at least {MIN_POINTS - 1}"
+            f"too few points between strain 0 and 1: found {used.sum()}, expected at least "
+            f"{MIN_POINTS - 1}"
         )
     return x[used], y[used]
 
@@ -92,7 +103,7 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
     misfit, modulus = next(one for one in tried if one[0] <= enough)
     if misfit > _MISFIT_MAX:
         raise MaterialError(
-            "no smooth monotone law fits the points: the best deviates from one by "
+            "no smooth monotonic law fits the points: the best law deviates from a point by "
             f"{misfit * top:.4g} Pa of {top:.4g} Pa"
         )
     rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])
@@ -104,7 +115,7 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Extend the points to strain 1 using their slope at the end."""
     if x[-1] > 0.95:
         return x, y
-    # Fit a parabola to the last third of the points. Its end slope is limited to 0.5 to 2 times
+    # Fit a parabola to the last third of the points. Limit the slope at its end to 0.5 to 2 times
     # the mean slope of the last quarter.
     last = max(3, x.size // 3)
     back = x[-last:] - x[-1]

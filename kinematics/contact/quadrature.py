@@ -5,10 +5,10 @@ plane, and the object's face cuts the spherical cap, so
 
     F = ∬ σ(ε) dx dy,   U = ∬ z w(ε) dx dy,   ε = (n·P − h)/(z cos θ),   P = (x, y, z) on the cap.
 
-In the coordinates t = n·P and φ, the angle about the normal n, dx dy = z dt dφ (lengths divided by
-a). The integrals give the ratio of each quantity to its closed form for a constant modulus E₀. The
-ratio is 1 plus a term that describes the material's nonlinearity, so there is no cancellation as
-d → 0.
+The coordinates are t = n·P and the angle φ about the normal n. With lengths divided by a, dx dy = z
+dt dφ. The integrals give the ratio of each quantity to its closed form for a constant modulus E₀.
+The ratio is 1 plus a term that describes the material's nonlinearity, so there is no cancellation
+as d → 0.
 
 The integral over φ is exact: with ε dφ = (t − h)/(p cos θ) dχ and p = √(t² − sin² θ), ε is linear
 in cos χ, and a polynomial law needs few nodes. The integral over t is evaluated in
@@ -36,7 +36,9 @@ from softfinger.kinematics.contact.material import Material
 
 FloatArray = NDArray[np.float64]
 
-_NODES = 18  # Gauss points per piece; 14 give an error of 1e-10 in ∂F/∂θ, 18 only rounding
+# Gauss points per piece; with 14, ∂F/∂θ has an error of 1e-10; with 18, it has only rounding
+# errors.
+_NODES = 18
 _NODES_HIGH_DEGREE = 26  # for laws of degree above 8, where 18 points may give an error of 1e-11
 _PIECE_MIN = 2.0**-14  # minimum size of a graded piece, relative to the scale of the singular point
 
@@ -94,12 +96,12 @@ def ratios(
         ∂F/∂θ  1 + 2 ∫ v (q ⟨T_1⟩ + T_1(0) middle + q r²/p² ⟨T_2 + k T_2′⟩) dv/(c p)
         ∂U/∂θ  1 + 3 ∫ v² (q ⟨S_1⟩ + S_1(0) middle + q r²/p² ⟨S_2 + k S_2′⟩) dv/(c p)
 
-    The integrals run over v from 0 to 1. In terms of y, t = sin θ + y².
+    The integrals run over v from 0 to 1. The variables t and y are related by t = sin θ + y².
 
     ``gauss`` [2, n] contains points and weights on [0, 1], ``circle`` [2, m] the values cos χ and
     sin² χ at equidistant angles, and ``polynomials`` the expansions of the law. delta = d/a is in
-    (0, 1]; h = 1 − delta is passed separately to keep full precision. s = |sin θ| ≤ h, and
-    c = cos θ.
+    (0, 1]; h = 1 − delta is a separate argument, to keep full precision. s = |sin θ| ≤ h, and c =
+    cos θ.
     """
     # Near 1, compute h − s from h² − s² = c² − ρ² to avoid cancellation.
     gap = h - s if h < 0.5 else (c * c - delta * (1.0 + h)) / (h + s)
@@ -116,14 +118,14 @@ def ratios(
     first_t = polynomials[2, 0]
     count = circle.shape[1]
     nodes = gauss.shape[1]
-    # There are poles at y = 0 (unless y0 = 0) and at y² = −2 sin θ. For h = 0 there are none.
+    # The integrand has poles at y = 0 (unless y0 = 0) and at y² = −2 sin θ, but not for h = 0.
     start = max(2.0 * y0, _PIECE_MIN * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0
     sum_fd = 0.0
     sum_ft = 0.0
     sum_ut = 0.0
-    low = 0.0  # y − y0 at the ends of the piece
+    low = 0.0  # values of y − y0 at the ends of the piece
     while low < span:
         high = max(start, 2.0 * (y0 + low)) - y0
         if not high < 0.75 * span:
@@ -201,9 +203,9 @@ def integrate(
 ) -> ClosedForms:
     """Integrate force, energy and first partials for any material, to a relative error of 1e-14.
 
-    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. They are NaN outside
-    the domain, which ends at d = a and at the limit on θ. ``nodes`` is the number of Gauss points
-    per piece; by default it depends on the degree of the law.
+    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. The results are NaN
+    outside the domain, which ends at d = a and at the limit on θ. ``nodes`` is the number of Gauss
+    points per piece; by default it depends on the degree of the law.
     """
     shape, (depth, tilt) = flatten(d, theta)
     radius = tip.radius

@@ -4,21 +4,21 @@ The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3
 μ = E/(2 + 2ν) and κ = E/(3 − 6ν) are the small-strain moduli. Contact is computed in the deformed
 configuration.
 
-The data file contains polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, scaled by Young's
-modulus E and the radius a. Its ``notes`` describe the computation and the remaining errors. This
-module evaluates the polynomials for one value of ν. The energy is U = E a³ t⁵ g(t, sin² θ). Its
-partials are the force along the face's normal, N = ∂U/∂d, and the moment ∂U/∂θ. With the base force
-F, the base pressure is
+The data file contains dimensionless polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, which
+are scaled by Young's modulus E and the radius a. The ``notes`` in the file describe the computation
+and the remaining errors. This module evaluates the polynomials for one value of ν. The energy is U
+= E a³ t⁵ g(t, sin² θ). The partials of U are the force along the face's normal, N = ∂U/∂d, and the
+moment ∂U/∂θ. With the base force F, the base pressure is
 
     p(r, φ) = F/a² B_0(r) + N/a² Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r).
 
-Without friction, F = N cos θ. A sticking face holds each point of the tip where it first touched,
-while the plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ describes how the
-energy of such presses changes with the tilt. A shear force T = −N sin θ cos θ q_0 pulls the tip up
-the slope, and F = N cos θ (1 − sin² θ q_0).
+Without friction, F = N cos θ. A sticking face holds each point of the tip at the position where the
+point first touched it. The plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ
+is the derivative of the energy of such presses with respect to the tilt. A shear force T = −N sin θ
+cos θ q_0 pulls the tip up the slope, and F = N cos θ (1 − sin² θ q_0).
 
-A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). T is assumed to act at
-height a, so its moment about the base centre is T a.
+A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). The shear force is
+assumed to act at height a, so its moment about the base centre is T a.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class SolidData:
     root: float  # maximum t
     square: float  # maximum sin² θ
     energy: FloatArray  # g, ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ [5, i, j]
-    harmonics: NDArray[np.int64]  # m of each mode [k]; the first is 0
+    harmonics: NDArray[np.int64]  # order m of each mode [k]; the first is 0
     ratios: FloatArray  # q [k, i, j]
     stick: FloatArray  # q_0, ∂q_0/∂t, ∂q_0/∂sin² θ [3, i, j]
     edges: FloatArray  # ring edges, r/a [rings + 1]
@@ -61,7 +61,7 @@ class SolidData:
 
 @lru_cache(maxsize=8)
 def solid_data(tip: Fingertip) -> SolidData:
-    """Return the data that match the Poisson's ratio, base and face of a solid ``tip``."""
+    """Return the data for the Poisson's ratio, base and face of a solid ``tip``."""
     block = tip.base if tip.face == "frictionless" else f"{tip.base}-{tip.face}"
     with np.load(_FILE) as file:
         stored: dict[str, Any] = {

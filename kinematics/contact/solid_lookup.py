@@ -1,8 +1,8 @@
-"""Contact tables of solid and measured tips, and their lookup kernels.
+"""Contact tables for solid and measured tips, and the lookup kernels for these tables.
 
 All six outputs follow from the energy U = E a³ t⁵ g (see `solid_data`), where g(t, sin² θ) is a
-polynomial and t = √(d/a). They are therefore consistent to within rounding. For a sticking face, a
-second polynomial q_0 gives the reduction of the force on the base.
+polynomial and t = √(d/a). The outputs are therefore consistent with each other to within rounding.
+For a sticking face, a second polynomial q_0 describes the reduction of the base force.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
 def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate `lookup.lookup`.
 
-    For |θ| beyond the data, the energy is taken as constant in θ at fixed d, and the partials are
-    those of this energy. The force continues to vary with cos θ.
+    If |θ| is beyond the data, the energy is assumed not to depend on θ, and the partials are those
+    of this energy. The force continues to vary with cos θ.
     """
     if math.isnan(d) or math.isnan(theta):
         nan = math.nan

@@ -1,7 +1,7 @@
 """Contact tables: fast lookup of force, energy and their partials within a certified tolerance.
 
-For every tip model, a table is one `table_record.Table` record. The `table_build` module builds the
-tables of spring tips and bounds their error; `lookup` evaluates tables.
+A table for any tip model is a single `table_record.Table` record. The `table_build` module builds
+the tables of spring tips and bounds their error; `lookup` evaluates tables.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ class ContactForces(NamedTuple):
 class Certificate(NamedTuple):
     """Bound on the relative error of all outputs, and the approximate location of the maximum.
 
-    The bound covers the whole domain including its edges, and rounding. Its assumptions are listed
-    in `table_build`. For softening laws, ∂F/∂θ may pass through zero, so its error is relative to
-    F tan θ where F tan θ is larger.
+    The bound covers the whole domain including its edges, and rounding. The assumptions behind the
+    bound are listed in `table_build`. For softening laws, ∂F/∂θ may pass through zero. The error of
+    ∂F/∂θ is therefore relative to the larger of ∂F/∂θ and F tan θ.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Certificate(NamedTuple):
     theta: float
 
 
-# tuple.__new__ builds a ContactForces of plain floats in a quarter of the constructor's time.
+# tuple.__new__ creates a ContactForces of plain floats in a quarter of the constructor's time.
 _numbers: Any = tuple.__new__
 
 _EDGE_FACTOR = 1.0 - 1e-12  # factor on d and θ that keeps edge points inside despite rounding
@@ -96,9 +96,9 @@ class ContactTable:
     data
         Array with the single table record that :func:`lookup` takes as its argument.
     header
-        The same record, accessible by field names.
+        The same record, with fields accessible by name.
     max_error
-        Bound on the relative error of all outputs. For a solid tip, it is the data error.
+        Bound on the relative error of all outputs. For a solid tip, this is the data error.
 
     Notes
     -----
@@ -130,8 +130,8 @@ class ContactTable:
             and ignores the material.
         tolerance
             Maximum relative numerical error, for spring tips only. The error of ∂F/∂θ is relative
-            to F tan θ if F tan θ is larger. Errors of the material law are not included: a modulus
-            error of 1 % changes F by 1 %.
+            to the larger of ∂F/∂θ and F tan θ. Errors of the material law are not included: a
+            modulus error of 1 % changes F by 1 %.
 
         Raises
         ------
@@ -149,8 +149,9 @@ class ContactTable:
             return cls(solid_table(tip, material))
         if material.worst_force_error > _LAW_ERROR:
             warnings.warn(
-                f"the smooth law deviates from its points by up to {material.fit_error:.4g} Pa, "
-                f"{material.worst_force_error:.1%} of F; expected at most {_LAW_ERROR:.0%}",
+                "the smooth law deviates from the measured points by up to "
+                f"{material.fit_error:.4g} Pa, {material.worst_force_error:.1%} of the force; "
+                f"expected at most {_LAW_ERROR:.0%}",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -164,7 +165,7 @@ class ContactTable:
 
     @property
     def certificate(self) -> Certificate:
-        """Bound on the relative error, and the d and θ where the error is largest."""
+        """Bound on the relative error, and the d and θ at which the error is largest."""
         return Certificate(self.max_error, self.header.worst_d, self.header.worst_theta)
 
     @property
@@ -185,11 +186,11 @@ class ContactTable:
         Parameters
         ----------
         d, theta
-            Numbers or arrays, which broadcast. Two numbers give numbers, inside the domain and
-            outside. Results are zero for d ≤ 0 and NaN for NaN input.
+            Numbers or arrays, which broadcast. If both are numbers, the results are numbers.
+            Results are zero for d ≤ 0 and NaN for NaN input.
         edge
-            If True, clamp points outside the domain without a RuntimeWarning. ``inside`` is False
-            for clamped points in either case.
+            If True, clamp points outside the domain without a RuntimeWarning. Regardless of
+            ``edge``, ``inside`` is False for clamped points.
 
         Raises
         ------
@@ -228,8 +229,8 @@ class ContactTable:
             first = outside[0]
             warnings.warn(
                 f"{outside.size} of {d.size} points are outside the contact table, the first at "
-                f"d = {1e3 * d[first]:g} mm, θ = {math.degrees(theta[first]):.3g}°; they get the "
-                "values at its edge, and `inside` is False",
+                f"d = {1e3 * d[first]:g} mm, θ = {math.degrees(theta[first]):.3g}°; for these "
+                "points, the values at the table's edge are returned and `inside` is False",
                 RuntimeWarning,
                 stacklevel=3,
             )

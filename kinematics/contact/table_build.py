@@ -1,11 +1,11 @@
 """Fit contact tables to the reference integrals with a certified error.
 
-The error is bounded for each piece of the table, over the whole domain and its edges. The bound is
-the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the higher
-coefficients, and rounding. It assumes that the reference integrals have only rounding errors, and
-that the coefficients beyond the computed ones keep decreasing. Both assumptions hold for every law
-here, since each law is a single polynomial. Pieces are halved until the bound is within the
-tolerance.
+The error is bounded for each piece of the table, over the whole domain including its edges. The
+bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
+higher coefficients, and rounding. The bound assumes that the reference integrals have only rounding
+errors, and that coefficients beyond the computed ones continue to decrease. Both assumptions hold
+for all supported laws, because each law is a single polynomial. Pieces are halved until the bound
+is within the tolerance.
 """
 
 from __future__ import annotations
@@ -45,8 +45,10 @@ from softfinger.kinematics.contact.table_record import (
 
 FloatArray = NDArray[np.float64]
 
-ROUNDING = 16.0 * np.finfo(float).eps  # rounding in the closed forms and the kernel's last products
-_EXTRA_V, _EXTRA_U = 4, 6  # Chebyshev coefficients in h and y computed beyond those stored
+# Rounding error of the closed forms and of the kernel's last products.
+ROUNDING = 16.0 * np.finfo(float).eps
+# Number of Chebyshev coefficients in h and y computed beyond the stored ones.
+_EXTRA_V, _EXTRA_U = 4, 6
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
 # Slab edges in h, from H_END to 1.
 _EDGES = [
@@ -88,7 +90,7 @@ class LawTerms:
 def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
     """Build the smallest table that meets ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
-        raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
+        raise TableError(f"the tolerance must be between 0 and 1, not {tolerance!r}")
     law, splits = LawTerms.of(material), 1
     while True:
         last = material.is_linear or splits == SPLITS_MAX
@@ -99,7 +101,7 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
             break
         splits *= 2
     raise TableError(
-        f"no contact table of this material reaches {tolerance:.3g}; the best reached "
+        f"no contact table of this material meets {tolerance:.3g}; the lowest error is "
         f"{table.max_error:.4g}"
     )
 
@@ -154,11 +156,11 @@ def _bound(
 ) -> _WorstError:
     """Return the bound on a piece's relative error and the approximate location of the maximum.
 
-    ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` are the Chebyshev
-    coefficients of the difference between ratios and table; the sum of their magnitudes bounds this
-    difference. The coefficients beyond the computed ones add less than twice the last two in each
-    direction. Each of them is less than half of its predecessor, because the ratios are analytic
-    well beyond the piece. ``rounding`` [5] is absolute.
+    ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` contains the Chebyshev
+    coefficients of the difference between ratios and table. The sum of their magnitudes bounds this
+    difference. Coefficients beyond the computed ones contribute less than twice the last two
+    coefficients in each direction, because each coefficient is less than half of its predecessor.
+    The reason is that the ratios are analytic well beyond the piece. ``rounding`` [5] is absolute.
     """
     everywhere = _dense_nodes(len(h)) @ _terms(values) @ _dense_nodes(len(y)).T
     size = np.abs(everywhere)
@@ -178,11 +180,11 @@ def _bound(
 def _rounding(terms: FloatArray, steep: float, low: float, splits: int) -> FloatArray:
     """Return bounds on the rounding errors of a piece's five ratios from their Chebyshev ``terms``.
 
-    There are three sources. First, each sum of powers has at most about 32 roundings. Second, h has
-    an error of two ulps, and ``steep`` is the ratio of h to half the width of the piece. Third, y²
-    has an error of 4 ulps divided by h², because cos² θ − ρ² cancels near the limit on θ. There the
-    slope of the ratios in y is 0, so the second derivative bounds the error due to y². In addition,
-    y has an error of ``splits`` ulps.
+    There are three sources. There are four rounding errors. First, each sum of powers has at most
+    about 32 roundings. Second, h has an error of two ulps, and ``steep`` is the ratio of h to half
+    the width of the piece. Third, y² has an error of 4 ulps divided by h², because cos² θ − ρ²
+    cancels near the limit on θ. At this limit, the slope of the ratios in y is 0, so the second
+    derivative bounds the error due to y². Fourth, y has an error of ``splits`` ulps.
     """
     i, j = np.arange(terms.shape[1])[:, None], np.arange(terms.shape[2])
     size = np.abs(terms)
@@ -203,7 +205,7 @@ def _terms(values: FloatArray) -> FloatArray:
 
 @cache
 def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return Chebyshev nodes on [−1, 1] and the matrix that turns node values into coefficients."""
+    """Return Chebyshev nodes on [−1, 1] and the matrix from node values to coefficients."""
     nodes: FloatArray = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     inverse = np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
     return nodes, np.asarray(inverse, dtype=np.float64)
@@ -211,7 +213,7 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def _dense_nodes(count: int) -> FloatArray:
-    """Evaluate ``count`` Chebyshev polynomials at points dense enough to resolve all of them."""
+    """Evaluate ``count`` Chebyshev polynomials at points that are dense enough to resolve them."""
     return np.asarray(chebyshev.chebvander(np.cos(np.linspace(np.pi, 0.0, 4 * count)), count - 1))
 
 

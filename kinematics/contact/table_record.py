@@ -1,8 +1,8 @@
 """Record type of contact tables, and the evaluation of their polynomials.
 
 A table consists of pieces. Each piece has five polynomials in two variables (the lanes), which are
-evaluated together. Their meaning and variables depend on the tip model; see `lookup` and
-`solid_lookup`.
+evaluated together. The meaning of the polynomials and of their variables depends on the tip model;
+see `lookup` and `solid_lookup`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ThreeFloats: TypeAlias = tuple[float, float, float]
 LANES = 5
 POWERS_U, POWERS_V = 12, 6  # terms in each variable
 PIECE = POWERS_V * POWERS_U * LANES  # coefficients per piece
-OCTAVES = 3  # octaves of the height h, covered by the pieces of a spring tip
+OCTAVES = 3  # octaves of the height h that the pieces of a spring tip cover
 SLAB_BITS = 4  # 2^4 slabs per octave
 SPLITS_MAX = 4  # maximum number of pieces per slab
 PIECES = OCTAVES * 2**SLAB_BITS * SPLITS_MAX
@@ -53,8 +53,8 @@ class Table(Record):
     at_first: float  # g at t = 0, from Hertz theory
     tolerance: float
     max_error: float  # bound on the relative error; data error for a solid tip
-    worst_d: float  # d of the largest error [m]
-    worst_theta: float  # θ of the largest error [rad]
+    worst_d: float  # d at which the error is largest [m]
+    worst_theta: float  # θ at which the error is largest [rad]
     coefficients: Annotated[FloatArray, PIECES * PIECE]
 
 

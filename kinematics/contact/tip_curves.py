@@ -37,7 +37,7 @@ class TipCurves:
     The curves are valid up to ``deepest`` [m] and ``tilt`` [rad]. ``centre`` [m] and ``rotation``
     [rad] locate the tip on the sensor, as in `SensorGrid`. ``presses`` is the number of presses
     used. Four sums describe a frame: the force [N], the first moments in x and y [N·m] and the
-    second moment [N·m²]. They are taken over the cell forces, which are pressure times area.
+    second moment [N·m²]. The sums are taken over the cell forces, i.e. pressure times area.
     ``rest`` contains the sums of an unloaded tip, and ``noise`` [4][4] is the covariance of one
     frame's sums. ``force_error`` (relative, for push and shown) and ``lever_error`` [m] are the
     residuals of the curves. Raises ValueError if the curves are invalid.
@@ -60,16 +60,16 @@ class TipCurves:
 
     def __post_init__(self) -> None:
         if not all(np.isfinite(getattr(self, each.name)).all() for each in fields(self)):
-            raise ValueError("a measured law's numbers must be finite")
+            raise ValueError("all numbers of a measured law must be finite")
         if not (0.0 < self.deepest <= self.radius and 0.0 < self.tilt < 0.5 * math.pi):
-            raise ValueError("a measured law must reach from 0 to some depth and tilt")
+            raise ValueError("a measured law must have a depth and a tilt range above 0")
         shapes = dict.fromkeys(("push", "shown", "lever", "extent"), (POWERS, SQUARES))
         for name, shape in (shapes | {"rest": (4,), "noise": (4, 4)}).items():
             if np.shape(getattr(self, name)) != shape:
                 raise ValueError(f"{name}: expected the shape {shape}")
         for name in ("push", "shown"):
             if not rises(getattr(self, name), self.root, self.square):
-                raise ValueError(f"{name} must rise with d")
+                raise ValueError(f"{name} must increase with d")
 
     @property
     def root(self) -> float:
@@ -105,7 +105,7 @@ def _shifted_polynomial(count: int, end: float) -> FloatArray:
 
 
 def rises(curve: ArrayLike, root: float, square: float) -> bool:
-    """Return True if the curve is positive and increases with t on (0, root] × [0, square]."""
+    """Return True if the curve is positive and increasing in t on (0, root] × [0, square]."""
     t, q = np.meshgrid(np.linspace(0.0, root, 41), np.linspace(0.0, square, 9), indexing="ij")
     values = _value(t, q, np.asarray(curve))
     return bool((np.diff(values, axis=0) > 0.0).all() and (values[0] >= 0.0).all())

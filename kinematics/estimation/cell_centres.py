@@ -21,8 +21,8 @@ def cell_centres(
     """Return height, x and y of the cells as flat arrays; ``active`` [rows, cols] masks cells.
 
     The height is √(a² − x² − y²) at the cell centre, or at the corner nearest to the tip centre if
-    the cell centre is outside the rim. It is −∞ for inactive cells and for cells outside the disc
-    of ``radius`` [m] around the tip centre.
+    the cell centre is outside the rim. The height is −∞ for inactive cells and for cells outside
+    the disc of ``radius`` [m] around the tip centre.
     """
     a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
     rows, cols = active.shape
@@ -40,7 +40,7 @@ def cell_centres(
 
 @fast_inner_kernel
 def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
-    """Return Σ p, Σ p² and the maximum p ≥ 0; if a cell is not finite, Σ p is not finite either."""
+    """Return Σ p, Σ p² and the maximum of 0 and all p; non-finite cells make Σ p non-finite."""
     total = 0.0
     energy = 0.0
     peak = np.int64(0)
@@ -48,7 +48,8 @@ def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
         value = frame[k] if height[k] >= 0.0 else 0.0
         total += value
         energy += value * value
-        # Non-negative floats sort like their bits. Comparing bits avoids special cases for NaN.
+        # Non-negative floats have the same order as their bit patterns. Comparing the bit patterns
+        # avoids special cases for NaN.
         bits = np.float64(value).view(np.int64)
         peak = bits if bits > peak else peak
     return total, energy, np.int64(peak).view(np.float64)

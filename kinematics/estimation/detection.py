@@ -20,10 +20,11 @@ from softfinger.kinematics.sensing.footprint import (
     steps,
 )
 
-_HYSTERESIS = 0.5  # ratio of the detection levels during and before a contact; avoids flicker
-STRONG_PEAK = 6.0  # noise standard deviations; above it, the largest cell is tested first
+# Ratio of the detection level during a contact to the level before; avoids flicker.
+_HYSTERESIS = 0.5
+STRONG_PEAK = 6.0  # noise standard deviations; if the largest cell reads more, it is tested first
 _NOISE_RATIO = 1.75  # ratio of measured and set noise above which a frame is noisy
-_SUSPECT_PEAK = 4.0  # noise standard deviations; with a smaller largest cell no frame is noisy
+_SUSPECT_PEAK = 4.0  # noise standard deviations that the largest cell of a noisy frame exceeds
 
 
 @inner_kernel
@@ -54,11 +55,12 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
     """Test the frame for a contact and store the result in ``state.signal``.
 
     A contact is detected if a cell reads at least ``peak_level`` · noise and the weighted sum of
-    its neighbours exceeds ``patch_level`` standard deviations. A single outlier is therefore not
-    detected as a contact. A cell and its neighbours are independent, so at levels of 3 and 4.9 the
-    false alarm rate for white noise on 788 cells is 788 · 1.35e-3 · 4.8e-7 = 5.1e-7 per frame. At a
-    noise of 0.2 % of the modulus, a contact of d = 0.2 mm is detected in 99.98 % of frames (150 000
-    simulated frames, all azimuths, tilts up to 30°, positions between cells).
+    its neighbours exceeds ``patch_level`` standard deviations. A single outlying cell is therefore
+    not detected as a contact. A cell and its neighbours are statistically independent. At levels of
+    3 and 4.9, the false alarm rate for white noise on 788 cells is therefore 788 · 1.35e-3 · 4.8e-7
+    = 5.1e-7 per frame. With a noise of 0.2 % of the modulus, a contact of d = 0.2 mm is detected in
+    99.98 % of frames (150 000 simulated frames, all azimuths, tilts up to 30°, positions between
+    cells).
     """
     signal = state.signal
     grid = state.grid
@@ -91,8 +93,8 @@ def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bo
     """Return True if the cells of a frame without contact scatter by more than their noise.
 
     Only cells above a centre are used, since readings may be clipped at 0. The centre is the mean
-    reading, or 0 if more than a quarter of the cells read 0. Half of 788 cells measure the noise
-    with a standard deviation of 4 %.
+    reading, or 0 if more than a quarter of the cells read 0. With half of 788 cells, the noise is
+    determined with a standard deviation of 4 %.
     """
     signal = state.signal
     if not (signal.is_finite and signal.peak > signal.mean + _SUSPECT_PEAK * signal.noise):
@@ -114,11 +116,11 @@ def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bo
 def shows_pattern(state: EstimatorState, frame: FloatArray, cells: Cells) -> bool:
     """Return True if a solid tip's frame matches the contact pattern significantly.
 
-    A solid tip spreads much of its pressure over the base. A weak contact is therefore visible in
-    the sum over all cells long before it is visible in any neighbourhood. The pattern has zero mean
-    and unit norm, so a common zero offset and noise clipped at 0 are not detected as a contact. The
-    threshold is ``patch_level`` noise standard deviations, or half of it after a contact in the
-    last frame.
+    A solid tip spreads much of its pressure over the base. A weak contact is therefore detectable
+    in the sum over all cells long before it is detectable in the neighbourhood of a cell. The
+    pattern has zero mean and unit norm, so a common zero offset and noise clipped at 0 are not
+    detected as a contact. The threshold is ``patch_level`` noise standard deviations, or half this
+    value if the last frame contained a contact.
     """
     projection = 0.0
     for k in range(frame.shape[0]):
@@ -135,7 +137,7 @@ def presses_outside(
 
     The footprint is extended by two cells and three standard deviations of the blur. ``level`` is
     in frame units. The weighted mean of a cell's neighbours must exceed a third of ``level``, so a
-    single cell is not enough.
+    single cell is not sufficient.
     """
     grid = state.grid
     a = grid.radius
@@ -167,9 +169,9 @@ _MASK_DEPTH = 1e3  # m, lowers the height of masked cells beyond the reach of an
 
 @inner_kernel
 def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
-    """Return True if the largest cell is too high above its neighbours to be part of a contact.
+    """Return True if the largest cell exceeds its neighbours by too much to be part of a contact.
 
-    The reading of a contact about as wide as a cell is at most ``signal.narrow_contact_max``. In a
+    A contact that is about as wide as a cell reads at most ``signal.narrow_contact_max``. In a
     wider contact, each cell reads less than twice the mean of its neighbours.
     """
     rows = state.grid.rows

@@ -1,7 +1,7 @@
 """Error budget: propagate errors other than white cell noise into the covariance of an estimate.
 
-White noise of variance σ² gives the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit. The
-other errors are propagated linearly:
+White noise of variance σ² gives the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit.
+Errors other than white noise are propagated linearly:
 
     shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                        (`set_shared_errors`)
       residuals        Σ size² qᵀq − m·(size Jᵀq)
@@ -17,12 +17,12 @@ x and y, the tip centre in x and y, the pitch, and the modulus or gain. ``size``
 deviation of each error. Patterns that move the tip relative to the cells are computed from pressure
 differences between neighbouring cells.
 
-R is the noise correlation as a function of the lag, as measured by `calibrate`. The widening due to
-R depends on the footprint size and is tabulated. W² are the fractions of a smooth error's energy
-that appear as a change of d and gain, and as a tilt. They are small because the errors of real
-cells are nearly as symmetric as the pressure. r_k are the residuals. For independent noise, the
-products of neighbouring residuals average to zero, whereas a misfit that is smooth over the
-footprint contributes fully to the sum.
+R is the noise correlation as a function of the lag; it is measured by `calibrate`. The widening due
+to R depends on the footprint size and is tabulated. W² contains the fractions of a smooth error's
+energy that appear as a change in d and gain, and as a tilt. The fractions are small because the
+errors of real cells are nearly as symmetric as the pressure. r_k are the residuals. For independent
+noise, the products of neighbouring residuals average to zero, whereas a misfit that is smooth over
+the footprint contributes fully to the sum.
 """
 
 from __future__ import annotations
@@ -61,15 +61,16 @@ __all__ = ["Uncertainty"]
 NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 NEIGHBOURS[2, 2] = 0.0
 _NOISE_PEAK = 4.5  # maximum reading due to noise alone, in standard deviations
-_CELL_COUNT_MIN = 48.0  # cells, below which smooth and rough misfits cannot be distinguished
+_CELL_COUNT_MIN = 48.0  # minimum number of cells for distinguishing smooth and rough misfits
 # Fractions of a smooth error's energy that appear in d (and the gain), in each tilt, and in the
 # residuals. Curve errors, hysteresis and crosstalk are nearly as symmetric as the pressure.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_IN_RESIDUALS = 0.15, 0.06, 0.2
 # Relative tilt error of the solid model per d/a, compared with frames from independent finite
-# elements up to 20° and 7 mm. In that range, the error is 4 % for a bonded tip and negligible for a
+# elements up to 20° and 7 mm. In this range, the error is 4 % for a bonded tip and negligible for a
 # lying tip.
 _SOLID_TILT_ERROR = 0.1
-_PRODUCT_SIGMA = 6.0  # threshold for products of neighbours, in noise standard deviations
+# Noise standard deviations, threshold for the products of neighbouring residuals.
+_PRODUCT_SIGMA = 6.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Uncertainty:
         Relative errors of the cell pitch, the tip's modulus and the common gain of all cells.
     correlation
         Noise correlation of two cells by their distance in rows and columns, [rows, cols], with 1
-        at [0, 0]. It is 0 at larger distances. None means white noise.
+        at [0, 0]. The correlation is 0 at larger distances. None means white noise.
     slope
         Change of the zero offset from the tip centre to its rim, in x and in y [Pa].
     smooth
@@ -132,9 +133,9 @@ def set_budget(
 ) -> None:
     """Set the error budget, and raise the threshold of the activity test above the common errors.
 
-    The material's ``fit_error`` [Pa], the distance between the law and the fitted points, acts like
-    a shift of the pressed cells. ``pattern`` [rows, cols] is the pattern used to detect the contact
-    of a solid tip.
+    The material's ``fit_error`` [Pa], the maximum difference between the law and the fitted points,
+    acts like a zero shift of the pressed cells. ``pattern`` [rows, cols] is the pattern used to
+    detect the contact of a solid tip.
     """
     budget, options = state.budget, state.options
     modulus = 0.0 if options.free_gain else math.hypot(known.modulus, known.gain)
@@ -161,7 +162,7 @@ def set_budget(
         with_centre = float((weights * _cropped(rho, 5)).sum()) if pattern is None else 0.0
         variance = float(quadratic(weights, rho)) - with_centre**2
         level = (level * math.sqrt(max(variance, 0.0)) + _NOISE_PEAK * max(with_centre, 0.0)) / norm
-    # A shift of twice the baseline's standard deviation must not be detected as a contact.
+    # A zero shift of twice the standard deviation ``baseline`` must not be detected as a contact.
     shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
     options.patch_level = level + max(shift, 0.0)
 
@@ -193,7 +194,8 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
     kernel = np.zeros(shape)
     kernel[: rho.shape[0], : rho.shape[1]] = rho
     kernel = np.roll(kernel, (-(rho.shape[0] // 2), -(rho.shape[1] // 2)), (0, 1))
-    # A measured correlation may imply negative power at some frequencies; clip the power at zero.
+    # A measured correlation may imply negative power at some frequencies, so clip the power at
+    # zero.
     power = np.maximum(np.fft.fft2(kernel).real, 0.0)
     waves = np.fft.fft2(several, shape, axes=(0, 1))
     out = np.einsum("xyi,xy,xyj->ij", waves.conj(), power, waves).real / power.size
@@ -203,7 +205,7 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
 def _set_widening(
     state: EstimatorState, rho: FloatArray, grid: SensorGrid, tip: Fingertip, material: Material
 ) -> None:
-    """Tabulate the widening by correlated noise at zero tilt, and the degrees of freedom used."""
+    """Tabulate the widening by correlated noise at zero tilt, and the fit's degrees of freedom."""
     options = state.options
     first = 0 if options.free_gain else 1
     for k in range(DEPTHS):
@@ -249,7 +251,7 @@ def widen_covariance(state: EstimatorState) -> float:
 
 @fast_inner_kernel
 def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> tuple[float, float]:
-    """Return the sum of the products of row-wise neighbouring residuals [Pa²], and their number.
+    """Return the sum [Pa²] and the number of products of neighbouring residuals in a row.
 
     Only cells with a modelled pressure above ``lowest`` [Pa] are included.
     """
@@ -269,14 +271,14 @@ def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> 
 def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> float:
     """Return the part of the squared misfit [Pa²] that is smooth over the footprint.
 
-    The result is 0 if noise explains the misfit. ``beyond`` [Pa²] is the total misfit in excess of
-    the expected value. If the footprint has only a few cells, the smooth part cannot be separated
-    and the whole excess is returned.
+    The result is 0 if noise explains the misfit. ``beyond`` [Pa²] is the excess of the total misfit
+    over its expected value. If the footprint has only a few cells, the smooth part cannot be
+    separated; in this case, the whole excess is returned.
     """
     fit = state.fit
     variance = state.signal.variance
     cols = state.grid.cols
-    # Near the floor, clipping raises the mean reading above the pressure.
+    # Near the floor, clipping increases the mean reading above the pressure.
     lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip_noise
     total, number = _neighbours_products(
         cells, lowest, index(fit.first_row * cols), index(fit.last_row * cols)
@@ -340,8 +342,8 @@ def _project(
 def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     """Set ``budget.shared``, the covariance of the fit parameters due to common errors.
 
-    ``fit.inverse`` must be the covariance for white noise of variance 1 Pa². Returns the squared
-    residuals [Pa²] that result if each common error is twice its standard deviation.
+    ``fit.inverse`` must be the covariance for white noise of variance 1 Pa². Returns the sum of
+    squared residuals [Pa²] that results if each common error equals twice its standard deviation.
     """
     fit = state.fit
     budget = state.budget
@@ -374,7 +376,8 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
         size = budget.sizes[source]
         if size == 0.0:
             continue
-        # Patterns that move or scale the pressure are proportional to the gain; offsets are not.
+        # Patterns that shift or scale the pressure image are proportional to the gain; offsets are
+        # not.
         size *= gain if source >= PLACE_X else 1.0
         remaining += size * size * budget.squares[source]
         for i in range(PARAMETERS):
@@ -388,7 +391,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     along = budget.tilt_error * fit.d / state.grid.radius
     for i in range(2):
         for j in range(2):
-            # Components along and across the tilt direction.
+            # Split into components along and across the tilt direction.
             n_i = fit.n_y if i else fit.n_x
             n_j = fit.n_y if j else fit.n_x
             m_i = fit.n_x if i else -fit.n_y

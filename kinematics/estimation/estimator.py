@@ -1,6 +1,6 @@
 """Estimate displacement, tilt, gain and their covariance from a frame of a pressure grid.
 
-This module contains `ContactEstimator` and its result `ContactEstimate`. A frame is processed in
+This module contains `ContactEstimator` and its result `ContactEstimate`. Each frame is processed in
 one compiled call; see `frame_pipeline`.
 """
 
@@ -80,16 +80,16 @@ class ContactEstimate:
     - The model explains at least 80 % of the frame's squared pressure.
     - There is no second contact.
     - The smooth part of the residual could change d by at most 60 % (one standard deviation). If
-      the gain is outside the range 1/2 to 2, the limit is 3 %, because a gain error and a smooth
-      residual together indicate a different tip.
+      the gain is outside the range 1/2 to 2, this limit is 3 % instead, because a gain error
+      together with a smooth residual indicates a different tip.
     - The standard deviation of d due to the known uncertainties is at most half of d.
 
-    The covariance includes the smooth residual (for example on a curved face) and the known
-    uncertainties.
+    The covariance includes the smooth residual, which occurs for example on a curved face, and the
+    known uncertainties.
 
     Without a contact, d and the tilts are 0, the estimate is valid, and ``d_std`` is the smallest
-    detectable d. Two errors cannot be detected from a single frame: a wrong modulus with a fixed
-    gain, and a tip that is displaced on the sensor.
+    detectable d. Two errors cannot be detected from a single frame: a wrong modulus if the gain is
+    fixed, and a displacement of the tip on the sensor.
     """
 
     contact: bool = False
@@ -116,7 +116,7 @@ class ContactEstimate:
         if not self.valid:
             return f"ContactEstimate: not valid: {self.invalid.text}"
         if not self.contact:
-            return f"ContactEstimate: no contact of more than {1e3 * self.d_std:.2g} mm"
+            return f"ContactEstimate: no contact deeper than {1e3 * self.d_std:.2g} mm"
         pairs = (self.tilt_x, self.tilt_x_std), (self.tilt_y, self.tilt_y_std)
         tilts = ", ".join(f"{math.degrees(a):z.2f} ± {math.degrees(std):.2f}°" for a, std in pairs)
         d = f"d {1e3 * self.d:.3f} ± {1e3 * self.d_std:.3f} mm"
@@ -162,8 +162,8 @@ class Readings:
         Reading at which a cell saturates [counts, or Pa for float frames]. None means the integer
         type's maximum.
     threshold
-        Smallest nonzero count that the board sends; smaller readings are sent as 0. It applies to
-        integer frames only.
+        Smallest nonzero count that the board sends; smaller readings are sent as 0. This threshold
+        applies to integer frames only.
     quantum
         Size of one count [Pa] if float frames were converted from counts clipped at 0, otherwise 0.
 
@@ -188,31 +188,33 @@ _RESULTS = (
     "rejected_count", "contact", "has_second_contact", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
-# Parameters of the fit and the activity test. They can be modified in `ContactEstimator.state`.
-_TOLERANCE = 16.0  # squared ratio of the step to the noise floor, below which the iteration ends
+# Default parameters of the fit and the activity test; `ContactEstimator.state` contains the values
+# in use.
+_TOLERANCE = 16.0  # squared ratio of step to noise floor below which the iteration ends
 _ITERATIONS = 20
 PEAK_LEVEL = 3.0  # noise standard deviations, see `detection.activity`
 PATCH_LEVEL = 4.9
 _R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
-# Minimum number of model points per tip radius, for linear and for nonlinear material laws. At a
+# Minimum number of model points per tip radius, for linear and for nonlinear material laws. With a
 # noise of 0.2 % of the modulus and tilts up to 25°, the bias is at most a quarter of the noise
-# floor. Within 4° of the domain limit, it is up to four times the noise floor.
+# floor. Within 4° of the domain limit, the bias is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
-_DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # limits of d/a and sin θ in a spring fit
-_STEP_MARGIN = 1.01  # factor by which a fit may exceed the data range of a solid tip
+_DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum d/a and sin θ in a spring fit
+_STEP_MARGIN = 1.01  # factor by which the fit of a solid tip may exceed the data range
 _SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear force, relative to its normal force
 # Width of the excluded rim of a solid tip, relative to the radius.
 _RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
-CELLS_MIN = 9  # minimum number of cells to estimate a solid tip's contact and shear
+CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact and shear
 
 
 def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
     """Return a mask [rows, cols] of the cells inside a solid tip's rim.
 
-    The model may be wrong at the rim. The stress of a bonded base is singular there and depends on
-    the mesh. Compared with frames from independent finite elements, the model's rms error is 3 %
-    with these cells and 0.6 % without them. If a lying base is tilted, the model predicts tension
-    at the rim, where real rubber lifts off. The mask also allows for an uncertain tip position.
+    The model may be inaccurate at the rim, where the stress of a bonded base is singular and
+    depends on the mesh. Compared with frames from independent finite elements, the model's rms
+    error is 3 % if the rim cells are included and 0.6 % otherwise. If a lying base is tilted, the
+    model predicts tension at the rim, where real rubber lifts off. The mask also takes the
+    uncertainty of the tip position into account.
     """
     margin = max(_RIM_WIDTH[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
     cells = grid.on(tip)
@@ -244,8 +246,8 @@ class ContactEstimator:
     readings
         Range and resolution of the readings.
     known
-        Other uncertainties of the sensor. They widen the covariance and reduce the sensitivity of
-        the contact detection. The material's ``fit_error`` is added to them.
+        Other uncertainties of the sensor. These uncertainties, together with the material's
+        ``fit_error``, widen the covariance and reduce the sensitivity of the contact detection.
 
     Raises
     ------
@@ -272,14 +274,14 @@ class ContactEstimator:
     ) -> None:
         if tip.physics == "measured":
             raise ValueError(
-                "a measured tip has no frame model: use "
+                "the frames of a measured tip can't be modelled by this class: use "
                 "softfinger.kinematics.estimation.measured.MeasuredEstimator"
             )
         if active is not None and np.shape(active) != grid.shape:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
         readings = readings or Readings()
         self.grid = grid
-        self._full = math.nan  # saturation for the type of the last frame
+        self._full = math.nan  # saturation value for the type of the last frame
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         known = known or Uncertainty()
@@ -289,7 +291,8 @@ class ContactEstimator:
             alive = alive & cells_within_rim(grid, tip, known)
             if alive.sum() < CELLS_MIN:
                 raise ValueError(
-                    f"a solid tip needs {CELLS_MIN} active cells within its rim, got {alive.sum()}"
+                    f"a solid tip requires at least {CELLS_MIN} active cells within its rim, got "
+                    f"{alive.sum()}"
                 )
         state = self.state = EstimatorState()
         options = self._options = state.options
@@ -363,7 +366,7 @@ class ContactEstimator:
 
         fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
         points = points_of(model_cells, material, grid.blur, count_for(cells, fineness))
-        # All kernel arguments except the state and the frame.
+        # All arguments of the kernel except the state and the frame.
         self._arrays = self._rows, pixels, weights.array, *points
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:
@@ -379,8 +382,8 @@ class ContactEstimator:
     ) -> float:
         """Return the smallest d [m] of an upright contact that the activity test detects.
 
-        The test compares a frame with the ``pattern``. If ``pattern`` is None, it examines the
-        cells around the largest reading.
+        The test compares a frame with the ``pattern``. If ``pattern`` is None, the test examines
+        the cells around the largest reading.
         """
         options = self._options
         uses_pattern = pattern is not None
@@ -406,8 +409,8 @@ class ContactEstimator:
     def saturation(self) -> float | None:
         """Reading at which a cell saturates; None means the integer type's maximum.
 
-        Update it when the zero offset subtracted from the readings changes. Setting a value that is
-        not positive raises ValueError.
+        Update this value when the zero offset that is subtracted from the readings changes. Setting
+        a value that is not positive raises ValueError.
         """
         return self._saturation
 
@@ -429,9 +432,10 @@ class ContactEstimator:
         self._options.noise = noise
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
-        """Estimate the contact from this frame alone and return a new result.
+        """Estimate the contact from this frame alone, and return a new result.
 
-        Earlier frames have no influence. See :meth:`update` for the arguments and exceptions.
+        Earlier frames do not affect the result. See :meth:`update` for the arguments and
+        exceptions.
         """
         estimate = self.state.estimate
         before, seq, last = self._estimate.copy(), self._seq, self._last
@@ -458,7 +462,8 @@ class ContactEstimator:
         pascal_per_count
             Conversion factor from readings to Pa.
         seq
-            Sequence number. If it equals the last frame's number, the last result is returned.
+            Sequence number. If this number equals the last frame's number, the last result is
+            returned.
 
         Returns
         -------
@@ -475,7 +480,7 @@ class ContactEstimator:
         full = _SATURATION_COUNTS.get(frame.dtype) if isinstance(frame, np.ndarray) else None
         if full is None:
             kind = getattr(frame, "dtype", type(frame).__name__)
-            raise ValueError(f"a frame is uint8, uint16, float32 or float64, got {kind}")
+            raise ValueError(f"a frame must be uint8, uint16, float32 or float64, got {kind}")
         if frame.shape != self.grid.shape:
             raise ValueError(f"a frame must have shape {self.grid.shape}, got {frame.shape}")
         if not 0.0 < pascal_per_count < math.inf:
@@ -509,8 +514,8 @@ class ContactEstimator:
 def _with_data_errors(known: Uncertainty, tip: Fingertip, free_gain: bool) -> Uncertainty:
     """Add the errors of a solid tip's data, from a comparison with independent finite elements.
 
-    The pressure error is included only with a free gain. It is as symmetric as the pressure itself,
-    so it hardly changes d if the gain is known.
+    The pressure error is included only with a free gain. The pressure error is as symmetric as the
+    pressure itself, so it hardly affects d if the gain is known.
     """
     data = solid_data(tip)
     smooth = data.pressure_error if free_gain else 0.0

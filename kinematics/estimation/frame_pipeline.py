@@ -34,14 +34,15 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import points_in
 
-# Clipping of the noise at 0 raises the sums of neighbourhoods. This increase of the detection level
-# restores the false alarm rate.
+# Clipping the noise at 0 increases the sums over neighbourhoods. Increasing the detection level by
+# this amount restores the false alarm rate.
 CLIPPED_LEVEL_INCREASE = 0.5
-GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside this range, the contact is not of this tip on this sensor
+GAIN_MIN, GAIN_MAX = 0.05, 20.0  # range of the gain for a contact of this tip on this sensor
 D_MAX = 0.75  # maximum valid d, relative to the radius
 # Maximum relative error of d that a smooth misfit may cause. The curved face of a disc causes an
 # error of this size, which is included in the covariance. If the gain is far from 1, a smaller
-# limit applies: both together indicate a different tip, which the covariance does not cover.
+# limit applies: such a gain together with a smooth misfit indicates a different tip, which the
+# covariance does not cover.
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
@@ -49,14 +50,14 @@ GAIN_FAR = 2.0
 # and to the peak), the sensor needs a tare. A solid tip loads all cells, but 5 % of them read less
 # than 0.32 of the peak.
 ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
-FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among those above half the peak
-ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for which linear propagation is valid
+FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among the cells above half the peak
+ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for a valid linear error propagation
 SHARED_MAX = 0.5  # maximum standard deviation of d due to known uncertainties, relative to d
 
 
 @inner_kernel
 def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Fit by maximum likelihood from the last estimate, or from the frame alone if that fails."""
+    """Fit by maximum likelihood from the last estimate or, if this fails, from the frame alone."""
     estimate = state.estimate
     options = state.options
     signal = state.signal
@@ -77,7 +78,7 @@ def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Ce
                 reason = Invalid.MODEL_MISMATCH
                 continue
             # Search for a second contact only if the residual exceeds the noise and a small
-            # fraction of the energy. Skip solid tips, which load their whole base.
+            # fraction of the energy. Skip this search for solid tips, which load their whole base.
             if not options.is_solid and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
@@ -135,7 +136,7 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
     n_y = s * estimate.n_x + c * estimate.n_y
     estimate.tilt_x = math.asin(n_x)
     estimate.tilt_y = math.asin(n_y)
-    # ∂tilt/∂n = 1/cos tilt. Only the two middle rows and columns need the rotation.
+    # ∂tilt/∂n = 1/cos tilt. Only the two middle rows and columns must be rotated.
     per_x = 1.0 / math.sqrt(1.0 - n_x * n_x)
     per_y = 1.0 / math.sqrt(1.0 - n_y * n_y)
     for j in range(4):
@@ -177,7 +178,8 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
     reason = _fit_frame(state, model, frame, cells)
     fit = state.fit
     if state.options.is_solid and reason == Invalid.NOT_CONVERGED:
-        # A contact of this tip either converges within the data range or is explained at its limit.
+        # For a contact of this tip, the fit either converges within the data range or explains the
+        # frame at the limit of the range.
         unexplained = fit.misfit > (1.0 - state.options.r_squared_min) * fit.readings
         reason = Invalid.MODEL_MISMATCH if unexplained or not fit.is_limited else reason
     if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
@@ -197,7 +199,7 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 
 @inner_kernel
 def _reset_results(state: EstimatorState, scale: float, step: float) -> None:
-    """Set the frame unit and clear the last results except for the contact."""
+    """Set the frame unit and clear all previous results except the contact."""
     options = state.options
     signal = state.signal
     grid = state.grid
@@ -208,7 +210,8 @@ def _reset_results(state: EstimatorState, scale: float, step: float) -> None:
     signal.saturation = options.saturation * scale
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
-    # A contact no wider than a cell strains it by at most about pitch²/2a². Allow gains up to 3.
+    # A contact that is no wider than a cell causes a strain of at most about pitch²/2a². Allow for
+    # gains up to 3.
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate
@@ -261,8 +264,8 @@ def estimate_frame(
     rejected = without_outliers(state, frame, cells.height)
     strong = False
     if state.options.is_solid and signal.is_finite:
-        # Every contact matches the pattern. A strong signal without the pattern is not a contact of
-        # this tip; a small common zero offset is not a signal.
+        # Every contact of a solid tip matches the pattern. A strong signal without the pattern is
+        # not a contact of this tip. A small common zero offset does not count as a signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > STRONG_PEAK * signal.noise
         signal.contact = shows_pattern(state, frame, cells)

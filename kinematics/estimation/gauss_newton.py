@@ -1,4 +1,4 @@
-"""Gauss-Newton fit of a contact to one pressure frame, as kernels.
+"""Kernels for the Gauss-Newton fit of a contact to one pressure frame.
 
 The parameters are the gain, d, n_x, n_y and, for solid tips, the shear force on the face along x
 and y. Each step uses the pressures and partials from the tip's forward model.
@@ -36,8 +36,8 @@ from softfinger.kinematics.sensing.solid_pressure import own_shear, press_solid
 from softfinger.kinematics.sensing.springs_pressure import press_springs
 
 # With a free gain, the covariance is multiplied by 1 + _GAIN_CURVATURE (σ_d/d)². The factor was
-# determined by comparing the squared errors in simulated frames over the operating range with the
-# linear prediction.
+# determined by comparing squared errors with the linear prediction, in simulated frames over the
+# operating range.
 _GAIN_CURVATURE = 6.0
 _HALVINGS_MAX = 5
 _LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of the model
@@ -47,9 +47,9 @@ _PIVOT_MIN = 1e-11
 
 # A cell that cannot read below its floor (0, or the smallest count sent) has a mean reading above
 # the true pressure. At a pressure z standard deviations above the floor, this excess, in standard
-# deviations, is E[max(z + e, 0)] − z = E[max(e − z, 0)] with e ~ N(0, 1). It is approximated by
-# (1 − z/CLIP_END)² times this polynomial, to within 3e-4. Cells more than CLIP_BELOW below the
-# floor carry almost no information.
+# deviations, is E[max(z + e, 0)] − z = E[max(e − z, 0)] with e ~ N(0, 1). The excess is
+# approximated by (1 − z/CLIP_END)² times this polynomial, to within 3e-4. Cells more than
+# CLIP_BELOW below the floor carry almost no information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
@@ -111,8 +111,8 @@ def free_noise(square: float, floor: float) -> float:
     """Return a cell's noise σ [Pa] from the mean ``square`` [Pa²] of unloaded cells.
 
     These cells read 0 below ``floor`` [Pa], so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. For a
-    floor of 0, this is half the variance. If all cells read below the floor, σ is less than a third
-    of the floor.
+    floor of 0, E[y²] is half the variance. If all cells read below the floor, the result is
+    slightly less than a third of the floor.
     """
     if not floor > 0.0:
         return math.sqrt(2.0 * square)
@@ -143,7 +143,7 @@ def _clip_noise(
 ) -> float:
     """Use the unloaded cells to estimate the noise [Pa] of cells clipped at the floor.
 
-    If the unloaded cells show no noise, no correction is needed.
+    If the unloaded cells do not show noise, a correction is not needed.
     """
     signal = state.signal
     inside, inside_number = _energy_inside(frame, cells, index(first), index(last))
@@ -159,9 +159,9 @@ def _clip_noise(
 def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
     """Compute ``residual`` and ``factor`` of each cell, and their sums, from readings and model.
 
-    A cell cannot read below 0, even where the rubber is in tension, nor below the floor. A
-    saturated cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the
-    noise is clipped at the floor; otherwise, cells with a model below the floor are excluded.
+    A cell cannot read below the floor, or below 0 even where the rubber is in tension. A saturated
+    cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the noise is
+    clipped at the floor; otherwise, cells with a model below the floor are excluded.
     """
     fit = state.fit
     saturation = state.signal.saturation
@@ -243,7 +243,7 @@ def _accumulate(fit: Fit, cells: Cells, first: int, last: int) -> None:
 def _accumulate_shear(
     fit: Fit, images: Images, cells: Cells, row: int, first: int, second: int
 ) -> None:
-    """Compute the normal-equation entries of one shear image, which starts at ``first``."""
+    """Compute the entries of the normal equations for the shear image that starts at ``first``."""
     t0 = t1 = t2 = t3 = own = other = right = 0.0
     for k in range(index(0), index(cells.factor.shape[0])):
         factor = cells.factor[k]
@@ -301,7 +301,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
     """Solve the normal equations for parameters first to last; set step, inverse and decrement.
 
     Returns False if a pivot of the scaled matrix is too small. In this case, the frame does not
-    determine all parameters.
+    contain enough information to determine all parameters.
     """
     normal = fit.normal
     lower = fit.lower
@@ -346,7 +346,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
 
 @inner_kernel
 def _apply_step(state: EstimatorState) -> bool:
-    """Apply the step, clamped to the limits of the model; return False if d was clamped."""
+    """Apply the step, clamped to the model's limits; return False if d was clamped."""
     fit = state.fit
     options = state.options
     shallow = fit.d
@@ -368,7 +368,7 @@ def _apply_step(state: EstimatorState) -> bool:
 
 @inner_kernel
 def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
-    """Set the covariance of (d, n_x, n_y, gain) from that of the fit parameters."""
+    """Set the covariance of (d, n_x, n_y, gain) from the covariance of the fit parameters."""
     for i in range(4):
         for j in range(4):
             out[(i + 3) % 4, (j + 3) % 4] = variance * inverse[i, j]
@@ -378,7 +378,7 @@ def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
 def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
     """Compute χ² of the solved fit, and the covariance due to common errors and smooth misfit.
 
-    Returns the noise variance [Pa²], or a negative number if there are too few cells. The variance
+    Returns the noise variance [Pa²], or a negative value if there are too few cells. The variance
     is increased if the misfit exceeds its expected scatter. The returned variance times
     ``fit.inverse`` is the covariance due to noise.
     """
@@ -427,7 +427,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
         y = fit.shear[1] + own * fit.n_y
         estimate.shear_x = along * x - across * y
         estimate.shear_y = across * x + along * y
-    # Noise may push the fit beyond the limits of the model; clamp the result.
+    # Clamp the result, because noise may push the fit beyond the limits of the model.
     within = min(1.0, options.sine_max / max(math.sqrt(square), 1e-9))
     estimate.d = min(fit.d, options.deepest)
     estimate.n_x = within * fit.n_x
@@ -438,7 +438,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
     variance = _check_fit(state, model, cells)
     wider = 1.0
     if options.free_gain:
-        # The larger the uncertainty of d, the less linearly d depends on the gain.
+        # The relation between d and the gain is less linear for a larger uncertainty of d.
         uncertain = variance * fit.inverse[DEPTH, DEPTH] + state.budget.shared[DEPTH, DEPTH]
         wider += _GAIN_CURVATURE * min(uncertain / (fit.d * fit.d), 1.0)
     set_covariance(fit.inverse, wider * variance, fit.covariance)
@@ -450,7 +450,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
 def fit(
     state: EstimatorState, model: Model, frame: FloatArray, cells: Cells, tolerance: float
 ) -> bool:
-    """Run Gauss-Newton from the contact in ``state.estimate`` and store the new estimate there.
+    """Run the Gauss-Newton method from the contact in ``state.estimate``; store the result there.
 
     The iteration stops if the predicted decrement is below ``tolerance`` · variance, where
     ``tolerance`` is the squared ratio of the step to the noise floor. Returns False if the frame

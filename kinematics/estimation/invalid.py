@@ -11,7 +11,7 @@ class Invalid(IntEnum):
     """Reason why an estimate is invalid, or ``NONE`` if it is valid.
 
     ``text`` is the message for users. If several reasons apply, a fault in the readings takes
-    precedence over its effect on the fit.
+    precedence over problems of the fit.
     """
 
     text: str
@@ -24,22 +24,22 @@ class Invalid(IntEnum):
 
     NONE = 0, ""
     NOT_FINITE = 1, "readings are not finite"
-    BELOW_ZERO = 2, "cells read below zero: tare"
-    ABOVE_ZERO = 3, "all cells read above zero: tare"
+    BELOW_ZERO = 2, "the cells read below zero: tare the sensor"
+    ABOVE_ZERO = 3, "all cells read above zero: tare the sensor"
     OUTLIERS = 4, "too many outliers"
     SATURATED = 5, "saturated"
-    SECOND_CONTACT = 6, "the tip has two contacts"
-    NOT_CONVERGED = 7, "the fit does not converge"
-    MODEL_MISMATCH = 8, "the frame does not fit the tip's model"
-    OUT_OF_RANGE = 9, "deeper or steeper than the contact model covers"
-    UNCERTAIN = 10, "too uncertain: press harder, or calibrate"
+    SECOND_CONTACT = 6, "the frame shows two contacts on the tip"
+    NOT_CONVERGED = 7, "the fit did not converge"
+    MODEL_MISMATCH = 8, "the frame does not match the tip's contact model"
+    OUT_OF_RANGE = 9, "depth or tilt is outside the range of the contact model"
+    UNCERTAIN = 10, "the estimate is too uncertain: use more force, or calibrate the sensor"
     # The following reasons are set by the daemon, which tracks estimates over time.
-    NO_FRAME = 11, "no frame yet"
+    NO_FRAME = 11, "no frame has arrived yet"
     BAD_FRAME = 12, "the board is disconnected, or its frames repeat"
-    STALE = 13, "no valid frame for too long"
-    CONTRADICTS_JOINTS = 14, "inconsistent with the joints"
-    NOT_IN_SCENE = 15, "not in the scene"
-    SERVO_NOT_READ = 16, "servo not read"
+    STALE = 13, "no valid frame has arrived for too long"
+    CONTRADICTS_JOINTS = 14, "the frames are inconsistent with the joints"
+    NOT_IN_SCENE = 15, "the finger is not in the scene"
+    SERVO_NOT_READ = 16, "the servo could not be read"
 
 
 REASONS = tuple(Invalid)

@@ -80,11 +80,11 @@ class MeasuredEstimator:
 
     Notes
     -----
-    An estimate is ``valid`` if it is within the measured range of the curves and the frame's extent
-    differs by less than 8 % from the value expected for the force.
+    An estimate is ``valid`` if it is within the measured range of the curves, and if the frame's
+    extent is within 8 % of the value expected for the force.
     """
 
-    saturation: float | None = None  # saturated cells are used like any other cell
+    saturation: float | None = None  # saturated cells are treated like all other cells
 
     noise = 0.0  # not used: the curves include the measured noise
 
@@ -111,7 +111,7 @@ class MeasuredEstimator:
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
         sum_std = math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
         self._contact_threshold = _CONTACT_SIGMA * sum_std
-        # Maximum undetected d, whose force equals the contact threshold.
+        # Maximum undetected d; its force equals the contact threshold.
         root = self._root_of(self._contact_threshold, 0.0, self._root_max)
         self._undetected_d = tip.radius * root**2
         self._seq: int | None = None
@@ -162,7 +162,7 @@ class MeasuredEstimator:
         self._seq = None
 
     def _root_of(self, force: float, q: float, t: float) -> float:
-        """Solve ``shown`` = ``force`` for t with Newton's method, starting at ``t``."""
+        """Solve ``shown`` = ``force`` for t by Newton's method, starting at ``t``."""
         for _ in range(24):
             value, by_t, _ = _curve(self._law.shown, t, q)
             before = t
@@ -199,7 +199,7 @@ class MeasuredEstimator:
         for found, out in zip(covariances, (result.covariance, result.systematic), strict=True):
             out[:3, :3] = found * np.outer(per_tilt, per_tilt)
         extent = force * _curve(self._law.extent, t, s * s)[0]
-        # A second contact changes the mean squared radius by more than this tolerance.
+        # A second contact would change the mean squared radius by more than this tolerance.
         tolerance = _EXTENT_ERROR_MAX * extent + _CONTACT_SIGMA * math.sqrt(self._noise[3, 3])
         agrees = abs(square - extent) < tolerance
         t_max = _EXTRAPOLATION_MAX * self._root_max * (1.0 - 1e-9)
@@ -214,16 +214,16 @@ class MeasuredEstimator:
 
         Both covariances are those of (d, n_x, n_y): one for all errors, and one for the errors
         common to all frames. The errors of the sum and of both moments are propagated through the
-        partials, in axes along and across the tilt. The tilt range of the calibration presses
-        serves as a prior where the centroid hardly determines the tilt. As in a Kalman update, the
+        partials, in axes along and across the tilt. Where the centroid hardly determines the tilt,
+        the tilt range of the calibration presses serves as a prior. As in a Kalman update, the
         prior pulls the tilt towards 0; this error is common to all frames.
         """
         law, known, q = self._law, self._known, s * s
         shown, shown_t, shown_q = _curve(law.shown, t, q)
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        # Partials of (sum, moment along the tilt) with respect to (d, s), and of the moment across
-        # the tilt with respect to the tilt across.
+        # Partials of (sum, moment along the tilt) with respect to (d, s), and the partial of the
+        # moment across the tilt with respect to the tilt in that direction.
         by_d = shown_t * per_d, s * (shown_t * per_d * lever + shown * lever_t * per_d)
         b = 2.0 * s * shown_q
         by_s = b, shown * lever + s * (b * lever + shown * 2.0 * s * lever_q)

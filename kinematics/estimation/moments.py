@@ -1,6 +1,6 @@
-"""Initial estimate of a contact from the sum, centroid and extent of a frame, as kernels.
+"""Kernels for the initial contact estimate from the sum, centroid and extent of a frame.
 
-The pressure moments over the footprint are compared with those of the model, which are tabulated
+The pressure moments over the footprint are compared with the model's moments, which are tabulated
 versus d. The force or the extent determines d, and the centroid determines the tilt.
 """
 
@@ -19,12 +19,13 @@ from softfinger.kinematics.estimation.state import START_POINTS, Cells, Estimato
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, set_around, set_face
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-# Margin around the footprint for cell centres, in cell diagonals. It includes all cells that touch
-# the footprint, even after a small motion of the contact.
+# Margin around the footprint, in cell diagonals. Cells whose centres are within this margin include
+# all cells that touch the footprint, even after a small motion of the contact.
 _MARGIN = 0.75
-_BLUR_MARGIN = 2.0  # additional margin, in standard deviations of the blur
-_TILT = 0.2  # rad, tilt at which the centroid arm is computed; the arm hardly depends on the tilt
-_WEAK_PEAK = 15.0  # peak in noise standard deviations, below which neighbourhoods are used
+_BLUR_MARGIN = 2.0  # additional margin around the footprint, in standard deviations of the blur
+# rad, tilt at which the centroid's moment arm is computed; the arm hardly depends on the tilt.
+_TILT = 0.2
+_WEAK_PEAK = 15.0  # noise standard deviations; below this peak, neighbourhoods are used
 _SINE_MAX = 0.95
 _NO_LEVEL = -1e300  # threshold below every reading
 
@@ -69,7 +70,7 @@ def _inverse(values: FloatArray, value: float) -> float:
 
 @inner_kernel
 def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Estimate the contact from the frame alone: from strong cells, then twice from moments."""
+    """Estimate the contact from the frame alone: once from strong cells, twice from moments."""
     m = state.moments
     signal = state.signal
     estimate = state.estimate
@@ -90,7 +91,7 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
         if not m.total > 0.0:
             at = signal.row * state.grid.cols + signal.col
             m.total, m.x, m.y, m.number = 1.0, cells.x[at], cells.y[at], 1.0
-        # About three quarters of the cells of a weak contact exceed the threshold.
+        # In a weak contact, about three quarters of the cells exceed the threshold.
         _set_from_area(m, state.grid, 1.3 * m.number if weak else m.number)
         _refine(state, frame, cells)
         _refine(state, frame, cells)
@@ -105,8 +106,8 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
 def _sums_of_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
     """Compute the same sums as :func:`sums_above` for pressures of a few times the noise.
 
-    Single noisy cells would distort the sums. Therefore only cells that read at least twice the
-    noise and have a significant neighbourhood are included.
+    Single noisy cells would distort the sums. Therefore the sums include only cells that read at
+    least twice the noise and have a significant neighbourhood.
     """
     m = state.moments
     level = 2.0 * state.signal.noise

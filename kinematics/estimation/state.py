@@ -11,11 +11,11 @@ from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
 OUTLIERS_MAX = 6  # maximum number of outliers excluded from a frame
-# Fit parameters; only solid tips have the last two.
+# Fit parameters; the last two apply only to solid tips.
 GAIN, DEPTH, TILT_X, TILT_Y, SHEAR_X, SHEAR_Y = range(6)
 PARAMETERS = 6
-START_POINTS = 17  # depths in the table for the initial estimate
-DEPTHS = 12  # depths in the table of correlated-noise effects
+START_POINTS = 17  # number of depths in the table for the initial estimate
+DEPTHS = 12  # number of depths in the table of correlated-noise effects
 # Patterns of common errors: a shift of all cells, its slopes in x and y, the tip position in x and
 # y, the pitch, and the pressure itself.
 SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING, PRESSURE = range(7)
@@ -57,12 +57,12 @@ class Signal(Record):
     scale: float  # Pa per count
     variance: float  # noise of a cell [Pa²]
     noise: float  # standard deviation of a cell [counts]
-    narrow_contact_max: float  # maximum reading of a contact as wide as a cell [counts]
+    narrow_contact_max: float  # maximum reading of a contact that is as wide as a cell [counts]
     patch_level: float
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf without a floor
     number: int  # number of cells that a contact can press
-    peak: float  # largest reading [counts]; row and col are −1 if it is below the level
+    peak: float  # largest reading [counts]; if it is below the level, row and col are −1
     row: int
     col: int
     mean: float  # [counts]
@@ -73,7 +73,7 @@ class Signal(Record):
 
 
 class Estimate(Record):
-    """Estimate for one frame, in sensor and then finger axes, and initial guess for the next."""
+    """Estimate for one frame, first in sensor axes, then in finger axes; next initial guess."""
 
     d: float
     gain: float
@@ -94,7 +94,7 @@ class Estimate(Record):
     n_x: float
     n_y: float
     shear: Pair  # model shear force divided by the squared radius [Pa]
-    residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]
+    residual: float  # Σ of (reading − model)² − reading² over the footprint [Pa²]
     undetected: float  # relative error of d that a smooth misfit may cause
     shared: float  # relative standard deviation of d due to known uncertainties
     covariance: Matrix  # of (d, tilt_x, tilt_y, gain)

@@ -1,9 +1,10 @@
 """Kernels for an object held by two rotational fingers: motion, holding torques and load.
 
-Coordinates and signs follow :mod:`hand.geometry`. The tips stick and roll, and the joints are at
-standstill. Because a pressure grid cannot measure shear, the load along the faces is estimated from
-the joint torques. After subtracting the contributions of the normal forces and of the tips' turning
-moments, the residual is the shear force times its moment arm about the pivot.
+Coordinates and signs follow :mod:`hand.geometry`. The tips roll without slipping, and the joints
+are at standstill. Because a pressure grid cannot measure shear, the load along the faces is
+estimated from the joint torques. The contributions of the normal forces and of the tips' turning
+moments ∂U/∂θ are subtracted from the torques. The residual is the shear force times its moment arm
+about the pivot.
 
 The object's faces may be inclined by a taper α, which is positive if the object is wider at the
 palm. Then θ = φ + q1 − α/2 at the left tip and θ = φ − q2 + α/2 at the right tip, where the
@@ -24,7 +25,7 @@ from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 FloatPair = tuple[float, float]  # (left, right)
 Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
 
-_SHEAR_STEPS = 3  # fixed-point iterations for the shears; each adds two digits
+_SHEAR_STEPS = 3  # fixed-point iterations for the shear forces; each adds two digits
 
 
 @kernel
@@ -58,9 +59,9 @@ def held_motion(
     2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m], and
     ``width`` is W cos(α/2), the distance between the contacts along n.
 
-    In turn_i, W is limited to at least half the tip radius. A thinner object rotates more slowly
-    than ideal rolling because of its inertia and the tips' shear compliance, so the prediction
-    would diverge without this limit.
+    In turn_i, W is limited to at least half the tip radius. Without this limit, the prediction
+    would diverge for thinner objects, whose inertia and the tips' shear compliance make them rotate
+    more slowly than in ideal rolling.
     """
     q1, q2 = q
     d1, d2 = d
@@ -126,11 +127,11 @@ def holding_moment_arms(
 
         τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
 
-    Moment equilibrium of the object gives T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2, where T is the mean
-    shear force. Tapered faces push the object out, so the shear force is T − N tan(α/2) at the left
-    tip and T + N tan(α/2) at the right tip; α is the ``taper`` [rad]. F is the mean contact force
-    of both tips, so a common modulus cancels in the moment arms τ/F [m]. N is the mean of the
-    normal forces N1 and N2 [N], which differ if the surroundings exert friction on the object.
+    From the moment equilibrium of the object, T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2, where T is the
+    mean shear force. Tapered faces push the object out, so the shear force is T − N tan(α/2) at the
+    left tip and T + N tan(α/2) at the right tip; α is the ``taper`` [rad]. F is the mean contact
+    force of both tips, so a common modulus cancels in the moment arms τ/F [m]. N is the mean of the
+    normal forces N1 and N2 [N]. N1 and N2 differ if the surroundings exert friction on the object.
     ``data1`` and ``data2`` are the contact table arrays. All results are zero unless both tips are
     in contact.
     """
@@ -178,7 +179,7 @@ def _unexplained(
     arm: float,
     moment_arm: float,
 ) -> tuple[float, float, float]:
-    """Return one finger's residual torque [N·m] and its decrease with T and T².
+    """Return one finger's residual torque [N·m] and its decrease per T and T².
 
     The residual is the joint torque, signed by ``side``, minus the contributions of N, ∂U/∂θ and T.
     """
@@ -221,8 +222,9 @@ def load_torques(
 ) -> tuple[float, float, float, float]:
     """Return the residual torques and the load model of a held object.
 
-    δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t axis
-    can explain. If each tip carries a force L [N], half of the load 2 L, the torques are
+    δ1 and δ2 [N·m] are the parts of the joint torques that can be caused only by a load along the
+    object's t axis. If each tip carries a force L [N], i.e. half of a total load of 2 L, the
+    torques are
 
         τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
@@ -233,16 +235,16 @@ def load_torques(
     the result of :func:`held_motion`. For parallel faces, ±v_i·n equals arm_i and lever_i equals
     W turn_i.
 
-    δ_i is the residual of τ_i at L = 0. A load gives exactly
-    (δ1 + δ2)/2 = moment_arm L + curvature L². The function returns (δ1, δ2, moment_arm, curvature).
-    All four are zero if a tip is not in contact or if a load would not change the torques.
+    δ_i is the residual of τ_i at L = 0. For a load, (δ1 + δ2)/2 = moment_arm L + curvature L² holds
+    exactly. The function returns (δ1, δ2, moment_arm, curvature). All four are zero if a tip is not
+    in contact or if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, _, _, across = motion
-    # Remove the motion along the bisector, which does not contribute to the moment arms.
+    # Remove the motion along the bisector, because it does not contribute to the moment arms.
     face_slope = math.tan(0.5 * taper)
     scale = 1.0 / (1.0 + face_slope * face_slope)
     moment_arm1 = scale * (across * turn1 - face_slope * arm1)
@@ -265,7 +267,8 @@ def load_torques(
 def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
     """Solve torque = moment_arm L + curvature L² [N·m]; return L [N] and the slope ∂torque/∂L [m].
 
-    No load can cause a torque beyond the parabola's vertex; there the minimum slope is used.
+    Torques beyond the parabola's vertex cannot be caused by a load; for them, the minimum slope is
+    used.
     """
     slope_min = _SLOPE_MIN * moment_arm
     slope = math.sqrt(

@@ -6,10 +6,10 @@
 
 Here r = R/C_w, s = C_w/C_c, τ_w = C_w R_wc and τ_c = C_c R_ca, where R is the electrical
 resistance, C_w and C_c are heat capacities, and R_wc and R_ca are thermal resistances. α is the
-temperature coefficient of copper, and g = ((C − A)/30 K)^(1/4) describes natural convection. For
-known I², the model is linear except for α and g, which are evaluated at the current estimate. A
-constant reading carries little information; a step in the reading gives an accurate case
-temperature.
+temperature coefficient of copper, and g = ((C − A)/30 K)^(1/4) describes natural convection. If I²
+is known, the model is linear except for the terms with α and g, which are evaluated at the current
+estimate. A constant reading carries little information, but a step in the reading determines the
+case temperature accurately.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ROOM_TEMPERATURE = 25.0  # °C
 _CONVECTION_DIFFERENCE = 30.0  # K above ambient at which τ_c is defined
 _INITIAL_STD = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
 _RANDOM_WALK = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
-_STEP_STD = 0.12  # °C, standard deviation of the case temperature when the reading steps
+_STEP_STD = 0.12  # °C, standard deviation of the case temperature at a step of the reading
 _STAY_STD = 6.0  # °C, standard deviation of a constant reading over 1 s
 _COUPLING = 0.25  # unobservable τ_w error, as a fraction of W − C
 
@@ -72,7 +72,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
         return
     _predict(s, square, dt)
     stepped = reading - s.reading
-    if abs(stepped) > 1.0:  # missed steps or a different sensor
+    if abs(stepped) > 1.0:  # the filter missed steps, or the sensor was replaced
         _correct(s, reading, 1.0)
     elif stepped != 0.0:
         _correct(s, reading - 0.5 * stepped, _STEP_STD * _STEP_STD)
@@ -83,7 +83,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
 
 @inner_kernel
 def _convection_factor(over: float) -> float:
-    """Return the convection factor g for a case that is ``over`` K above ambient, at least 1 K."""
+    """Return the convection factor g for a case at ``over`` K above ambient, but at least 1 K."""
     return math.sqrt(math.sqrt(max(over, 1.0) / _CONVECTION_DIFFERENCE))
 
 

@@ -1,18 +1,18 @@
-"""Virtual spring between the joints that keeps a held object upright despite sticking tips.
+"""Compute the virtual joint spring that keeps a held object upright despite sticking tips.
 
 Two mirrored fingers hold an object of width W between parallel faces with a displacement d at each
 tip. The small antisymmetric motions are the object's angle φ and the antisymmetric joint angle
-δ = (q1 − q2)/2. They change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual spring k
-between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by kδ. For a
-normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ + σ,
-where c is 2/3 for the spring model of the paper. With b = k/(N B) and pivots 2B apart,
+δ = (q1 − q2)/2. These motions change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual
+spring k between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by
+kδ. For a normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ
++ σ, where c is 2/3 for the spring model of the paper. With b = k/(N B) and pivots 2B apart,
 
     T = N (φ − bδ)                                       the forces of both fingers are collinear
     W T = N ((W + 2(a − d))φ − 2ℓδ) + 2 ∂U/∂θ            moment balance of the object
     σ = (a − d + ℓ)δ − W(φ − φ0)/2                       rolling since the tips stuck
 
-where ℓ = L sin q + e cos q. The last equation integrates the stick condition while d and q change,
-so the result does not depend on the path. For an object whose angle is φ0 at first contact,
+where ℓ = L sin q + e cos q. The last equation integrates the stick condition over changes in d and
+q, so the result does not depend on the path. For an object whose angle is φ0 at first contact,
 
     φ/φ0 = W D/(W D − 4 (a − d + cd) M)
     D = 2ℓ + (1 − 2c)d − b(W − d)        M = a − d + ℓ + (1 + b)d/2

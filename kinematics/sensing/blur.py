@@ -1,9 +1,9 @@
-"""Sample points of cells along one axis, and their weights in the cell mean.
+"""Compute sample points of cells along one axis, and their weights in the cell mean.
 
 The elastomer over a sensor spreads pressure like a Gaussian blur. A Gaussian blur is separable: it
-is a weighted sum over neighbouring points along one axis, then along the other. The blur is
-therefore included in the weights with which a cell averages its points. Without blur, a cell
-averages its own points with equal weights.
+is a weighted sum over neighbouring points along one axis, followed by a weighted sum along the
+other axis. The weights with which a cell averages its points therefore include the blur. Without
+blur, a cell averages its own points with equal weights.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Points; moment-matching weights are used below this width, Gaussian samples above it.
+# Width in points; moment-matching weights are used below it, and Gaussian samples above it.
 _MOMENT_MATCHED_MAX = 0.75
-_CUTOFF = 4.5  # standard deviations, truncation of the Gaussian
+_CUTOFF = 4.5  # truncation of the Gaussian, in standard deviations
 
 
 def axis_points(
@@ -25,9 +25,9 @@ def axis_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the positions of points [count, cells] and their weights in the mean of one cell.
 
-    There are ``number`` cells of width ``pitch``, beginning at ``start``. Cells within the range of
-    the blur are added on both sides. The value of cell j is the sum over m and q of weights[m, q]
-    times point m of cell j + q.
+    The axis has ``number`` cells of width ``pitch``, and the first cell begins at ``start``. On
+    both sides, cells within the range of the blur are added. The value of cell j is the sum of
+    weights[m, q] times point m of cell j + q, over all m and q.
     """
     mean = np.convolve(stencil(blur * count / pitch), np.full(count, 1.0 / count))
     half = (len(mean) - count) // 2

@@ -1,4 +1,4 @@
-"""Outline of the footprint on a grid of cells, as kernels.
+"""Kernels for the outline of the footprint on a grid of cells.
 
 The forward model and the estimator share this geometry. Lengths are in m, in sensor axes, relative
 to the tip centre. The object's face is the plane ``n·(x, y, z) = h`` with ``h = a − d``. Above the
@@ -7,8 +7,9 @@ base point (x, y), the height of the face is ``z = u − v x − w y``, where
     u = h/n_z,  v = n_x/n_z,  w = n_y/n_z,
 
 and the spring strain at this point is ``ε = 1 − (u − v x − w y)/√(a² − x² − y²)`` (eq. 2 of the
-parallel-distributed model). The footprint {ε > 0} is the projection of a flat disc. It is an
-ellipse or, beyond the model's domain, an ellipse truncated by the rim; both are convex.
+parallel-distributed model). The footprint {ε > 0} is the projection of a flat disc. The footprint
+is an ellipse or, beyond the model's domain, an ellipse truncated by the rim; both shapes are
+convex.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def line_span(face: Face, a: float, y: float) -> Span:
     root = math.sqrt(root)
     left = (v * q - root) / e
     right = (v * q + root) / e
-    # A root below the base plane is not an edge; in that case the footprint ends at the rim.
+    # A root below the base plane is not an edge of the footprint, which then ends at the rim.
     return -edge if q < v * left else left, edge if q < v * right else right
 
 

@@ -58,9 +58,11 @@ class SensorGrid:
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1:
-            raise ValueError(f"a grid needs rows and columns, got {self.rows} × {self.cols}")
+            raise ValueError(
+                f"a grid must have at least one row and one column, got {self.rows} × {self.cols}"
+            )
         if not all(0.0 < p <= _PITCH_MAX for p in self.pitches):
-            raise ValueError(f"pitch must be in metres, up to {_PITCH_MAX:g}, got {self.pitch}")
+            raise ValueError(f"pitch must be in metres, at most {_PITCH_MAX:g}, got {self.pitch}")
         if not all(math.isfinite(c) for c in (*self.centre, self.rotation)):
             raise ValueError("centre and rotation must be finite")
         if (
@@ -68,7 +70,9 @@ class SensorGrid:
             <= self.blur
             <= 0.5 * min(self.rows * self.pitches[1], self.cols * self.pitches[0])
         ):
-            raise ValueError(f"blur must be 0 to half the grid's shorter side, got {self.blur}")
+            raise ValueError(
+                f"blur must be between 0 and half of the grid's shorter side, got {self.blur}"
+            )
 
     @property
     def pitches(self) -> tuple[float, float]:
@@ -87,7 +91,8 @@ class SensorGrid:
         pitch_x, pitch_y = self.pitches
         x = -0.5 * self.cols * pitch_x - self.centre[0]
         y = -0.5 * self.rows * pitch_y - self.centre[1]
-        # The values are in field order. Setting the fields one by one takes ten times as long.
+        # The values are in field order. Setting the fields individually would take ten times as
+        # long.
         fields = (tip.radius, x, y, pitch_x, pitch_y, self.rows, self.cols)
         return Grid(np.array([fields], Grid.dtype))
 
@@ -110,9 +115,10 @@ class SensorGrid:
     ) -> FloatArray:
         """Return the pressure [Pa] of a contact, averaged over each cell.
 
-        For a spring tip, the error is at most 1e-5 of the modulus, including cells at the outline.
-        It is 1e-4 above 30° and 1e-3 where the outline almost reaches the rim. The accuracy of a
-        solid tip is that of `solid_data`; contacts outside the range of its data are clamped.
+        For a spring tip, the error is at most 1e-5 of the modulus, even in cells at the outline.
+        The error is 1e-4 for tilts above 30° and 1e-3 where the outline almost reaches the rim. For
+        a solid tip, the accuracy equals that of `solid_data`, and contacts outside the range of its
+        data are clamped.
 
         Parameters
         ----------
@@ -154,7 +160,8 @@ class SensorGrid:
         return _images(replace(self, rotation=0.0), tip)
 
 
-@lru_cache(maxsize=16)  # grids of two fingers and their shifted copies for the error budget
+# Cache size: the grids of two fingers, and shifted copies for the error budget.
+@lru_cache(maxsize=16)
 def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     return images(tip, grid.on(tip), grid.blur)
 
@@ -173,5 +180,7 @@ def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float
         raise ValueError(f"d = {d} m is more than the tip's radius {radius} m")
     n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
     if abs(tilt_x) >= 0.5 * math.pi or abs(tilt_y) >= 0.5 * math.pi or n_x**2 + n_y**2 >= 1.0:
-        raise ValueError(f"tilts {tilt_x}, {tilt_y} rad give no normal that points out of the tip")
+        raise ValueError(
+            f"tilts {tilt_x}, {tilt_y} rad are too large: the face normal must point out of the tip"
+        )
     return n_x, n_y

@@ -1,6 +1,6 @@
 """Forward model of a solid tip: a frame is a weighted sum of fixed images.
 
-Each image shows a mode from `solid_data`. A mode gives one image of the grid, or two if it is
+Each image shows a mode from `solid_data`. A mode has one image on the grid, or two images if it is
 directional: B(r) cos mφ and B(r) sin mφ, averaged over each cell. The image weights are smooth
 functions of (d, n_x, n_y). Because the sensor cannot measure tension, a cell reads 0 where the sum
 is negative.
@@ -26,10 +26,10 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
 IMAGES = 2 * MODES
-_IMAGES_PER_PASS = 4  # images added per pass; must divide IMAGES
+_IMAGES_PER_PASS = 4  # number of images added per pass; must divide IMAGES
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
-# Sample points along each side of a cell: inside the rim, cut by the rim, and with blur.
+# Sample points per cell side: for cells inside the rim, cells cut by the rim, and with blur.
 _INSIDE, _CUT, _BLURRED = 6, 24, 12
 
 
@@ -67,12 +67,12 @@ def weights_of(tip: Fingertip, material: Material) -> Weights:
 
 
 def image_count(harmonics: IntArray) -> int:
-    """Return the number of images that the modes need."""
+    """Return the number of images required for the modes."""
     return int(len(harmonics) + np.count_nonzero(harmonics))
 
 
 def images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
-    """Return the mode images, then those of shear along x and y, float64 [·, rows · cols]."""
+    """Return the mode images, followed by the images for shear along x and y, [·, rows · cols]."""
     if blur > 0.0:
         return _blurred_images(tip, cells, blur)
     data = solid_data(tip)
@@ -136,7 +136,7 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
 
 @inner_kernel
 def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
-    """Set the image weights of a contact (for Pa) and their partials in d, n_x and n_y."""
+    """Set a contact's image weights (for images in Pa) and their partials in d, n_x and n_y."""
     table = weights.table
     square = n_x * n_x + n_y * n_y
     t = math.sqrt(d * table.inverse_radius)
@@ -196,7 +196,7 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
 def own_shear(weights: Weights, d: float, square: float) -> float:
     """Return the shear force of straight indentation on a sticking face, divided by a² sin θ [Pa].
 
-    The shear acts at height a and is already included in the modes. ``weights`` must be set for
+    This shear acts at height a and is already included in the modes. ``weights`` must be set for
     this contact.
     """
     q = weights.q[0]
@@ -255,9 +255,9 @@ def _add_images(
 
 @inner_kernel
 def add_images(weights: Weights, of: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
-    """Add all images, stored consecutively in ``pixels``, multiplied by the weights ``of``.
+    """Add all images in ``pixels``, which are stored consecutively, with the weights in ``of``.
 
-    The last group may include the shear images, whose weights are 0 here.
+    The last group of images may include the shear images, whose weights are 0 here.
     """
     count = out.shape[0]
     for j in range(0, weights.images, _IMAGES_PER_PASS):
@@ -295,9 +295,9 @@ def render_solid(
     """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), multiplied by ``gain``, into ``out``.
 
     ``shear`` [N] is the force on the face along x and y, acting at height a. If ``whole`` is True,
-    it is the total shear; otherwise it is added to the shear of straight indentation. ``basis``
-    holds the grid's images. The result is zero for d ≤ 0. Contacts outside the range of the data
-    are clamped to the maximum depth and tilt at the same azimuth.
+    ``shear`` is the total shear; otherwise ``shear`` is added to the shear of straight indentation.
+    ``basis`` holds the grid's images. The result is zero for d ≤ 0. Contacts outside the range of
+    the data are clamped to the maximum depth and tilt at the same azimuth.
     """
     each = weights[0]
     table = each.table

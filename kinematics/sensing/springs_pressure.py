@@ -4,8 +4,8 @@ A cell reads the mean over sample points that are distributed evenly over its ar
 (x, y) of the base, the spring has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ with
 z = u − v x − w y; see `footprint`. Each point represents a small rectangle and uses the mean strain
 over it. Inside the footprint, the mean strain follows from tabulated means of 1/ℓ, x/ℓ and y/ℓ.
-Where the outline cuts the rectangle, only the part with f = ℓ² − z² > 0 contributes. There f is
-treated as a plane whose values are evenly distributed over the rectangle.
+Where the outline cuts the rectangle, only the part with f = ℓ² − z² > 0 contributes. In such a
+rectangle, f is approximated by a plane, and its values by a uniform distribution.
 
 The point weights include the sensor's blur; see `blur`.
 """
@@ -44,11 +44,12 @@ _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 
 
 class SpringPoints(NamedTuple):
-    """Sample points of a grid under a tip, in the layout that the kernels use.
+    """Sample points of a grid under a tip, in the memory layout that the kernels use.
 
-    A row of points is one array. It starts with the points at the first position in each cell, then
-    those at the second position, and so on. The array includes cells outside the grid within the
-    range of the blur. One-dimensional arrays allow vectorised loops.
+    Each row of points is one array. Each array contains the points at the first position in each
+    cell, followed by the points at the second position, and so on. The array also includes cells
+    outside the grid that are within the range of the blur. One-dimensional arrays allow vectorised
+    loops.
     """
 
     x: FloatArray  # from the tip centre [m], one row
@@ -126,8 +127,8 @@ def _set_strains(
 ) -> None:
     """Set ε and −∂ε/∂u of the points from ``first`` to ``last`` in the row that begins at ``row``.
 
-    ``half`` holds half the side lengths of a point's rectangle. Indices are unsigned because Numba
-    checks signed indices for negative values, which prevents vectorisation.
+    ``half`` contains half the side lengths of a point's rectangle. Indices are unsigned, because
+    Numba checks signed indices for negative values, and this check prevents vectorisation.
     """
     u = face.u
     v = face.v
@@ -140,20 +141,21 @@ def _set_strains(
         # ε > 0 where f = ℓ² − z² > 0; f is almost linear up to the rim and beyond.
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
-        # This spread of f over the rectangle makes the mean of max(f, 0) exact if the outline
-        # passes through the centre.
+        # Width of the uniform distribution of f. If the outline passes through the centre and f is
+        # a plane, the mean of max(f, 0) is then exact to within 2 %; the exact width is 4 (big +
+        # small²/(3 big)).
         by_x = abs(size_x * (x - z * v))
         by_y = abs(size_y * (y - z * w))
         big = max(by_x, by_y)
         small = min(by_x, by_y)
         spread = 4.0 * max(big, max(0.963 * big + 0.222 * small, 0.77 * big + 0.556 * small))
         part = min(max(f + 0.5 * spread, 0.0), spread)
-        # z in the middle of the part with f > 0; f decreases along (p, q).
+        # Value of z in the middle of the part with f > 0; f decreases along (p, q).
         p = x - z * v
         q = y - z * w
         away = 0.5 * max(0.5 * part - f, 0.0) / (p * p + q * q + least)
         z = max(z + away * (v * p + w * q), 0.0)
-        # Means of ε and 1/ℓ for f evenly distributed from 0 to ``part``.
+        # Means of ε and 1/ℓ for values of f that are uniformly distributed from 0 to ``part``.
         length = math.sqrt(z * z + part)
         mean = part / (spread * (length + z) + least)
         g = points.inverse[row + k]
@@ -174,7 +176,7 @@ def _start_stresses(points: SpringPoints, first: int, last: int, highest: float)
 
 @inlined_kernel
 def _raise_power(points: SpringPoints, first: int, last: int, coefficient: float) -> None:
-    """Perform one step of Horner's scheme for σ(ε) and its slope."""
+    """Perform one step of Horner's scheme for σ(ε) and its derivative."""
     for k in range(first, last):
         strain = points.strain[k]
         points.factor[k] = points.factor[k] * strain + points.stress[k]
@@ -277,7 +279,7 @@ def press_springs(
     count_y, reach = points.along.shape
     size_x = 0.5 * grid.pitch_x / count_x
     size_y = 0.5 * grid.pitch_y / count_y
-    # A rectangle that the outline cuts may have its centre outside the outline.
+    # The centre of a rectangle that the outline cuts may be outside the outline.
     set_around(around, face, a, math.hypot(size_x, size_y))
     low, high = extremes(around, a)
     lines = points.y.shape[0]

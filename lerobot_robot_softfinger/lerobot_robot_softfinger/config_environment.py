@@ -1,6 +1,7 @@
-"""Settings of the environment, set by ``--env.NAME``, and its registration with Gymnasium.
+"""Define the environment's settings (``--env.NAME``), and register it with Gymnasium.
 
-``--env.type=softfinger`` is the simulated hand, which is loaded when it is made.
+``--env.type=softfinger`` selects the simulated hand, which is loaded when the environment is
+created.
 """
 
 from dataclasses import dataclass, field
@@ -20,14 +21,14 @@ from softfinger.gym import SECONDS, STEP, TASKS
 class SoftfingerEnvConfig(EnvConfig):
     """Simulated hand: ``task`` is Grasp-v0, Rotate-v0 or Push-v0.
 
-    With ``control`` set to ``law``, actions are the force [N] and the object angle [rad] of the
-    built-in grip law. With ``joints`` they are joint goals [rad].
+    If ``control`` is ``law``, actions are the force [N] and the object angle [rad] for the built-in
+    grip law. If ``control`` is ``joints``, actions are joint goals [rad].
     """
 
     task: str | None = "Grasp-v0"
     fps: int = round(1.0 / STEP)
     control: str = "law"
-    profile: str | None = None  # of the simulated hand; the default settings if None
+    profile: str | None = None  # profile of the simulated hand; None selects the default settings
     rows: int = 44  # size of the profile's grids
     cols: int = 44
     render_mode: str = "rgb_array"

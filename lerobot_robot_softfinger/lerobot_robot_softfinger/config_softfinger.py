@@ -1,4 +1,4 @@
-"""Define the robot's settings, which are set with ``--robot.NAME``."""
+"""Define the robot's settings (``--robot.NAME``)."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -23,8 +23,8 @@ _DESCRIPTIONS = {
 class LeRobotHand(gymnasium.Wrapper):
     """`SoftFingerEnv` with the robot's observations and actions.
 
-    An action outside the range of the environment is clipped; joint goals move by at most 0.02 rad
-    in a step.
+    Actions outside the environment's range are clipped. Joint goals change by at most 0.02 rad per
+    step.
     """
 
     def __init__(self, task: str, control: str, **options: Any) -> None:

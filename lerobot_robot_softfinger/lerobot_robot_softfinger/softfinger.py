@@ -57,7 +57,8 @@ class Softfinger(Robot):
         config = self.config
         hand = Hand(config.address, client="lerobot", timeout=config.timeout, keys=config.keys)
         try:
-            hand.state(config.start_timeout)  # The first start is slow because of compilation.
+            # The daemon's first start is slow because of compilation.
+            hand.state(config.start_timeout)
             hand.status()
             self._waiting = hand.frames()
             self._frames: dict[str, TactileFrame] = {}
@@ -72,7 +73,7 @@ class Softfinger(Robot):
         size, expected = (frame.rows, frame.cols), (self.config.rows, self.config.cols)
         if size != expected:
             raise ValueError(
-                "--robot.rows, --robot.cols: found {} × {}, the hand's grids have {} × {}".format(
+                "--robot.rows, --robot.cols: found {} × {}, expected the hand's {} × {}".format(
                     *expected, *size
                 )
             )

@@ -1,6 +1,6 @@
 """Compute the linear model of a solid tip: ``python -m research.solid_tip``.
 
-The result is the input file of `strain`; the notes in the output of `strain` describe the format.
+The result is the input file for `strain`. The notes in the output of `strain` describe the format.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Arrays = dict[str, NDArray[Any]]
 BASES = ("bonded", "lying")
 STICKING = "-sticking"
 BLOCKS = tuple(base + face for face in ("", STICKING) for base in BASES)
-HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν for validation, not fitted
+HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are used for validation, not for the fit
 
 
 def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
@@ -45,7 +45,7 @@ def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
 
 
 def differences(tip: SolidTip, samples: fit.Samples) -> str:
-    """Return the errors in N, U and p compared with presses, over three depth ranges."""
+    """Return the errors in N, U and p relative to presses, for three depth ranges."""
     areas = np.sqrt(np.diff(tip.edges**2))
     rows = []
     for d, theta, push, energy, _, base in zip(*samples, strict=True):
@@ -61,7 +61,7 @@ def differences(tip: SolidTip, samples: fit.Samples) -> str:
 
 
 def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float]:
-    """Return the maximum relative differences of two files in N and in a sensor frame."""
+    """Return the maximum relative differences between two files, in N and in a sensor frame."""
     force, pressure = [], []
     for poisson in (*fit.NU, 0.49):
         tip, second = SolidTip(arrays, block, poisson), SolidTip(other, block, poisson)

@@ -1,4 +1,4 @@
-"""Contact of a rigid plane with the hemisphere as a linear complementarity problem.
+"""Contact of a rigid plane with the hemisphere, as a linear complementarity problem.
 
 Without friction, the unknown of each surface cell is its normal force q ≥ 0 along the plane's
 normal n = (sin θ, 0, cos θ), applied to both mirror images y and −y. The cells move by C q, where
@@ -6,9 +6,9 @@ C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Con
 q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
 
 A sticking face adds two forces along the plane to each cell, which hold the cell where it first
-touched. The result then depends on the path. Here the plane moves straight along n, so the held
-points do not move along the plane and the tangential forces do no work. N = ∂U/∂d therefore holds
-as it does without friction.
+touched. With a sticking face, the result depends on the path. In these presses, the plane moves
+straight along n, so the held points do not move along the plane and the tangential forces do no
+work. Therefore N = ∂U/∂d holds, as it does without friction.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from research.solid_tip.green import FloatArray, Green
 
-BEYOND = 0.06  # a; cells may touch this far outside the undeformed overlap
+BEYOND = 0.06  # in units of a; cells up to this distance outside the undeformed overlap may touch
 
 
 class Press(NamedTuple):
@@ -31,7 +31,7 @@ class Press(NamedTuple):
     push: float  # normal force N
     energy: float  # U
     base: FloatArray  # (H, B) cosine harmonics of the base pressure at the base nodes
-    shear: float  # force against the tip along (cos θ, 0, −sin θ); 0 without friction
+    shear: float  # force on the tip along (cos θ, 0, −sin θ); 0 without friction
 
 
 class TiltedPlane:
@@ -51,7 +51,8 @@ class TiltedPlane:
             height = r * np.cos(phi) * sine + z * cosine
             near = height > 1 - d_max - BEYOND
             phi, half = phi[near, None], cells // 2
-            # Axes in cylindrical components, for the harmonics that the ring's cells resolve.
+            # Axes in cylindrical components, for the harmonics that the cells of the ring can
+            # resolve.
             x, y, upright = axes.T
             load = np.stack(
                 np.broadcast_arrays(
@@ -89,9 +90,9 @@ class TiltedPlane:
     def press(self, d: float) -> Press:
         """Solve at depth ``d``, starting from the cells in contact in the last press.
 
-        Sticking depends on the path, so increase the depth in small steps. A cell that comes into
-        contact within a step sticks at an interpolated position. Raises RuntimeError if the active
-        sets do not converge.
+        With a sticking face, the result depends on the path, so increase the depth in small steps.
+        A cell that comes into contact during a step sticks at an interpolated position. Raises
+        RuntimeError if the active sets do not converge.
         """
         overlap, step = self.reach - (1 - d), len(self.axes)
         before = self.moved

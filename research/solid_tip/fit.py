@@ -1,4 +1,4 @@
-"""Fit the data file to presses: a polynomial for the energy, a few modes for the base pressure.
+"""Fit the data in the file to presses: a polynomial for the energy, modes for the base pressure.
 
 The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so
 N = ∂U/∂d holds exactly. The base pressure divided by N is decomposed by singular values, one
@@ -20,12 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 from research.solid_tip.contact import Press
 from research.solid_tip.green import GAUSS, RING_EDGES, FloatArray, quadratic
 
-D_MAX, THETA_MAX = 0.4, np.radians(36.0)  # sin 36° < 1 − D_MAX: the plane stays above the base
+D_MAX, THETA_MAX = 0.4, np.radians(36.0)  # sin 36° < 1 − D_MAX, so the plane stays above the base
 NU = (0.45, 0.4995)
 S_MAX = np.sqrt(D_MAX)
 ORDERS = (11, 6)  # coefficients in s and sin²θ
 HARMONICS = 9
-RIM = 0.95  # cells beyond it are down-weighted: bonded stress is singular, a lying base ends
+# Cells beyond this radius are down-weighted, because bonded stress is singular and a lying base
+# ends.
+RIM = 0.95
 
 
 def chebyshev_nodes(low: float, high: float, count: int) -> FloatArray:
@@ -56,7 +58,7 @@ class Samples(NamedTuple):
 
 
 def ring_means(base_radius: FloatArray) -> FloatArray:
-    """Return the matrix (R, B) of ring area means from quadratic elements with the given nodes."""
+    """Return the matrix (R, B) that averages the nodal values of quadratic elements over rings."""
     points, gauss = GAUSS
     ends = base_radius[::2]
     cuts = np.unique(np.concatenate([RING_EDGES, ends]))
@@ -84,7 +86,7 @@ def terms(
 
 
 def energy_terms(s: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the contributions of the energy coefficients to U/U_Hertz and N/N_Hertz."""
+    """Return the contribution of each energy coefficient to U/U_Hertz and N/N_Hertz."""
     value, slope = terms(s, theta, ORDERS)
     return s[:, None] * value, s[:, None] * (1.2 * value + 0.2 * s[:, None] * slope)
 
@@ -105,7 +107,7 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
 def push_of(energy: FloatArray) -> FloatArray:
     """Convert coefficients of V to those of Q = 6/5 V + s/5 ∂V/∂s in N = N_Hertz (1 + s Q)."""
     slope = chebyshev.chebder(energy, axis=0) * (2 / S_MAX)
-    s = np.array([S_MAX / 2, S_MAX / 2])  # s as a Chebyshev series
+    s = np.array([S_MAX / 2, S_MAX / 2])  # the variable s as a Chebyshev series
     product = np.apply_along_axis(lambda row: chebyshev.chebmul(s, row), 0, slope)
     return np.asarray(1.2 * energy + 0.2 * product[: len(energy)])
 
@@ -144,11 +146,11 @@ def fit(
     for m in range(HARMONICS):
         weight = np.sqrt(areas * (1.0 if m == 0 else 0.5)) * np.where(RING_EDGES[1:] > RIM, 0.05, 1)
         flat = patterns[:, :, m] * weight
-        # Include the base moment, so that the modes reproduce it despite the rim's low weight.
+        # Include the base moment, so that the modes reproduce it in spite of the rim's low weight.
         moment = (m == 1) * 2.0 * patterns[:, :, m] @ levers
         flat = np.concatenate([flat, moment[..., None]], axis=-1)
         _, size, rows = np.linalg.svd(flat.reshape(-1, areas.size + 1), full_matrices=False)
-        # Rms of the truncated modes.
+        # Rms amplitude of the truncated modes.
         left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / flat[..., 0].size) / scale
         turned = design * np.sin(theta)[:, None] ** m
         for row in rows[: int(np.sum(left > tolerance))]:
@@ -200,14 +202,14 @@ class SolidTip:
         return push, energy, pressure
 
     def shear(self, d: float, theta: float) -> float:
-        """Return T/N of a sticking face, along (cos θ, 0, −sin θ) against the tip."""
+        """Return T/N of a sticking face; T is the force on the tip along (cos θ, 0, −sin θ)."""
         x = 2 * np.sqrt(d) / self.s_max - 1
         w = 2 * (np.sin(theta) / np.sin(self.theta_max)) ** 2 - 1
         stick = float(chebyshev.chebval2d(x, w, self.coef[0]))
         return stick * float(np.sin(theta) * np.cos(theta))
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
-        """Average the pressure over a square grid of cells centred under the tip; rows along y."""
+        """Average the pressure over cells of a square grid centred under the tip; rows along y."""
         parts, turns = 10, 2000  # radial and angular pieces of each ring
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,

@@ -24,8 +24,8 @@ from scipy.sparse.linalg import splu
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Rings of the base. They are fine at the rim, where the stress of a bonded base is singular, and
-# are mirrored beyond the rim, where a lying base spreads.
+# Rings of the base. The elements are small at the rim, where the stress of a bonded base is
+# singular. The elements are mirrored beyond the rim, because a lying base spreads.
 RING_EDGES = np.sin(np.linspace(0, np.pi / 2, 97))
 RING_EDGES = np.concatenate([RING_EDGES, 2 - RING_EDGES[RING_EDGES > 0.8][-2::-1]])
 MIDDLES = (RING_EDGES[1:] + RING_EDGES[:-1]) / 2
@@ -133,12 +133,12 @@ class Meridian:
 
 
 STIFF = 1e4  # E, stiffness of the springs that suppress rigid motions of harmonic 1
-CONTACT_END = np.radians(85.0)  # polar angle beyond which rings carry no contact
-CAP = 0.2  # rad, polar angle of the cap on which a shear force acts
+CONTACT_END = np.radians(85.0)  # maximum polar angle of the rings that may be in contact
+CAP = 0.2  # rad, polar angle of the cap on which the shear force acts
 
 
 class Green(NamedTuple):
-    """Response of rings and base. Components are (r, φ, z); rings are ordered from the pole."""
+    """Response of rings and base, with components (r, φ, z); rings start at the pole."""
 
     place: FloatArray  # (R, 2) mean r and z of each ring [a]
     weight: FloatArray  # (R,) ∫ r ds of each ring [a²]

@@ -3,13 +3,13 @@
 The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and
 κ = E/(3 − 6ν), where E and ν are the small-strain values. Elements have 27 nodes. In the volumetric
 part, J − 1 is projected onto linear functions in each element (mean dilatation to first order),
-which avoids locking as ν approaches ½. The mesh is obtained by revolving a meridian mesh. For a
+which avoids locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a
 tilted plane, it covers half a turn, with the symmetry plane y = 0. For an upright plane, it is one
 thin wedge, and all nodes at the same r and z have the same motion.
 
-Contact occurs between the plane and nodes. An active node lies in the plane, transmits a normal
-force, and moves freely along the plane unless the face sticks. Each Newton step also updates the
-active set. The linear solver is pypardiso.
+Contact occurs between the plane and nodes. An active node lies in the plane and transmits a normal
+force. An active node moves freely along the plane unless the face is sticking. Each Newton step
+also updates the active set. The linear solver is pypardiso.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class State(NamedTuple):
     depth: float
     motion: FloatArray  # displacement of each dof
     touching: NDArray[np.bool_]  # contact state of the face nodes
-    held: FloatArray  # positions of sticking nodes along the plane
+    held: FloatArray  # positions along the plane of the sticking nodes
 
 
 class Body:
@@ -259,8 +259,8 @@ class Body:
         """Return the energy, the dof forces and, if ``pressures`` are given, the upper tangent.
 
         ``pressures`` are the coefficients (e, 4) of each element's linear functions, updated as in
-        the Newton steps of a mixed method. Without them, the second-order volume change in a step,
-        multiplied by κ, would distort the next tangent.
+        the Newton steps of a mixed method. Without these pressures, the second-order volume change
+        in a step, multiplied by κ, would distort the next tangent.
         """
         if self.at_rest is not None:
             out = self.times_tangent(self.at_rest, motion)
@@ -320,7 +320,7 @@ class Body:
         return stress, density, four, swell
 
     def solve(self, numbers: FloatArray, right: FloatArray, known: FloatArray) -> FloatArray:
-        """Solve for the dofs under forces ``right``; ``known`` dofs are given, NaN if unknown."""
+        """Solve for the dofs under forces ``right``; ``known`` has the given dofs, or NaN."""
         if self.moves is not None:
             return self._solve_at_rest(right, known)
         given = ~np.isnan(known)
@@ -339,7 +339,7 @@ class Body:
     def _solve_at_rest(self, right: FloatArray, known: FloatArray) -> FloatArray:
         """Solve for linear elements as in `solve`, using the response to forces on the face."""
         assert self.moves is not None
-        # All forces except those on the face are at equilibrium from the start.
+        # All forces except those on the face are in equilibrium from the start.
         given = ~np.isnan(known[self.pushed])
         load = right[self.pushed]
         if given.any():
@@ -414,7 +414,7 @@ class Body:
             reaction = (forces + self.times_tangent(numbers, change))[self.normal]
             gap = motion[self.normal] - target
             now = np.where(touching, reaction < 0, gap > 1e-10)
-            if attempt > 15:  # keep nodes active that alternate
+            if attempt > 15:  # keep alternating nodes active
                 now |= touching
             still = np.abs(change).max() < 1e-6 and size == 1.0
             if still and (now == touching).all():

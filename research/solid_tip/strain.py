@@ -30,8 +30,8 @@ NU = fit.chebyshev_nodes(*fit.NU, 3)
 SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
 AREAS = np.pi * np.diff(RING_EDGES**2)
 # For each block, the indices of sin²θ in `SINES` to press, with the values of ν. At the far corner
-# of the domain, the elements of lying rubber are crushed and do not converge; there the fit
-# extrapolates.
+# of the domain, the elements of lying rubber are crushed and the solution does not converge, so the
+# fit extrapolates there.
 TILTS = {
     "bonded": {1: NU[1:2], 2: NU[1:2], 4: NU[1:2]},
     "lying": {1: NU[1:2], 2: NU[1:2]},
@@ -57,14 +57,14 @@ that carries the tip's own; it presses where it has slid to, beyond 1, too. forc
 pressure_error: of N, and of the base pressure where it is smooth (within 0.95 a), against elements
 of other meshes, d to 0.35 a, θ to 20°. Largest and rms differences of what was fitted:
 {errors}"""
-# From the presses in tests/harness/solid_reference.py. A coarse mesh hardly resolves the rim of a
-# tilted bonded base.
+# Errors determined from the presses in tests/harness/solid_reference.py. A coarse mesh hardly
+# resolves the rim of a tilted bonded base.
 FORCE_ERROR = 0.005
 PRESSURE_ERROR = {"bonded": 0.01, "lying": 0.004}
 
 
 class Change(NamedTuple):
-    """Effect of strain on presses at one θ and ν, versus d."""
+    """Effect of finite strain on presses at one θ and ν, as a function of d."""
 
     s: FloatArray
     energy: FloatArray  # ratio to the linear energy, minus 1 (n,)
@@ -176,7 +176,8 @@ class Strain:
         rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
         first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
         shear, harmonics = through(self.sines, shears), through(self.sines, bases)
-        # At small tilts the higher harmonics are tiny; divided by sin^m θ, they are all mesh error.
+        # At small tilts, the higher harmonics are so small that, after division by sin^m θ, they
+        # contain only mesh errors.
         least = len(self.sines) > 1
         higher = through(self.sines[least:], bases[least:])
 
@@ -212,7 +213,7 @@ class Strain:
 
 
 def main() -> None:
-    """Compute the presses that are missing from the folder, and write the file."""
+    """Compute the presses that are missing in the folder, and write the file."""
     parser = argparse.ArgumentParser(
         prog="python -m research.solid_tip.strain", description=__doc__
     )

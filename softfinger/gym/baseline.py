@@ -28,7 +28,8 @@ from softfinger.tools.sweep import Sweep, add_sweep
 SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, episodes per sample
 STEPS = 200
 FEATURES = 5
-_WEIGHT_SCALE = 0.2  # factor for the weights, because an action of 1 is fast (1 rad/s)
+# Factor for the weights; reduces the speed, because an action of 1 is fast (1 rad/s).
+_WEIGHT_SCALE = 0.2
 _ADDED_STD = 0.2  # added to the standard deviation to avoid premature convergence
 
 Weights = NDArray[np.float64]

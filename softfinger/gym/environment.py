@@ -1,4 +1,4 @@
-"""Provide a Gymnasium environment that runs the daemon's control loop in virtual time.
+"""Gymnasium environment that runs the daemon's control loop in virtual time.
 
 Each action is sent as a client command, so an agent has the same capabilities and limits as a
 client. Episodes with the same seed are bit-for-bit identical.
@@ -36,7 +36,7 @@ Observation = dict[str, NDArray[Any]]
 
 FORCE = 6.0  # N, target grip force
 REACH = 0.02  # rad, maximum joint goal change per step
-FORCES = 1.0, 12.0  # N, grip forces for the actions -1 and 1
+FORCES = 1.0, 12.0  # N, grip forces for the actions −1 and 1
 ANGLE = 0.25  # rad, object angle for the action 1
 WHITE = 50e3  # Pa, pressure shown as white (255) in images
 LOST = 0.03  # m, displacement at which the object counts as lost
@@ -69,11 +69,11 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Changes to settings, in the same form as for ``--set``.
     shaped
         Add potential-based shaping to the reward of ``grasp``: up to 10 for closing the fingers
-        and up to 10 for both forces. It rewards progress before the first touch and leaves the
+        and up to 10 for both forces. Shaping rewards progress before the first touch and leaves the
         optimal policy unchanged [1]_.
     render_mode
         ``rgb_array`` makes `render` return an image [300, 550, 3]; ``human`` shows each step in a
-        window, at most in real time.
+        window, at real-time speed or slower.
 
     Notes
     -----
@@ -85,9 +85,9 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     - ``goal`` [1]: target in N, or in rad for ``rotate``.
 
     An episode terminates when the object is lost or the hand is in a fault state. ``info`` holds
-    ``truth`` (the object's x, y [m] and angle [rad]), ``fault``, ``refused``: the reason for which
-    the daemon refused a command, or an empty string, and ``is_success``: whether the error is
-    within the scale of the reward (1 N, 0.05 rad or 2 mm).
+    ``truth`` (the object's x, y [m] and angle [rad]), ``fault``, ``refused`` (the reason why the
+    daemon refused a command, or an empty string) and ``is_success`` (True if the error is within
+    the reward's scale of 1 N, 0.05 rad or 2 mm).
 
     References
     ----------
@@ -116,7 +116,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._window: Window | None = None
         self._pack_state, self._pack_truth = packer(STATE), packer(TRUTH)
-        # Joint goals may press as hard as the grip law.
+        # With joint goals, the fingers may press as hard as with the grip law.
         ours = ("loop.clock=virtual", "safety.current_move=1.2")
         file = None if profile is None else Path(profile)
         self._settings = load(file, changes=(*ours, *changes))
@@ -291,7 +291,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         }
 
     def render(self) -> Image | None:
-        """Return the image of the last step with ``rgb_array``; otherwise return None."""
+        """Return the image of the last step if the mode is ``rgb_array``, otherwise None."""
         if self.render_mode != "rgb_array" or self._daemon is None:
             return None
         return self._picture()
@@ -335,6 +335,6 @@ class Images(gymnasium.ObservationWrapper[Observation, NDArray[np.float32], Obse
         self.observation_space: Any = spaces.Dict({**known.spaces, "pressure": image})
 
     def observation(self, observation: Observation) -> Observation:
-        """Replace ``pressure`` in the observation with 8-bit images."""
+        """Replace the entry ``pressure`` of the observation by 8-bit images."""
         grey = np.minimum(observation["pressure"] * (255.0 / self._full), 255.0)
         return observation | {"pressure": grey.astype(np.uint8)}

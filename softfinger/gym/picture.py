@@ -1,7 +1,8 @@
-"""Draw the simulated hand and its pressure maps as an RGB image, with NumPy, and show it.
+"""Draw the simulated hand and its pressure maps as an RGB image with NumPy, and display the image.
 
-The scene has the lines of the page of `softfinger view`: the fingers and their tips, the estimated
-object in green, the true one in grey. Beside it are the pressure maps, left above right.
+The scene contains the same lines as the `softfinger view` page: the fingers with their tips, the
+estimated object in green and the true object in grey. The pressure maps are next to the scene, with
+the left finger's map above the right finger's map.
 """
 
 from __future__ import annotations
@@ -21,19 +22,19 @@ from softfinger.tools.viewing.hand_drawing import COLOURS, hand_parts
 
 Image = NDArray[np.uint8]
 
-_SIDE, _MAP = 400, 150  # pixels: width of the scene, side of a pressure map
+_SIDE, _MAP = 400, 150  # pixels, width of the scene and side length of a pressure map
 HEIGHT, WIDTH = 2 * _MAP, _SIDE + _MAP
-_SCALE = 2100.0  # pixels a metre
+_SCALE = 2100.0  # pixels per metre
 _LOWEST = -0.012  # m, y of the lower edge of the scene
 _THINNEST = 1.6  # pixels
 _BACKGROUND = 24
 
 
 class Painter:
-    """Draws images of one hand."""
+    """Painter for images of one hand."""
 
     def __init__(self, settings: Settings, full_scale: float) -> None:
-        """Create a painter; ``full_scale`` [counts] has the brightest colour of a map."""
+        """Create a painter; ``full_scale`` [counts] is shown in the brightest colour of a map."""
         self._settings = settings
         colours = np.array(colour_map(), np.uint8)
         self._colours, self._full = colours, full_scale / len(colours)
@@ -41,7 +42,7 @@ class Painter:
     def __call__(
         self, state: HandState, truth: dict[str, Any], pressure: NDArray[np.uint16]
     ) -> Image:
-        """Return the image [HEIGHT, WIDTH, 3] of a state, a ``hand/truth`` message and frames."""
+        """Return the image [HEIGHT, WIDTH, 3] for a state, a ``hand/truth`` message and frames."""
         scene = np.full((HEIGHT, _SIDE, 3), float(_BACKGROUND))
         for part in hand_parts(self._settings, state, truth).values():
             for colour, width, points in part.lines:
@@ -59,7 +60,7 @@ class Painter:
 def _stroke(
     scene: NDArray[np.float64], points: NDArray[Any], width: float, colour: tuple[int, int, int]
 ) -> None:
-    """Draw a line through points [n, 2] m, smoothed over one pixel."""
+    """Draw an antialiased line through points [n, 2] [m]."""
     at = np.array([0.5 * _SIDE, HEIGHT]) + _SCALE * (points - (0.0, _LOWEST)) * (1.0, -1.0)
     reach = 0.5 * max(_SCALE * width, _THINNEST) + 0.5
     cover = np.zeros(scene.shape[:2])
@@ -77,19 +78,19 @@ def _stroke(
 
 
 def _box(at: NDArray[np.float64], reach: float) -> tuple[slice, slice]:
-    """Return rows and columns of the pixels within ``reach`` of points [n, 2]."""
+    """Return slices that enclose all pixels within a distance ``reach`` of points [n, 2]."""
     low, high = np.floor(at.min(axis=0) - reach), np.ceil(at.max(axis=0) + reach)
     (x0, y0), (x1, y1) = np.clip((low, high), 0, (_SIDE, HEIGHT)).astype(int).tolist()
     return slice(y0, y1), slice(x0, x1)
 
 
 class Window:
-    """A window of tkinter that shows images, at most as fast as the simulated time."""
+    """Tkinter window that shows images at most as fast as in simulated time."""
 
     def __init__(self, title: str) -> None:
         """Open the window.
 
-        Raises RuntimeError without tkinter or a display.
+        Raises RuntimeError if tkinter or a display is missing.
         """
         self._shown = 0.0
         try:
@@ -99,14 +100,14 @@ class Window:
         except Exception as error:  # ImportError or TclError, which is defined in tkinter
             raise RuntimeError(
                 f"render_mode: found 'human', but no window can be opened: {error}; use a display "
-                "and a Python with tkinter, or 'rgb_array'"
+                "and a Python with tkinter, or render_mode 'rgb_array'"
             ) from None
         self._root.title(title)
         self._photo = tkinter.PhotoImage(width=WIDTH, height=HEIGHT)
         tkinter.Label(self._root, image=self._photo).pack()
 
     def show(self, image: Image, period: float) -> None:
-        """Show an image ``period`` [s] after the last one. A closed window stays closed."""
+        """Show an image ``period`` [s] after the last image, unless the window has been closed."""
         time.sleep(max(self._shown + period - time.monotonic(), 0.0))
         self._shown = time.monotonic()
         import tkinter

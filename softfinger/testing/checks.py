@@ -1,8 +1,8 @@
-"""Provide conformance checks for backend plugins.
+"""Conformance checks for backend plugins.
 
 Each check takes the settings of a profile that uses the backend, for example
-``check_tactile(load(Path("profile.toml")))``. It creates the backend in the same way as the daemon.
-If the check fails, it raises AssertionError with the value found and the value expected.
+``check_tactile(load(Path("profile.toml")))``. The check creates the backend in the same way as the
+daemon. If the check fails, it raises AssertionError with the value found and the value expected.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _POLL = 1e-3  # s, poll interval, like a control tick
 
 
 def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:
-    """Open each finger's tactile board twice and check ``frames`` frames.
+    """Open each finger's tactile board twice, and check the given number of ``frames``.
 
-    ``patience`` [s] limits the waiting time. The check works without an object in the hand.
+    ``patience`` [s] is the maximum waiting time. The check works without an object in the hand.
     """
     clock = make_clock(settings)
     for name in settings.scene.fingers:
@@ -41,7 +41,7 @@ def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) 
                 _check_counters(sensor)
             finally:
                 sensor.close()
-            sensor.latest()  # This call must not raise an exception.
+            sensor.latest()  # calling `latest` after `close` must not raise an exception
         sensor.close()
 
 
@@ -51,7 +51,9 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
     kept = np.zeros(shape, np.uint16)
     for count in range(frames):
         while (frame := sensor.latest()) is last or frame is None:
-            assert time.monotonic() < deadline, f"found {count} frames in time, expected {frames}"
+            assert time.monotonic() < deadline, (
+                f"found {count} frames within the test time, expected {frames}"
+            )
             time.sleep(_POLL)
         assert isinstance(frame, Frame), f"found {type(frame).__name__}, expected a Frame"
         found = f"{frame.data.dtype} {frame.data.shape}"
@@ -74,8 +76,9 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
 def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0) -> None:
     """Connect to the servos twice and read them.
 
-    If ``torque`` is True, the torque is also switched on at the present position and off again. The
-    joints must not move by more than 0.05 rad. ``patience`` [s] limits each wait.
+    If ``torque`` is True, the torque is also switched on at the current position and off again. In
+    this case, the joints must not move by more than 0.05 rad. ``patience`` [s] limits each waiting
+    time.
     """
     servos = make_servos(settings, make_clock(settings), None)
     assert servos is not None, "servos.backend: found none, expected servos"
@@ -96,11 +99,13 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
                 _read(servos, reading, patience)
                 moved = np.abs(np.subtract(reading.q, first)).max()
                 assert moved < 0.05, (
-                    f"found joints that moved by {moved:.3g} rad when torque was switched on"
+                    f"the joints moved by {moved:.3g} rad when torque was switched on"
                 )
             deadline = time.monotonic() + patience
             while not servos.torque_off(reading):
-                assert time.monotonic() < deadline, "torque off is not confirmed in time"
+                assert time.monotonic() < deadline, (
+                    "torque off was not confirmed within the test time"
+                )
         finally:
             servos.close()
     servos.close()
@@ -110,7 +115,7 @@ def _read(servos: Servos, reading: Reading, patience: float) -> None:
     deadline = time.monotonic() + patience
     reading.valid = False
     while not reading.valid:
-        assert time.monotonic() < deadline, "no valid reading in time"
+        assert time.monotonic() < deadline, "no valid reading arrived within the test time"
         time.sleep(_POLL)
         servos.read(reading)
 
@@ -122,11 +127,11 @@ def _check_counters(backend: Servos | TactileSensor) -> None:
 
 
 def check_shape(settings: Settings) -> None:
-    """Create the object's shape and check its properties against values from its corners."""
+    """Create the object's shape and compare its properties with values from its corners."""
     shape = shape_of(settings)
     assert isinstance(shape, Shape), f"found {type(shape).__name__}, expected a Shape"
     if shape.kind == DISC:
-        assert shape.roundness > 0.0, "found a disc without radius"
+        assert shape.roundness > 0.0, "found a disc without a radius"
         return
     sound = polygon(shape.corners)
     away = float(np.abs(sound.corners - shape.corners).max())

@@ -1,4 +1,4 @@
-"""Emulated hardware on pseudo-terminals: a whole hand in a process, or servos alone in a thread."""
+"""Emulated hardware on pseudo-terminals: a hand in a process, or only servos in a thread."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.tools.processes.emulate import emulator_process
 
 _SERVOS_MAX = 8
-_LOOK = 0.005  # s between checks for changes made by another thread
-_STALL = 0.5  # s; the part of a pause of this process beyond this does not count as servo time
+_LOOK = 0.005  # s, time between checks for changes made by another thread
+_STALL = 0.5  # s; longer pauses of this process count only up to this value as servo time
 
 
 class EmulatedHand:
-    """Emulated hand: the process `softfinger emulate`, which ends with this context.
+    """Emulated hand in a `softfinger emulate` process, which ends with this context.
 
     The first start on a machine compiles kernels, which takes minutes.
 
@@ -43,13 +43,13 @@ class EmulatedHand:
 
     Attributes
     ----------
-    folder : folder of the ports, the ``--dir`` of `softfinger run --config hil`
+    folder : folder of the ports, to be passed as ``--dir`` to `softfinger run --config hil`
     ports : paths of the serial ports ``servos``, ``tactile-left`` and ``tactile-right``
 
     Raises
     ------
     NoEmulator
-        The emulator has ended. Its message is on standard error.
+        If the emulator has ended. The emulator prints its error message to standard error.
     """
 
     def __init__(
@@ -65,24 +65,26 @@ class EmulatedHand:
         self.ports = {name: str(path) for name, path in find_ports(self.folder).items()}
 
     def send(self, words: str) -> str:
-        """Send requests or faults as `softfinger emulate --send` does, and return the reply.
+        """Send requests or faults in the same way as `softfinger emulate --send`; return the reply.
 
-        Examples: ``"place"`` puts the object back, ``"press depth=3mm"`` presses a plate on the
-        tips and waits until it has arrived. Raises Refused if the words are not understood.
+        For example, ``"place"`` puts the object back, and ``"press depth=3mm"`` presses a plate
+        onto the tips and waits until the plate has arrived. Raises Refused if the words are not
+        understood.
         """
         return carry_out(self.folder, words)
 
     def fault(self, *words: str) -> None:
-        """Begin faults such as ``"left:silent"`` or ``"drop=0.01@2"``; ``"well"`` ends all faults.
+        """Start faults such as ``"left:silent"`` or ``"drop=0.01@2"``; ``"well"`` ends all faults.
 
-        `softfinger help emulate` lists them. Raises Refused if a word is not understood.
+        `softfinger help emulate` lists all faults. Raises Refused if a word is not understood.
         """
         self.send(" ".join(words))
 
     def report(self, forget: bool = False) -> dict[str, Any]:
         """Return the traffic on the servo bus and the true state of the hand.
 
-        `softfinger help emulate` lists the fields. With ``forget`` the record begins again.
+        `softfinger help emulate` lists the fields. If ``forget`` is True, the record is then
+        cleared.
         """
         report: dict[str, Any] = json.loads(self.send("report forget" if forget else "report"))
         return report
@@ -109,9 +111,10 @@ def free_servos(
     t: float = 0.0,
     **options: Any,
 ) -> ServoBus:
-    """Create factory-new servos on free joints, which stand at ``counts``, at time ``t`` [s].
+    """Create factory-new servos on free joints at the positions ``counts``, at time ``t`` [s].
 
-    With ``for_daemon`` they have the return delay and the mode that `softfinger run` expects.
+    If ``for_daemon`` is True, the servos have the return delay and the mode that `softfinger run`
+    expects.
     """
     plant, chosen = FreeJoints(len(ids), t), by_name(model)
     radian = 2.0 * math.pi / COUNTS_PER_TURN
@@ -131,15 +134,15 @@ def free_servos(
 class EmulatedBus:
     """One to eight emulated Dynamixel servos on a serial port, without a hand.
 
-    The servos are factory-new, stand in the middle of their range and turn without a load. A thread
-    serves them in real time until the context ends.
+    The servos are factory-new, start in the middle of their range and rotate without a load. A
+    thread runs the servos in real time until the context ends.
 
     Parameters
     ----------
     model, ids : model and IDs of the servos
-    baud : with 0, the servos answer at any rate and at once; otherwise only at this rate, with its
-        transmission time
-    bus : servos of your own instead, for example on another plant
+    baud : if 0, the servos reply immediately at any baud rate; otherwise they reply only at this
+        baud rate, with its transmission time
+    bus : your own servos instead, for example on another plant
 
     Attributes
     ----------
@@ -167,7 +170,7 @@ class EmulatedBus:
 
     @property
     def port(self) -> str:
-        """Path of the serial port; it changes when the port is unplugged and plugged again."""
+        """Path of the serial port; the path changes when the port is plugged in again."""
         return self._terminal.path
 
     def call(self, job: Callable[[], Any]) -> Any:
@@ -176,20 +179,20 @@ class EmulatedBus:
             return job()
 
     def fault(self, *words: str) -> None:
-        """Begin faults such as ``"silent=2"`` or ``"drop=0.1"``; ``"well"`` ends all faults.
+        """Start faults such as ``"silent=2"`` or ``"drop=0.1"``; ``"well"`` ends all faults.
 
-        Raises FaultError for other words, and for faults that need a hand or begin later.
+        Raises FaultError for unknown words, and for faults that require a hand or start later.
         """
         events = parse_faults(words, tuple(servo.id for servo in self.bus.servos))
         for event in events:
             if event.part not in (SERVOS, ALL) or event.after:
-                raise FaultError(f"{event}: expected a fault of servos that begins at once")
+                raise FaultError(f"{event}: expected a servo fault that starts immediately")
         with self._between_packets:
             for event in events:
                 self._terminal.apply_fault(event.kind, event.value, self.now())
 
     def report(self) -> list[dict[str, Any]]:
-        """Return the state and the traffic of each servo, as in `EmulatedHand.report`."""
+        """Return the state and the bus traffic of each servo, as in `EmulatedHand.report`."""
         report: list[dict[str, Any]] = self.call(lambda: self.bus.report(self.now()))
         return report
 
@@ -214,7 +217,7 @@ class EmulatedBus:
                 self._terminal.service(self.now())
 
     def now(self) -> float:
-        """Return the time of the servos [s]: real time without long stalls of this process."""
+        """Return the servo time [s], i.e. real time without long stalls of this process."""
         seen, self._seen = self._seen, time.monotonic()
         self._origin += max(self._seen - seen - _STALL, 0.0)
         return self._seen - self._origin

@@ -1,4 +1,4 @@
-"""pytest fixtures of the test kit. Every test run loads this module, so it imports little."""
+"""Pytest fixtures of the test kit. The module imports little, because every test run loads it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _options(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """Return the options of all markers on the test; the marker nearest to the test wins."""
+    """Return the options of all markers on a test; markers closer to the test have priority."""
     markers = list(reversed(list(request.node.iter_markers("softfinger"))))
     for marker in markers:
         if marker.args:

@@ -1,4 +1,4 @@
-"""Hands without hardware in virtual time: the simulated hand with its daemon, and a recording."""
+"""Hands in virtual time without hardware: the simulated hand with its daemon, and recordings."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ from softfinger.tools.recordings.record import RecordingWriter
 
 Controller = Callable[[HandState], Mapping[str, Any] | None]
 
-_QUEUE = 10_000  # messages queued for a subscription; older ones are dropped
+_QUEUE = 10_000  # maximum number of messages queued for a subscription; older messages are dropped
 _ROUNDING = 1e-9  # s
-_OWN = b"this process"  # route of own requests
+_OWN = b"this process"  # route of this object's own requests
 _EVERYTHING = -1  # all topics, as bits
 
 
 class RecordingOver(NoStream):
-    """The recording has no further message."""
+    """The end of the recording has been reached."""
 
 
 class Tap(Link):
-    """Link that also passes published messages to ``take``, and carries requests of its owner."""
+    """Link that also passes published messages to ``take`` and transmits its owner's requests."""
 
     def __init__(self, take: Callable[[bytes, dict[str, Any]], None]) -> None:
         super().__init__()
         self._take = take
         self.tapped = 0  # topics for `take`, as bits
-        self.answer: dict[str, Any] = {}  # to the last request of the owner
+        self.answer: dict[str, Any] = {}  # reply to the owner's last request
 
     def request(self, request: dict[str, Any], t: float) -> None:
         """Add a request that arrives at time ``t`` [s]; the next tick sets its `answer`."""
@@ -85,7 +85,7 @@ class VirtualSubscription(Subscription[Any]):
     """Iterator over the records of one topic; waiting for a record advances the virtual time."""
 
     def __init__(self, hand: VirtualTimeHand, topic: bytes, timeout: float | None) -> None:
-        # The base would open a socket.
+        # Do not call the base class's constructor, because it would open a socket.
         self.topic = topic
         self.waiting: deque[Any] = deque(maxlen=_QUEUE)
         self.is_open = True
@@ -118,10 +118,10 @@ class VirtualSubscription(Subscription[Any]):
 
 
 class VirtualTimeHand(Hand):
-    """Base of the hands in virtual time, which advances only during calls.
+    """Base class of hands in virtual time, which advances only during calls.
 
-    All methods of `softfinger.Hand` work, so a program that takes a `Hand` runs unchanged and
-    waits in virtual time. `run` is for a controller that is a function of the state.
+    All methods of `softfinger.Hand` work, so a program that uses a `Hand` runs unchanged and waits
+    in virtual time. The method `run` is intended for controllers that are functions of the state.
     """
 
     def __init__(self) -> None:
@@ -143,15 +143,15 @@ class VirtualTimeHand(Hand):
 
     @property
     def address(self) -> str:
-        """Address for `Hand` or the variable SOFTFINGER_ADDRESS while `serve` is active."""
+        """Address for `Hand` or for the variable SOFTFINGER_ADDRESS while `serve` is active."""
         return f"{self.stream_address},{self.command_address}"
 
     def step(self) -> None:
         """Advance by the smallest step: a tick, or a recorded message."""
         if self._serving:
             raise RuntimeError(
-                "found a call that advances the time within serve(), which does that: use a "
-                "client, such as Hand(hand.address)"
+                "found a call that advances the time inside serve(), which advances the time "
+                "itself: use a client, such as Hand(hand.address)"
             )
         self._step()
 
@@ -159,23 +159,24 @@ class VirtualTimeHand(Hand):
         raise NotImplementedError
 
     def run(self, seconds: float, controller: Controller | None = None) -> list[Refused]:
-        """Advance by ``seconds``, under a controller.
+        """Advance by ``seconds`` under the control of ``controller``, if given.
 
         Parameters
         ----------
         controller : function that is called with each published state, ``stream.state_rate`` times
-            a second, and returns the next command as a map, or None:
+            per second, and returns either None or the next command as a map such as
             ``{"command": "hold", "force": 5.0}``
 
         Returns
         -------
         list[Refused]
-            Refusals of the controller's commands, which may be due to an event after its state.
+            Refusals of the controller's commands. Refusals may be caused by events that occurred
+            after the controller's state.
 
         Raises
         ------
         Refused
-            A command that the daemon does not know, or with wrong parameters.
+            If a command is unknown to the daemon or has invalid parameters.
         """
         end, refusals = self.t + seconds - _ROUNDING, []
         states = self._subscription(schema.STATE, None)
@@ -203,10 +204,11 @@ class VirtualTimeHand(Hand):
 
     @contextlib.contextmanager
     def serve(self, speed: float = 1.0) -> Iterator[str]:
-        """Serve clients over ZeroMQ; the context is `address`.
+        """Serve clients over ZeroMQ; the context manager returns `address`.
 
-        Meanwhile a thread advances the virtual time, ``speed`` times as fast as real time if the
-        machine is fast enough. Clients in this process are created with ``Hand(hand.address)``.
+        During the context, a thread advances the virtual time ``speed`` times as fast as real time,
+        if the machine is fast enough. Clients in this process are created with
+        ``Hand(hand.address)``.
         """
         config = Config(self.stream_address, self.command_address, GATEWAY_TOPICS, _QUEUE)
         over = threading.Event()
@@ -217,7 +219,8 @@ class VirtualTimeHand(Hand):
                 while not over.is_set():
                     self._step()
                     due = begin + (self.t - first) / speed
-                    begin += max(time.monotonic() - due, 0.0)  # a late machine pauses the hand
+                    # If the machine is late, the hand pauses.
+                    begin += max(time.monotonic() - due, 0.0)
                     over.wait(max(due - time.monotonic(), 0.0))
 
         with contextlib.closing(Gateway(config, self._link)) as gateway:
@@ -240,7 +243,7 @@ class VirtualTimeHand(Hand):
         return made
 
     def _select_topics(self) -> None:
-        """Tap the topics of the open subscriptions, or all during a recording."""
+        """Tap the topics of the open subscriptions, or all topics while recording."""
         self._subscriptions = [each for each in self._subscriptions if each.is_open]
         self._link.tapped = 0 if self._writer is None else _EVERYTHING
         for each in self._subscriptions:
@@ -260,15 +263,16 @@ class VirtualTimeHand(Hand):
 
 
 class VirtualHand(VirtualTimeHand):
-    """Simulated hand and its daemon in virtual time, as fast as this machine computes.
+    """Simulated hand and its daemon in virtual time, which run as fast as this machine permits.
 
-    On one machine, the same calls give the same states bit for bit.
+    On the same machine, identical calls give states that are identical bit for bit.
 
     Parameters
     ----------
     profile : name or file of a profile with a simulated hand; None for the default settings
     changes : settings to change, in the form of ``--set``
-    plant : settings that only the simulated hand has, unknown to the daemon, in the same form
+    plant : settings that apply only to the simulated hand and are unknown to the daemon, in the
+        same form
 
     Attributes
     ----------
@@ -279,7 +283,7 @@ class VirtualHand(VirtualTimeHand):
     Raises
     ------
     SettingsError
-        The settings are invalid, or not those of a simulated hand.
+        If the settings are invalid or are not those of a simulated hand.
     """
 
     def __init__(
@@ -312,14 +316,16 @@ class VirtualHand(VirtualTimeHand):
         return self._link.answer
 
     def fault(self, *words: str) -> None:
-        """Begin loads and measurement faults such as ``"push=3@0.5"`` or ``"left:gain=0.8"``.
+        """Start loads and measurement faults such as ``"push=3@0.5"`` or ``"left:gain=0.8"``.
 
-        `softfinger help emulate` lists them; times count from now. ``"well"`` ends the faults.
+        `softfinger help emulate` lists all faults. Times are relative to this call. ``"well"`` ends
+        all faults.
 
         Raises
         ------
         FaultError
-            The words are not understood, or need servos and boards, as `EmulatedHand` has them.
+            If the words are not understood, or if they require servos and boards as in
+            `EmulatedHand`.
         """
         for event in parse_faults(words, ()):
             self._faults.append(event._replace(after=event.after + self.t))
@@ -331,13 +337,13 @@ class VirtualHand(VirtualTimeHand):
             event = self._faults.pop(0)
             if not self.plant.apply_fault(event):
                 raise FaultError(
-                    f"{event}: found a fault of servos or boards, expected one of measurements or "
+                    f"{event}: found a fault of servos or boards, expected a measurement fault or "
                     "a load: use emulated_hand"
                 )
 
     @contextlib.contextmanager
     def record(self, path: Path | str) -> Iterator[None]:
-        """Record all topics in a new file within the context (extra ``record``)."""
+        """Record all topics to a new file until the context ends (extra ``record``)."""
         self._writer = RecordingWriter(Path(path))
         for topic, message in self._link.kept():
             self._writer.add(topic, message)
@@ -360,7 +366,7 @@ def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
     settings = load(None if profile is None else Path(profile), Path(), changes)
     if not settings.simulated:
         raise SettingsError(
-            f"{profile or 'changes'}: found backends of hardware, expected a simulated hand: use "
+            f"{profile or 'changes'}: found hardware backends, expected simulated backends: use "
             "emulated_hand, which emulates the hardware"
         )
     loop = settings.loop.model_copy(update={"clock": "virtual"})
@@ -368,9 +374,9 @@ def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
 
 
 class RecordedHand(VirtualTimeHand):
-    """Recording as a `Hand`: its messages arrive in virtual time, and commands have no effect.
+    """Recording in the form of a `Hand` on virtual time; commands do not have an effect.
 
-    Iterating over a stream ends with the recording, and so does `run`.
+    Iterations over a stream, and calls of `run`, end at the end of the recording.
 
     Parameters
     ----------
@@ -383,7 +389,7 @@ class RecordedHand(VirtualTimeHand):
     Raises
     ------
     RecordingError
-        The file is not a recording.
+        If the file is not a recording.
     """
 
     def __init__(self, path: Path | str) -> None:

@@ -1,4 +1,4 @@
-"""Fuzz with random and mutated input: briefly in tests, for hours by `python -m tests.fuzz`."""
+"""Run fuzz tests with random or mutated input, for hours with `python -m tests.fuzz`."""
 
 import random
 from typing import NamedTuple
@@ -13,7 +13,7 @@ class Report(NamedTuple):
 
 
 def mutated(rng: random.Random, data: bytes) -> bytes:
-    """Return ``data`` with bytes changed, removed, repeated, inserted or greatly extended."""
+    """Return ``data`` with some or many bytes changed, removed, duplicated or inserted."""
     made = bytearray(data)
     for _ in range(rng.choice((0, 1, 1, 2, 5, 20))):
         kind = rng.randrange(8)

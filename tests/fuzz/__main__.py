@@ -1,6 +1,7 @@
-"""Run ``python -m tests.fuzz TARGET … --count N --seed S``: N inputs each, by default all targets.
+"""Fuzz targets (default: all): ``python -m tests.fuzz TARGET … --count N --seed S``.
 
-The run stops at the first input that raises an unexpected exception, and prints all other errors.
+Each target receives N inputs. The run stops at the first input that raises an unexpected exception,
+and prints all other errors.
 """
 
 import argparse

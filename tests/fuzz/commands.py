@@ -1,6 +1,6 @@
-"""Fuzz commands, profiles and calibration files: invalid input must only cause a refusal.
+"""Fuzz commands, profiles and calibration files: invalid input must be rejected cleanly.
 
-Commands go to a running hand, every hundredth through a real socket.
+Commands are sent to a running hand, every hundredth of them through a real socket.
 """
 
 import json
@@ -41,7 +41,7 @@ _ODD = (
 
 
 def some_request(rng: random.Random) -> Any:
-    """Return a command in the correct form, or nearly."""
+    """Return a valid or slightly malformed command."""
     name = rng.choice([*COMMANDS, "arm", "grasp", "nothing"])
     request: dict[Any, Any] = {"command": name}
     for key in COMMANDS[name].parameters if name in COMMANDS else ():
@@ -152,7 +152,7 @@ class CommandTarget:
 
 
 class FileTarget:
-    """Reader of files that returns the content or raises its one documented error."""
+    """File reader that returns the content or raises its documented exception."""
 
     def __init__(
         self, read: Callable[[Path], Any], error: type[Exception], seeds: list[bytes], end: str
@@ -216,14 +216,14 @@ def _tokens_mixed(rng: random.Random, text: bytes) -> bytes:
 
 
 def settings_target() -> FileTarget:
-    """Return the target for profiles."""
+    """Return the fuzz target for profiles."""
     seeds = [path.read_bytes() for path in sorted((ROOT / "config").glob("*.toml"))]
     short = [b"[safety]\ncurrent_max = 1.0\n[tip]\nradius = 0.01\n", b'task.name = "demo"\n', b""]
     return FileTarget(load, SettingsError, short * 3 + seeds, ".toml")
 
 
 def calibration_target() -> FileTarget:
-    """Return the target for calibration files of a small sensor; larger files are only longer."""
+    """Return the fuzz target for calibration files, with a small sensor to keep the files short."""
     rows, cols = 4, 5
     sensor = {"finger": "left", "label": "x", "rows": rows, "cols": cols, "full_count": 255}
     table = [[1.0 + 0.1 * column for column in range(cols)] for _ in range(rows)]
@@ -256,7 +256,7 @@ TARGETS: dict[str, Callable[[], Any]] = {
 
 
 def fuzz(name: str, count: int, seed: int) -> Counter[str]:
-    """Send ``count`` inputs to a target and count the results; unexpected exceptions are raised."""
+    """Send ``count`` inputs to a target and count the results; propagate unexpected exceptions."""
     target, rng, counts = TARGETS[name](), random.Random(seed), Counter[str]()
     try:
         for _ in range(count):

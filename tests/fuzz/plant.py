@@ -12,7 +12,7 @@ from softfinger.kinematics.compiled.kernel import kernel
 from tests.fuzz import Report
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 
-LONGER = 10  # in one of three hands, the step is multiplied by this factor
+LONGER = 10  # the step is multiplied by this factor in one of three hands
 EACH = 400  # commands per hand
 SHAPES = ("rectangle", "rectangle", "disc", "wedge", "none")
 # Columns: joint, mode, torque on, goal, current, three load components, load set, reset, seconds,
@@ -31,7 +31,7 @@ WRONG = (
 
 @kernel
 def past_limit(radius, d, theta, curvature):
-    """Return the rim's minimum indentation that follows from the tip's d and θ alone [m]."""
+    """Return the minimum rim indentation implied by the tip's d and θ alone [m]."""
     if curvature == 0.0:
         return d - radius * (1.0 - abs(math.sin(theta)))
     away = radius - d + 1.0 / curvature
@@ -72,7 +72,7 @@ def carry_out(plants, data, ring, commands):
             state.position[:] = 0.0
             state.velocity[:] = 0.0
             state.position[3] = 0.08
-        if commands[k, 11] > 0.0:  # no input for a while: from now on the energy may only decrease
+        if commands[k, 11] > 0.0:  # without input, the energy may only decrease from now on
             goals.torque_on[:] = 0
             state.current[:] = 0.0
             goals.load[:] = 0.0

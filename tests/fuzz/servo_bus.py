@@ -32,7 +32,7 @@ SEEDS = (
 
 
 def fuzz(count: int, seed: int) -> Report:
-    """Feed ``count`` packets to two servos; exceptions of the bus are raised."""
+    """Feed ``count`` packets to two servos; propagate exceptions from the bus."""
     source = random.Random(seed)
     bus = make_bus()
     t = 0.0
@@ -51,10 +51,10 @@ def fuzz(count: int, seed: int) -> Report:
 def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
     """Return True if the servo replies to a ping while the others are silent.
 
-    The others are silenced because all servos may have the same ID.
+    All other servos are silenced, because several servos may have the same ID.
     """
     for each in bus.servos:
         each.silent = each is not servo
-    servo.table.set(reg.PROTOCOL_TYPE, 2)  # a write may have set it to 1
+    servo.table.set(reg.PROTOCOL_TYPE, 2)  # a write may have selected protocol 1
     found = PacketParser().feed(bus.feed(frame(BROADCAST, framing.PING), t), 0.0)
     return [packet.id for packet in found] == [servo.id]

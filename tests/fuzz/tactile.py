@@ -1,4 +1,4 @@
-"""Fuzz every tactile framing and the reader of ASCII exports with random and mutated bytes."""
+"""Fuzz every tactile framing and the ASCII export reader with random and mutated bytes."""
 
 import random
 
@@ -56,7 +56,7 @@ def _stream(source: random.Random, target: str, sent: dict[bytes, int]) -> bytes
 
 
 def fuzz_framing(target: str, count: int, seed: int) -> Report:
-    """Feed ``count`` mutated streams to a decoder in pieces; it must then find valid frames."""
+    """Feed a decoder ``count`` mutated streams in pieces; it must still find valid frames."""
     source = random.Random(seed)
     decoder: Decoder = DECODERS[target](ROWS, COLS)
     fed, frames, foreign = 0, 0, 0
@@ -95,7 +95,7 @@ def fuzz_framing(target: str, count: int, seed: int) -> Report:
 
 
 def fuzz_ascii(count: int, seed: int) -> Report:
-    """Read ``count`` mutated exports; each must give finite readings or a TekscanError."""
+    """Read ``count`` mutated exports; each must yield finite readings or a TekscanError."""
     source = random.Random(seed)
     frames = 0
     wrong: list[str] = []
@@ -120,7 +120,7 @@ def fuzz_ascii(count: int, seed: int) -> Report:
 
 
 def fuzz(target: str, count: int, seed: int) -> Report:
-    """Fuzz one of TARGETS; exceptions of the code under test are raised."""
+    """Fuzz one of TARGETS; propagate exceptions from the code under test."""
     if target == "ascii":
         return fuzz_ascii(count, seed)
     return fuzz_framing(target, count, seed)

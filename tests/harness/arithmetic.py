@@ -1,9 +1,10 @@
-"""Describe or change the arithmetic of a test run, which affects the last bits of results.
+"""Report or change the floating-point environment, which affects the last bits of results.
 
-``python -m tests.harness.arithmetic MODULE …`` runs ``python -m MODULE …`` with a different
-arithmetic: OpenBLAS uses the kernels of an older processor, NumPy uses only its baseline SIMD
-loops, and Numba compiles for a generic processor. Generic kernels have their own cache folder,
-because the folder's name depends on the target processor (`kinematics.compiled.kernel_folder`).
+``python -m tests.harness.arithmetic MODULE …`` runs ``python -m MODULE …`` in a different
+environment: OpenBLAS uses the kernels of an older processor, NumPy uses only its baseline SIMD
+loops, and Numba compiles for a generic processor. The generic Numba kernels have their own cache
+folder, because the folder name depends on the target processor
+(`kinematics.compiled.kernel_folder`).
 """
 
 import ctypes
@@ -15,7 +16,7 @@ import llvmlite.binding
 import numpy as np
 from numpy._core import _multiarray_umath
 
-# Environment variables that replace the processor's default arithmetic.
+# Environment variables that override the defaults for this processor.
 VARIABLES = (
     "OPENBLAS_CORETYPE",
     "NPY_DISABLE_CPU_FEATURES",
@@ -26,7 +27,7 @@ _AVX512 = ("skylakex", "cooperlake", "sapphirerapids")  # OpenBLAS cores that us
 
 
 def chosen() -> dict[str, str]:
-    """Return the variables that are set; usually none."""
+    """Return the override variables that are set (usually none)."""
     return {name: os.environ[name] for name in VARIABLES if os.environ.get(name)}
 
 
@@ -48,14 +49,14 @@ def simd() -> list[str]:
 
 
 def described() -> str:
-    """Describe the arithmetic in one line."""
+    """Describe the floating-point environment in one line."""
     processor = os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name()
     extensions = " ".join(simd()) or "the baseline"
     return f"OpenBLAS {blas_core() or 'none'}, NumPy {extensions}, kernels for {processor}"
 
 
 def other() -> dict[str, str]:
-    """Return variables that select a different arithmetic that this processor supports."""
+    """Return variables that select another floating-point environment of this processor."""
     core = blas_core().lower()
     if platform.machine() == "aarch64":
         older = "CORTEXA57" if core == "armv8" else "ARMV8"
@@ -69,7 +70,7 @@ def other() -> dict[str, str]:
 
 
 def main() -> None:
-    """Replace this process with the command, using the other arithmetic."""
+    """Execute the command in the other environment, in place of the current process."""
     variables = other()
     named = " ".join(f"{name}='{value}'" for name, value in variables.items())
     print(f"usual arithmetic: {described()}", f"now with {named}", sep="\n", flush=True)

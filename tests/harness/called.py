@@ -6,5 +6,5 @@ from softfinger.kinematics.compiled.kernel import kernel
 
 
 def called(inner: Any) -> Any:
-    """Compile the same source as a kernel that can be called from Python."""
+    """Recompile an inner kernel's source as a kernel that Python can call."""
     return kernel(inner.py_func)

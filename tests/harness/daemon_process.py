@@ -1,4 +1,4 @@
-"""Run ``softfinger`` in separate processes: daemons, and subcommands that end by themselves."""
+"""Run ``softfinger`` in separate processes: daemons and short-lived subcommands."""
 
 import shutil
 import signal
@@ -11,7 +11,7 @@ from typing import Any
 from softfinger.daemon.client.command_client import send
 
 SOFTFINGER = [sys.executable, "-m", "softfinger"]
-# Settings that tolerate the stalls of a busy machine, for tests that do not concern time-outs.
+# Settings that tolerate stalls on a busy machine, for tests that are not about time-outs.
 PATIENCE = {
     "servos.open_timeout": 60.0,
     "servos.reply_timeout": 0.1,
@@ -26,13 +26,13 @@ PATIENT = [word for key, value in PATIENCE.items() for word in ("--set", f"{key}
 
 
 def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a program in this Python to its end; return status and output."""
+    """Run a program with this Python interpreter until it exits; return its status and output."""
     call = [sys.executable, *map(str, words)]
     return subprocess.run(call, capture_output=True, text=True, check=False, **options)
 
 
 def softfinger(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a subcommand to its end; return status and output."""
+    """Run a subcommand until it exits; return its status and output."""
     return python("-m", "softfinger", *words, **options)
 
 
@@ -58,7 +58,7 @@ def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
 
 
 def until_it_says(words: Sequence[str | Path], text: str) -> None:
-    """Run a tool until it prints a line with ``text``, then end it; it must end without error."""
+    """Run a tool until it prints a line with ``text``; terminate it and check its exit status."""
     process = started(*words, stderr=None)
     assert any(text in line for line in process.stdout), f"{text!r} was not printed"
     process.terminate()
@@ -67,7 +67,7 @@ def until_it_says(words: Sequence[str | Path], text: str) -> None:
 
 
 class Running:
-    """Process of ``softfinger run`` that is ready once constructed."""
+    """A ``softfinger run`` process; the constructor returns once the process is ready."""
 
     def __init__(self, *words: str) -> None:
         self.lines: list[str] = []

@@ -1,7 +1,7 @@
-"""Find and end processes that tests started, directly or indirectly.
+"""Find and kill processes that tests started, directly or indirectly.
 
-Run as a program with a word as its argument, the module waits for the end of standard input and
-then kills every process whose environment contains this word.
+When run as a program with a word as its argument, this module waits until its standard input
+closes. At that point, the module kills every process whose environment contains the word.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ _PR_SET_CHILD_SUBREAPER = 36  # from <linux/prctl.h>
 
 @contextlib.contextmanager
 def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
-    """Context that kills a process on exit, whereas ``with`` alone would wait forever."""
+    """Context manager that kills a process on exit; a plain ``with`` would wait forever."""
     with process:
         try:
             yield process
@@ -28,12 +28,12 @@ def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
 
 
 def adopt_orphans() -> None:
-    """Adopt descendants whose own parent ends."""
+    """Adopt descendants whose parent process exits."""
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def end_with_this_process() -> None:
-    """Kill all processes started from now on when this process ends, even after SIGKILL."""
+    """When this process ends, even by SIGKILL, kill all processes that it starts from now on."""
     word = f"TESTS_OF_PROCESS={os.getpid()}"
     _watching.append(
         subprocess.Popen(
@@ -60,21 +60,21 @@ def running(process: int | None = None) -> set[int]:
 
 
 def end(processes: set[int]) -> None:
-    """Kill children of this process and all their descendants."""
+    """Kill child processes and all their descendants."""
     for process in processes:
         below = running(process)
         with contextlib.suppress(OSError):
             os.kill(process, signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             os.waitpid(process, 0)
-        end(below)  # they are now children of this process
+        end(below)  # this process has adopted them
 
 
 def _sweep(word: bytes) -> bool:
     """Kill every process with ``word`` in its environment; return True if any was found."""
     found = False
     for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # the process has ended or belongs to another user
+        with contextlib.suppress(OSError):  # the process has exited or belongs to another user
             if word in (folder / "environ").read_bytes().split(b"\0"):
                 os.kill(int(folder.name), signal.SIGKILL)
                 found = True

@@ -1,7 +1,7 @@
 """Execute `softfinger` commands from the documentation's shell blocks in the test process.
 
-Commands without an end are only parsed, together with their profile. An emulated hand runs in a
-separate process and replaces the previous one.
+Commands that run until interrupted are only parsed, together with their profile. An emulated hand
+runs in a separate process and replaces the previous one.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from tests.harness.daemon_process import SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # marks processes started by a command, which run separately
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
-# Options that let such commands end by themselves, so they are run.
+# Commands with one of these options end by themselves, so they are run.
 _ENDS = {"--record", "--recompute"}
 _SHOWN = re.compile(r"# (?P<mode>\w+)(?: (?P<force>[\d.]+) N)?(?:.*?(?P<angle>-?[\d.]+)°)?")
 _CLIENT = """\
@@ -50,7 +50,7 @@ def parse(words: list[str]) -> None:
 
 
 class Softfinger:
-    """The ``softfinger`` command as a program in ``folder``; `serve` executes one call."""
+    """Stand-in ``softfinger`` program in ``folder``; `serve` executes one call."""
 
     def __init__(self, folder: Path) -> None:
         client, command = folder / "client.py", folder / "softfinger"
@@ -129,7 +129,7 @@ class Softfinger:
         return 0 if self._emulator.stdout.readline() == "ready\n" else 1
 
     def end(self) -> None:
-        """End the emulated hand and its daemon."""
+        """Stop the emulated hand and its daemon."""
         self._end_daemon()
         if self._emulator is not None:
             self._emulator.terminate()

@@ -31,7 +31,7 @@ READY_WITHIN = 200.0  # s, includes kernel compilation
 def emulated(
     folder: Path, *faults: str, settings: Settings | None = None, **options: Any
 ) -> Iterator[Emulator]:
-    """Run an emulator in a thread; it is ready when the context is entered."""
+    """Run an emulator in a thread; the context is entered once the emulator is ready."""
     made = Emulator(settings or Settings(), folder, faults=faults, **options)
     ready = threading.Event()
     runner = threading.Thread(target=made.run, args=(ready.set,), daemon=True)
@@ -46,7 +46,7 @@ def emulated(
 
 
 class EmulatorProcess:
-    """Process of ``softfinger emulate`` with these arguments."""
+    """A ``softfinger emulate`` process with the given arguments."""
 
     def __init__(self, *arguments: str | Path) -> None:
         pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -64,7 +64,7 @@ class EmulatorProcess:
         return self
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Send a signal; return exit status and remaining output without kernel messages."""
+        """Send a signal; return the exit status and the output without compilation messages."""
         self.popen.send_signal(number)
         out, err = self.popen.communicate(timeout=300)
         return self.popen.returncode, out, _COMPILED.sub("", err)

@@ -1,6 +1,6 @@
 """Publisher and command server on real sockets, with a hand computed from formulas.
 
-They are used to test clients; the test controls all messages.
+Client tests use these sockets and control all messages.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class FakeDaemon:
 
     ``changes`` are merged into every state. ``requests`` contains the received commands and
     ``keys`` the client key of each. ``replies`` maps a command to its reply, or to a list of
-    successive replies. No states are sent while ``silent`` is set, no replies while ``deaf`` is
-    set, and no frames for the fingers in ``dead``.
+    successive replies. ``silent`` suppresses all states, ``deaf`` suppresses all replies, and
+    ``dead`` names the fingers whose frames are suppressed.
     """
 
     def __init__(self) -> None:

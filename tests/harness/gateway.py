@@ -19,7 +19,7 @@ from tests.conftest import until
 
 
 class Served:
-    """Both ends of a link: clients connect to the gateway's end, the test uses the loop's end."""
+    """Both ends of a link: clients connect to the gateway's end, and tests use the loop's end."""
 
     def __init__(
         self,

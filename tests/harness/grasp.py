@@ -1,14 +1,16 @@
 """Reference model of a grasp: two rotational fingers, two soft tips, an object at equilibrium.
 
-The energy is the sum of both tips' energies and gravity. A tip's energy with the shear d_t is
+The energy is the sum of both tips' energies and the potential energy of gravity. With the shear
+d_t, a tip's energy is
 
     U(d, θ, d_t) = U₀(d, θ) + F(d, θ) (sin θ d_t + cos θ d_t²/d)
 
-with U₀ and F from the contact table. For a constant modulus this is πE[d³/(3cos²θ) + d² d_t tan θ +
-d d_t²], the parallel-distributed model. The shear force is T = ∂U/∂d_t and the normal force N =
-∂U/∂d − T tan θ. Shears follow the rolling increments of `reference_hand`, which are in general not
-integrable, so a grasp depends on its path: motions are divided into small steps that accumulate the
-shears. The grasp is at equilibrium if the energy is stationary along those increments.
+with U₀ and F from the contact table. For a constant modulus, this is the parallel-distributed
+model, πE[d³/(3cos²θ) + d² d_t tan θ + d d_t²]. The shear force is T = ∂U/∂d_t and the normal force
+is N = ∂U/∂d − T tan θ. Shears follow the rolling increments of `reference_hand`. The increments are
+not integrable in general, so a grasp depends on its path: motions are divided into small steps, and
+the shears of the steps are summed. The grasp is at equilibrium if the energy is stationary along
+the increments.
 """
 
 from dataclasses import dataclass
@@ -65,7 +67,7 @@ class GraspState:
 
 @dataclass(frozen=True)
 class GraspForces:
-    """Grasp forces, each of shape (2,), left first."""
+    """Grasp forces, each of shape (2,), left finger first."""
 
     force: FloatArray  # F on the tip's base, the sum over a pressure grid [N]
     normal: FloatArray  # N [N]
@@ -91,9 +93,10 @@ class Grasp:
         self._weight = np.array(weight, dtype=np.float64)
 
     def symmetric(self, d: float) -> GraspState:
-        """Return a state with both tips indented by ``d`` [m], object upright and no shear force.
+        """Return a state with both tips indented by ``d`` [m], an upright object and no shear.
 
-        Raises ValueError if the fingers cannot reach it, GraspError outside the tip's range.
+        Raise ValueError if the fingers cannot reach this state, and GraspError if it is outside the
+        tip's range.
         """
         q = self.hand.inverse((0.0, 0.0, 0.0), (d, d), self.width)
         # T = 0 gives d_t = −(d/2) tan θ.
@@ -120,7 +123,7 @@ class Grasp:
     def balance(self, state: GraspState, q: ArrayLike | None = None) -> GraspState:
         """Move the joints to ``q`` (2,) in one step and let the object roll to equilibrium.
 
-        Use small steps, because the shears are integrated along a straight path. Raises GraspError
+        Use small steps, because the shears are integrated along a straight path. Raise GraspError
         if a contact opens or leaves the table, or if no equilibrium is found.
         """
         x = state.coordinates
@@ -148,10 +151,10 @@ class Grasp:
         return GraspState(x[:2].copy(), x[2:].copy(), shear)
 
     def steer(self, state: GraspState, delta: float) -> GraspState:
-        """Turn both fingers by ``delta`` [rad] to the right (q1 + δ, q2 − δ), at equilibrium.
+        """Return the equilibrium after both fingers rotate by ``delta`` [rad] to the right.
 
-        The object turns in the opposite direction, by about 2(a − d + L sin q + e cos q)/W per
-        radian.
+        The joints are then at q1 + δ and q2 − δ. The object turns in the opposite direction, by
+        about 2(a − d + L sin q + e cos q)/W per radian.
         """
         ways = state.q + np.outer(np.arange(1, 17) / 16, [delta, -delta])
         for q in ways:

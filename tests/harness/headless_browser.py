@@ -1,6 +1,6 @@
 """Control a headless Chromium through DevTools: open pages and evaluate scripts.
 
-The browser stores all data in a test folder and makes only requests from the page.
+The browser stores all data in a test folder and sends only the requests that the page makes.
 """
 
 import json
@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from tests.conftest import until
 
-WAIT = 60.0  # s to wait for one reply
+WAIT = 60.0  # s, time-out for one reply
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _FLAGS = (
     "--headless=new",
@@ -48,7 +48,7 @@ class Browser:
         self.process = subprocess.Popen(
             [path, *words, "about:blank"], start_new_session=True, **quiet
         )
-        told = folder / "DevToolsActivePort"  # the browser writes this file once it listens
+        told = folder / "DevToolsActivePort"  # the browser writes this file once it is listening
         until(lambda: told.exists() and "/" in told.read_text())
         pages: list[dict[str, Any]] = []
 
@@ -103,7 +103,7 @@ class Browser:
                 self.requests.append(answer["params"]["request"]["url"])
 
     def close(self) -> None:
-        """End the browser and its child processes."""
+        """Stop the browser and its child processes."""
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
         self._socket.close()

@@ -1,4 +1,4 @@
-"""Make the pytest plugin of this tree visible to other processes, as its installation does."""
+"""Make this tree's pytest plugin visible to other processes, as if it were installed."""
 
 import os
 import tomllib
@@ -8,9 +8,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def plugin_path(folder: Path) -> str:
-    """Write the metadata of an installed package to ``folder``; return a PYTHONPATH with it.
+    """Write an installed package's metadata to ``folder``; return a PYTHONPATH that includes it.
 
-    The entry points are those of pyproject.toml.
+    The entry points are those in pyproject.toml.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     entries = project["entry-points"]["pytest11"]

@@ -1,10 +1,10 @@
-"""Simulate the clock of a machine that wakes up late on request."""
+"""Simulate a machine that wakes up late on request."""
 
 from softfinger.daemon.clock import VirtualClock
 
 
 class LateMachine(VirtualClock):
-    """Replacement for the real clock that advances only by work and sleep.
+    """Replacement for the real clock; only `work` and sleeping advance it.
 
     ``late_by`` holds the delays of the next wake-ups [s].
     """
@@ -16,7 +16,7 @@ class LateMachine(VirtualClock):
         self.late_by: list[float] = []
 
     def work(self, seconds: float) -> None:
-        """Advance the clock by a working time."""
+        """Advance the clock by the duration of some work."""
         self._now += seconds
 
     def sleep_until(self, t: float) -> float:

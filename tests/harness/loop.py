@@ -17,7 +17,7 @@ def command(daemon: Daemon, name: str, **numbers: float) -> dict[str, Any]:
 
 
 def torque_of(daemon: Daemon) -> Any:
-    """Return the torque state of each servo of the plant."""
+    """Return the torque state of each servo in the plant."""
     return daemon.hand.torque_on
 
 

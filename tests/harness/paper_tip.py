@@ -1,4 +1,4 @@
-"""Tip and sensor of the paper, used by most tests: 20 mm, 0.304 MPa, 44 × 44 cells on 58 mm."""
+"""The paper's tip and sensor, used by most tests: 20 mm, 0.304 MPa, 44 × 44 cells on 58 mm."""
 
 import math
 from typing import Any
@@ -37,7 +37,7 @@ CHECKPOINTS = (
 
 
 def tilts(theta: float, azimuth: float) -> tuple[float, float]:
-    """Return (tilt_x, tilt_y) of a total tilt towards ``azimuth`` [rad]."""
+    """Return (tilt_x, tilt_y) for a total tilt towards ``azimuth`` [rad]."""
     return (
         math.asin(math.sin(theta) * math.cos(azimuth)),
         math.asin(math.sin(theta) * math.sin(azimuth)),
@@ -47,8 +47,8 @@ def tilts(theta: float, azimuth: float) -> tuple[float, float]:
 def dense(
     grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
 ) -> np.ndarray[Any, Any]:
-    """Return the blurred pressure averaged over cells, from ``pieces`` samples per cell side."""
-    from scipy.ndimage import gaussian_filter  # slow import, needed by few tests
+    """Return the blurred pressure averaged over cells, with ``pieces`` samples per cell side."""
+    from scipy.ndimage import gaussian_filter  # this import is slow and few tests need it
 
     d, tilt_x, tilt_y = contact
     axes = []
@@ -72,7 +72,7 @@ def dense(
 def fisher(
     grid: SensorGrid, material: Material, truth: Any, noise: float, free_gain: bool
 ) -> np.ndarray[Any, Any]:
-    """Return the numerical inverse Fisher information of (d, tilt_x, tilt_y[, gain])."""
+    """Return the numerical inverse of the Fisher information for (d, tilt_x, tilt_y[, gain])."""
     columns = []
     for k, step in enumerate((1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free_gain else 3]):
         ends = []
@@ -91,11 +91,11 @@ def errors(estimate: Any, truth: Any) -> np.ndarray[Any, Any]:
 
 
 def board(pascal_per_count: float = 1.0, **range_: int) -> TactileSettings:
-    """Return board settings for this sensor, with 16 bits by default."""
+    """Return board settings for the paper's sensor, with 16 bits by default."""
     return TactileSettings(pascal_per_count=pascal_per_count, **range_)
 
 
 def flawed(**flaws: float) -> SimulationSettings:
-    """Return settings of a simulated sensor that has only these defects."""
+    """Return settings for a simulated sensor that has only the given defects."""
     named = {"noise": 0.0, **flaws}
     return SimulationSettings(**{f"tactile_{name}": value for name, value in named.items()})

@@ -1,4 +1,4 @@
-"""Record the simulated hand on the virtual clock under commands at given ticks."""
+"""Record the simulated hand on the virtual clock while it executes commands at given ticks."""
 
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,10 @@ def record_hand(
     profile: str | None = None,
     hand: tuple[str, ...] = (),
 ) -> list[str]:
-    """Record a run with the commands in ``due`` at their ticks (500 per second).
+    """Record a run in which each command in ``due`` is sent at its tick (500 per second).
 
     ``hand`` contains settings that apply only to the simulated hand, not to the daemon. Returns the
-    reasons of the refused commands.
+    reasons for the refused commands.
     """
     refused = []
     with VirtualHand(profile, changes, hand) as made, made.record(path):

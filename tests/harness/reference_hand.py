@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 
 class ReferenceHand(HandGeometry):
-    """Hand with derivatives and inverse kinematics."""
+    """Hand model with derivatives and inverse kinematics."""
 
     def variables(self, x: Any, width: float) -> Any:
         """Return (d, θ, s) of each tip (2, 3, …) at coordinates (5, …), which may be complex."""

@@ -21,7 +21,7 @@ BOUNDS = SETTINGS.safety
 
 
 class Sensor:
-    """The properties of a sensor that the limits use."""
+    """Sensor properties that the limits use."""
 
     def __init__(self, finger: int) -> None:
         self.finger = finger
@@ -79,7 +79,7 @@ class Deaf:
 
 
 def bounded(judge: Safety, state: State) -> None:
-    """Limit the state's goal as is done before sending it to the servos."""
+    """Limit the state's goal, as the daemon does before sending it to the servos."""
     judge.write(cast(Servos, Deaf()), state)
 
 
@@ -104,7 +104,7 @@ def levers(lever: float) -> GraspState:
 
 
 def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
-    """Return the fault after ``seconds`` in this state, with every limit checked at least once."""
+    """Hold the state for ``seconds`` and return the fault; check every limit at least once."""
     found = None
     for _ in range(max(round(seconds / 0.002), len(LIMITS)) + len(LIMITS)):
         found = judge.judge(state)

@@ -31,7 +31,7 @@ def make_bus(model: str = "XM430-W210", ids: Sequence[int] = (1, 2), **options: 
 
 
 def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: Any) -> ServoBus:
-    """Return servos on free joints, configured for the hand with these ``servos`` settings."""
+    """Return servos on free joints, configured for the hand with the given ``servos`` settings."""
     settings = Settings.model_validate({"servos": servos or {}})
     return ServoBus.from_settings(settings, FreeJoints(2, t), t=t, **options)
 
@@ -43,7 +43,7 @@ def put_fault(bus: ServoBus, text: str, t: float) -> None:
 
 
 def backend_settings(path: str, **servos: Any) -> Settings:
-    """Return Dynamixel backend settings for this port, with time-outs for a busy machine."""
+    """Return Dynamixel backend settings for the port, with time-outs for a busy machine."""
     waits = {"reply_timeout": 1.0, "watchdog": 2.0}
     values = {"backend": "dynamixel", "port": path} | waits | servos
     return Settings.model_validate({"servos": values})
@@ -57,7 +57,7 @@ def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
 
 
 class BusClient:
-    """Bus client with its own time that uses the independent parser for replies."""
+    """Bus client with its own time; it parses replies with the independent parser."""
 
     def __init__(self, bus: ServoBus) -> None:
         self.bus = bus
@@ -93,9 +93,9 @@ class BusClient:
 class DirectPort(SerialPort):
     """Port connected to a bus in this thread: a reply is available immediately or never.
 
-    The bus uses the time of ``clock``. Without a clock, it uses ``t``, which the test sets; waiting
-    for a missing reply then advances ``t`` to the deadline. With ``baud`` 0, the port receives at
-    any rate.
+    The bus uses the time of ``clock``. Without a clock, the bus uses ``t``, which the test sets;
+    waiting for a missing reply then advances ``t`` to the deadline. With ``baud`` 0, the port
+    receives at any rate.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class DirectPort(SerialPort):
 
 
 class RunningBus(EmulatedBus):
-    """Bus served by a thread: a given one, or the servos of the settings."""
+    """Bus served by a thread; the default bus has the servos of the settings."""
 
     def __init__(self, bus: ServoBus | None = None, baud: int = 0, **options: Any) -> None:
         super().__init__(baud=baud, bus=bus or hand_bus(baud=baud, **options))

@@ -1,8 +1,8 @@
 """Compute frames of a solid tip with finite elements, for tests/golden/solid_frames.npz.
 
-``python -m tests.harness.solid_reference OUT`` uses neo-Hookean elements. Its meshes differ from
-those of the data file's fit, and it uses none of the fit's polynomials, modes or linear material
-law. It requires pypardiso.
+``python -m tests.harness.solid_reference OUT`` uses neo-Hookean elements. The meshes differ from
+those used to fit the data file, and the program does not use the fit's polynomials, modes or linear
+material law. It requires pypardiso.
 """
 
 import argparse
@@ -36,7 +36,7 @@ class _Rings(SolidTip):
 
 
 def row(block: str, theta: float, press: Strained) -> dict[str, object]:
-    """Return one row of the file; lengths in radii, stresses in E."""
+    """Return one row of the data file; lengths are relative to the tip radius, stresses to E."""
     force = press.push * np.cos(theta) - press.shear * np.sin(theta)
     pressure = press.base * (force / (press.base[0] @ AREAS))
     frame = _Rings().frame(pressure, PITCH / RADIUS, CELLS)
@@ -45,7 +45,7 @@ def row(block: str, theta: float, press: Strained) -> dict[str, object]:
 
 
 def main() -> None:
-    """Compute the contacts and write the file."""
+    """Compute the contacts and write the data file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     arguments = parser.parse_args()

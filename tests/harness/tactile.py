@@ -29,7 +29,7 @@ RATE = 200.0  # Hz
 
 
 def image(number: int) -> NDArray[np.uint16]:
-    """Return a different image for each number; no cell equals its transpose."""
+    """Return a different, asymmetric image for each number."""
     cells = np.arange(ROWS * COLS, dtype=np.uint16).reshape(ROWS, COLS)
     return (cells * 7 + 3 * (cells // COLS) + number) % 160
 
@@ -48,7 +48,7 @@ class _Images:
 
 
 def why_not_open(sensor: TactileSensor) -> str:
-    """Return the error message of opening the sensor, or "" on success."""
+    """Open the sensor; return its error message, or "" on success."""
     try:
         sensor.open()
     except TactileError as error:
@@ -58,7 +58,7 @@ def why_not_open(sensor: TactileSensor) -> str:
 
 
 class Rig:
-    """Context with one backend and its environment."""
+    """Test context with one backend and its environment."""
 
     def __init__(
         self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None
@@ -117,7 +117,7 @@ class Rig:
         return self.sensor.latest()
 
     def unplug(self) -> None:
-        """Unplug the board's port, in the thread that serves it."""
+        """Unplug the board's port, in the thread that serves the port."""
         self._unplug.set()
 
     def _serve(self) -> None:

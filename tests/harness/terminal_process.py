@@ -50,7 +50,7 @@ class TerminalProcess:
     def pump(self, seconds: float = 0.02) -> None:
         """Read the available output; if there is none, wait up to ``seconds`` for it.
 
-        At most one terminal buffer is read, because the process may write faster than this one
+        At most one terminal buffer is read, because the process may write faster than the test
         reads.
         """
         end = len(self.written) + _CAPACITY
@@ -82,14 +82,14 @@ class TerminalProcess:
         os.write(self.master, keys)
 
     def press(self, key: bytes, text: str) -> None:
-        """Press a key until ``text`` appears; on a busy machine the first key press may be lost."""
+        """Press a key repeatedly until ``text`` appears; a busy machine may lose a key press."""
         while text not in self.text():
             self.type(key)
             later = time.monotonic() + 1.0
             self.wait(lambda later=later: text in self.text() or time.monotonic() > later)
 
     def ended(self) -> int:
-        """Wait for the process to end; return its exit status."""
+        """Wait for the process to exit; return its exit status."""
         self.wait(lambda: self.process.poll() is not None)
         self.pump()
         return self.process.returncode
@@ -99,7 +99,7 @@ class TerminalProcess:
         self.pump()
         pairs = ((b"\x1b[?1049h", b"\x1b[?1049l"), (b"\x1b[?25l", b"\x1b[?25h"))
         pairs += ((b"\x1b[?2004h", b"\x1b[?2004l"),)
-        # Both sequences of each pair must have been sent, the restoring one last.
+        # Both sequences of each pair must have been sent, and the restoring one last.
         given = all(0 <= self.written.rfind(a) < self.written.rfind(b) for a, b in pairs)
         return given and termios.tcgetattr(self.slave) == self.attributes
 

@@ -1,4 +1,4 @@
-"""Run ``softfinger view`` as a process and receive its pictures as a page does."""
+"""Run ``softfinger view`` as a process and receive its pictures as a browser page does."""
 
 import json
 import subprocess
@@ -10,14 +10,14 @@ from websockets.sync.client import connect
 
 from tests.harness.daemon_process import SOFTFINGER
 
-WAIT = 60.0  # s to wait for one picture
+WAIT = 60.0  # s, time-out for one picture
 
 
 class Viewed:
-    """Process that is serving once constructed.
+    """A ``softfinger view`` process; the constructor returns once the process is serving.
 
-    ``address`` is the page's address, ``commanding`` the one with the token. ``folder`` is the
-    working directory, where recordings are also stored.
+    ``address`` is the page's address, and ``commanding`` is the address with the token. ``folder``
+    is the working directory, where recordings are also stored.
     """
 
     def __init__(self, *words: str, folder: Path | None = None) -> None:
@@ -37,7 +37,7 @@ class Viewed:
         self.host = urlsplit(self.address).netloc
 
     def end(self) -> str:
-        """End the process with a signal and return its output."""
+        """Stop the process with a signal and return its output."""
         self.process.terminate()
         said = self.process.communicate(timeout=300)[1]
         assert self.process.returncode == 0, said

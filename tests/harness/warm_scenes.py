@@ -80,7 +80,7 @@ class Watch(event.Listener):
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Run the script; report compilations before the first tick, outside all parts, and later."""
+    """Run the script; report compilations during start-up, outside the warm-up parts, and later."""
     watch = Watch()
     modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch):
@@ -91,7 +91,7 @@ def run(settings: Settings) -> dict[str, Any]:
     with event.install_listener("numba:compiler_lock", watch), hand:
         for wait, request in SCRIPT:
             hand.loop.advance(wait)
-            for _ in range(300):  # in real time, a busy machine may take long
+            for _ in range(300):  # a busy machine may need long in real time
                 if hand.loop.state.mode not in ("grasping", "rotating"):
                     break
                 hand.loop.advance(0.1)
@@ -107,7 +107,7 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 def calibrated(folder: Path) -> dict[str, Any]:
-    """Return settings with a calibrated left sensor, whose frames are thus pressures."""
+    """Return settings with a calibrated left sensor, so its frames contain pressures."""
     settings = Settings()
     cells = [[0.0] * settings.tactile.cols for _ in range(settings.tactile.rows)]
     tare = TareStep(date=now(), zero=cells, noise=1520.0, frames=16)
@@ -133,7 +133,7 @@ def main(folder: Path, names: list[str]) -> None:
             print(json.dumps({"scene": name, **run(scenes[name])}), flush=True)
             os._exit(0)
         if os.waitpid(child, 0)[1]:
-            sys.exit(f"{name}: failed")  # the reason is already printed
+            sys.exit(f"{name}: failed")  # the child has already printed the reason
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
+"""Test that ``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
 
 import csv
 from pathlib import Path
@@ -21,7 +21,7 @@ TILT = 0.1
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
-    """Return the counts of an indentation up to 5 mm at 0.1 rad; rounding is the only noise."""
+    """Return the counts for an indentation of up to 5 mm at 0.1 rad; rounding is the only noise."""
     grid = SensorGrid(rows=44, cols=44, pitch=PITCH)
     material = Material.table_i()
     frames = [grid.pressure(TIP, material, d, TILT, 0.0) for d in DEPTHS[1:]]
@@ -104,7 +104,10 @@ def test_a_recording_without_frames_is_an_error(inline, tmp_path):
     path.write_bytes(b"\x89MCAP0\r\n")
     done = inline("analyse", path)
     assert (done.returncode, "cut short" in done.stderr) == (1, True)
-    assert done.stderr.splitlines()[-1] == f"analyse: {path}: contains no tactile frames"
+    assert (
+        done.stderr.splitlines()[-1]
+        == f"analyse: {path}: the file does not contain any tactile frames"
+    )
 
 
 def test_frames_without_settings_need_matching_settings(inline, counts, tmp_path):
@@ -113,7 +116,7 @@ def test_frames_without_settings_need_matching_settings(inline, counts, tmp_path
     done = inline("analyse", path)
     assert (done.returncode, done.stdout) == (2, "")
     assert (
-        "small.npy: contains no settings: describe the tip and the sensor with --config"
+        "small.npy: the file does not contain settings: describe the tip and the sensor with"
         in done.stderr
     )
     done = inline("analyse", path, "--config", "paper")

@@ -1,4 +1,4 @@
-"""The bus's record of wire traffic, read directly and through the control socket."""
+"""Test the bus's traffic record, read directly and through the control socket."""
 
 import json
 import struct
@@ -17,7 +17,7 @@ UNIT = by_name("XM430-W350").current_unit
 
 
 class Hand(BusClient):
-    """Servos of the settings: left closes with rising counts, right with falling ones."""
+    """Servos of the settings; rising counts close the left finger, falling counts the right one."""
 
     def __init__(self) -> None:
         super().__init__(hand_bus(10.0))

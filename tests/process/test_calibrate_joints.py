@@ -1,4 +1,4 @@
-"""`softfinger calibrate joints` on an emulated hand whose joints are turned by hand."""
+"""Test `softfinger calibrate joints` on an emulated hand whose joints are turned by hand."""
 
 import shlex
 import sys
@@ -11,7 +11,7 @@ from softfinger.tools.calibration.joints import put
 from softfinger.tools.cli import main
 from tests.harness.emulated import HIL, SdkServos, emulated
 
-# The emulated hand's true values, which differ from the profile; the object is out of reach.
+# True values of the emulated hand, which differ from the profile; the object is out of reach.
 TRUTH = [
     "servos.ids=[2,1]",
     "servos.direction=[-1,1]",
@@ -46,13 +46,13 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
     servos.close()
     assert calibrate(folder, file, "--config", "hil", *by_hand(folder)) == 0
     told = capsys.readouterr()
-    assert "left finger: close it fully\n" in told.err
+    assert "left finger: close the finger fully\n" in told.err
     assert "left: servo 2 (not 1: IDs are swapped), direction -1, zero 1" in told.out
     assert "servos.direction = [-1, 1]" in told.out
     found = load(file, folder)
     assert (found.servos.ids, found.servos.direction) == ((2, 1), (-1, 1))
     assert found.servos.zero == pytest.approx((1500, 5300), abs=5)
-    # The emulated stops are 0.05 rad outside the limits, of which 0.03 rad are kept as a margin.
+    # The emulated stops are 0.05 rad outside the limits; 0.03 rad of this are kept as a margin.
     assert found.hand.q_min == pytest.approx((-0.42, -0.32), abs=0.01)
     assert found.hand.q_max == pytest.approx((0.92, 0.82), abs=0.01)
     assert "ids = [2, 1] # left, right" in file.read_text()
@@ -62,8 +62,8 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("turn", "told"),
     [
-        ("left={pose} right={pose}", "servos 1 and 2 turned, expected one: move it alone"),
-        ("left={pose}", "servo 2 turned for both fingers"),
+        ("left={pose} right={pose}", "servos 1 and 2 rotated, expected one servo: move only one"),
+        ("left={pose}", "servo 2 rotated with both fingers"),
         ("left=ajar", "ended with status 1"),
     ],
 )
@@ -93,7 +93,7 @@ def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
     assert "left finger: found 0.0° between closed and open" in capsys.readouterr().err
     monkeypatch.setattr(emulator._servos.bus.servos[0]._joint, "shift", 4000)
     assert calibrate(folder, *words) == 1
-    assert "is outside one turn" in capsys.readouterr().err
+    assert "(one turn), because the position changes" in capsys.readouterr().err
 
 
 def test_only_calibrated_values_change_in_a_profile():

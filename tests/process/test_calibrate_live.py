@@ -1,4 +1,4 @@
-"""`softfinger calibrate` with a live board on a pty, load by load."""
+"""Test `softfinger calibrate` with a live board on a pty, one load at a time."""
 
 import contextlib
 import io
@@ -22,7 +22,7 @@ FRAMES = 12
 
 
 class Bench:
-    """Frames of the simulated sensor's board; each Enter key applies the next load."""
+    """Frames of the simulated sensor's board; each press of Enter applies the next load."""
 
     def __init__(self) -> None:
         self.sensor = MadeUp()
@@ -129,5 +129,5 @@ def test_without_matplotlib_the_step_succeeds_and_reports_the_missing_plot(
     np.savez(frames, frames=MadeUp().counts(np.zeros((N, N)), 10))
     words = ["--config", str(live / "profile.toml"), "--recording", str(frames)]
     assert main(["calibrate", "tare", str(tmp_path / "a.json"), *words]) == 0
-    assert "no picture was drawn: pictures need matplotlib" in capsys.readouterr().err
+    assert "the result was not plotted: plots require matplotlib" in capsys.readouterr().err
     assert load_calibration(tmp_path / "a.json").tare.frames == 10

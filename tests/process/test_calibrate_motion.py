@@ -1,4 +1,4 @@
-"""`calibrate friction` and `calibrate latency` move a hand on ptys through its running daemon."""
+"""Test that `calibrate friction` and `calibrate latency` move a hand through its daemon."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,7 +28,7 @@ Calibrate = Callable[..., int]
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Hand]]:
-    """Yield a profile of the hand, and a client of its daemon."""
+    """Yield the hand's profile and a client connected to its daemon."""
     folder = tmp_path_factory.mktemp("hand")
     addresses = own_addresses()
     profile = folder / "my.toml"
@@ -62,7 +62,9 @@ def test_friction_is_calibrated_by_sweeping_a_joint(hand, calibrate, capsys):
     profile, client = hand
     assert calibrate("friction", "--set", 'scene.fingers=["left"]') == 0
     told = capsys.readouterr()
-    assert "keep the space around the fingers free; sweeps left 0° to -23°" in told.err
+    assert (
+        "keep the space around the fingers free; the joints will sweep left 0° to -23°" in told.err
+    )
     # At the sweep's velocities, a tenth of the additional static friction remains.
     found = load(profile, profile.parent)
     assert found.control.joint_friction == pytest.approx(FRICTION, abs=2 * COUNT)
@@ -75,7 +77,7 @@ def test_latency_is_calibrated_by_grasps_at_several_forces(hand, calibrate, caps
     profile, client = hand
     assert calibrate("latency", "--force", "8") == 0
     told = capsys.readouterr()
-    assert "put an object between the fingers; it is grasped with 8 N" in told.err
+    assert "put an object between the fingers; the hand will grasp it with 8 N" in told.err
     assert "(the daemon used 15 ms) from " in told.out
     assert load(profile, profile.parent).tactile.latency == pytest.approx(LATENCY, abs=4e-3)
     assert client.state().mode == "disarmed"

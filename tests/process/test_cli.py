@@ -1,4 +1,4 @@
-"""The command line in separate processes: run, send, signals, a second daemon, invalid settings."""
+"""Test the command line in processes: run, send, signals, a second daemon, invalid settings."""
 
 import json
 import os
@@ -53,13 +53,13 @@ def test_duration_and_settings_on_the_command_line(profile, inline):
     done = softfinger("run", "--config", path, "--set", "loop.rate=250", "--duration", "0.3")
     assert done.returncode == 0, done.stderr
     assert "simulated, 250 Hz" in done.stderr
-    assert "ended, torque off" in done.stderr
+    assert "ended; torque is off" in done.stderr
 
 
 def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
     second = softfinger("run", "--config", str(daemon.profile))
     assert second.returncode == 1
-    # Both addresses are in use; which is found first depends on the order of start-up.
+    # Both addresses are in use; the order of start-up determines which one is found first.
     taken = (f"stream.address: {daemon.addresses[0]}", f"commands.address: {daemon.commands}")
     assert any(f"{each} is in use; is another softfinger" in second.stderr for each in taken)
 
@@ -76,10 +76,10 @@ def test_a_missing_serial_port_is_named(profile, inline):
 def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
     done = inline("send", "arm", "--address", addresses[1], "--timeout", "0.1")
     assert done.returncode == 2
-    assert f"send: no answer to arm from {addresses[1]} within 0.1 s" in done.stderr
+    assert f"send: no reply to arm from {addresses[1]} within 0.1 s" in done.stderr
     assert "is softfinger running, or still starting?" in done.stderr
     done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "3")
-    assert f"no answer to arm from {addresses[1]} yet, waiting up to 3 s" in done.stderr
+    assert f"no reply to arm from {addresses[1]} yet, waiting up to 3 s" in done.stderr
     done = inline("send", "grasp", "force:5", "--address", addresses[1])
     assert done.returncode == 2
     assert "found 'force:5', expected key=number" in done.stderr
@@ -90,7 +90,7 @@ def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
 )
 def test_a_signal_during_start_up_exits_without_a_traceback(profile, number):
     process = started("run", "--config", profile(""))
-    # Printed once the signal handlers are installed, before compilation.
+    # This line is printed once the signal handlers are installed, before compilation.
     first = process.stderr.readline()
     process.send_signal(number)
     said = first + process.communicate(timeout=300)[1]
@@ -113,13 +113,13 @@ def test_fatal_signals_turn_torque_off_first(profile, addresses, number):
     process.send_signal(number)
     said = process.communicate(timeout=300)[1]
     assert process.returncode == 0
-    assert "ended, torque off" in said
+    assert "ended; torque is off" in said
 
 
 @pytest.mark.extended
 def test_a_log_reader_that_stops_reading_does_not_block_the_daemon(profile, addresses):
     process = started("run", "--config", profile(""))
-    process.stderr.close()  # from now on, every write to it fails
+    process.stderr.close()  # from now on, every write to stderr fails
     assert ask(addresses[1], "arm")["ok"]
     assert ask(addresses[1], "status")["mode"] == "armed"
     process.terminate()
@@ -136,9 +136,9 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     daemon.running.process.send_signal(signal.SIGSTOP)
     for request in requests:
         socket.send_multipart([b"", msgpack.packb(request)])
-    # Exceeds the size limit, so the gateway refuses it itself.
+    # This message exceeds the size limit, so the gateway refuses it itself.
     socket.send_multipart([b"", b"x" * 5000])
-    assert socket.poll(60_000)  # the gateway also has all earlier requests
+    assert socket.poll(60_000)  # the gateway has also read all earlier requests
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"
     select.select([], [], [], 0.5)  # the stall
     daemon.running.process.send_signal(signal.SIGCONT)
@@ -154,7 +154,7 @@ def test_a_command_received_during_a_stall_is_refused(daemon, context):
     assert (arm["ok"], arm["reason"]) == (False, "late")
     assert ask(daemon.commands, "status")["torque"] is False
     (disarm,) = stalled(daemon, context, {"command": "disarm"})
-    assert disarm["ok"] or disarm["reason"] == "late"  # after more than 1 s, on a busy machine
+    assert disarm["ok"] or disarm["reason"] == "late"  # may arrive late on a busy machine
 
 
 def test_a_stop_received_during_a_stall_also_cancels_waiting_commands(daemon, context):
@@ -185,7 +185,7 @@ def test_an_ipc_address_never_replaces_a_file(tmp_path, profile, inline):
     words = ("--set", f"stream.address=ipc://{file}", "--duration", "0.2")
     done = inline("run", "--config", profile(""), *words)
     assert done.returncode == 1
-    assert "exists and is not a socket" in done.stderr
+    assert "exists but is not a socket" in done.stderr
     assert file.read_text(encoding="utf-8") == "kept"
 
 
@@ -204,5 +204,5 @@ def test_a_disabled_compiler_is_reported_in_one_line():
     assert done.returncode == 1
     assert done.stdout == ""
     assert done.stderr == (
-        "limits: NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset it\n"
+        "limits: NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset this variable\n"
     )

@@ -1,4 +1,4 @@
-"""The Python client, with a real daemon and with streams that a real daemon never sends."""
+"""Test the Python client with a real daemon and with streams that a real daemon never sends."""
 
 import asyncio
 import inspect
@@ -114,7 +114,7 @@ def test_a_wait_times_out_with_the_last_state(hand):
 def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
     stream, commands = addresses
     timeout = SILENCE_TIME + 0.05
-    unanswered = rf"no answer to arm from {commands} within 1\.05 s"
+    unanswered = rf"no reply to arm from {commands} within 1\.05 s"
 
     async def ask() -> None:
         async with AsyncHand(*addresses, timeout=timeout) as hand:
@@ -131,7 +131,7 @@ def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
     asyncio.run(ask())
     said = [
         f"no hand/state from {stream} yet, waiting up to 1.05 s",
-        f"no answer to arm from {commands} yet, waiting up to 1.05 s",
+        f"no reply to arm from {commands} yet, waiting up to 1.05 s",
     ]
     assert caplog.messages == said + said
 
@@ -181,7 +181,7 @@ def test_a_value_that_is_not_a_number_is_refused_by_parameter_name(fake, hand, g
 
 LATE = {
     "ok": False,
-    "error": "arm: the command was 0.40 s old when it was handled",
+    "error": "arm: the command was 0.40 s old when it was processed",
     "reason": "late",
 }
 MODE = {
@@ -216,10 +216,10 @@ def test_a_late_command_is_repeated_with_its_key_and_a_refused_one_is_not(fake, 
     assert caught.value.reason == "mode"
     assert len(fake.requests) == 4
     assert len(set(fake.keys)) == 2
-    # No time remains for a second attempt.
+    # The long delay leaves no time for a second attempt.
     monkeypatch.setattr(command_client, "RETRY_DELAY", 100.0)
     fake.replies["arm"] = LATE
-    with pytest.raises(Refused, match="old when it was handled") as caught:
+    with pytest.raises(Refused, match="old when it was processed") as caught:
         arm(fake, 60.0)
     assert caught.value.reason == "late"
     assert len(fake.requests) == 5
@@ -236,7 +236,7 @@ def test_a_cancelled_command_is_not_repeated(fake):
                 await arming
 
     fake.replies["arm"] = LATE
-    asyncio.run(cancelled())  # waits for the attempt in progress
+    asyncio.run(cancelled())  # cancellation waits for the attempt in progress
     count, published = len(fake.requests), fake.published
     until(lambda: fake.published > published + 50)  # half a second
     assert len(fake.requests) == count
@@ -252,17 +252,17 @@ def test_state_returns_a_current_state(fake, hand):
 
 def test_gaps_are_counted_with_the_step_of_the_topic():
     gaps = Gaps()
-    for seq in (5, 10, 16, 30, 36):  # the sender chooses which one of five is sent
+    for seq in (5, 10, 16, 30, 36):  # the publisher sends one of five states, at any phase
         gaps.take({"seq": seq, "seq_step": 5})
     assert gaps.lost == 2
-    gaps.take({"seq": 5, "seq_step": 5})  # a restart, not a loss
+    gaps.take({"seq": 5, "seq_step": 5})  # the daemon has restarted; this is not a loss
     gaps.take({"seq": 10, "seq_step": 5})
     assert gaps.lost == 2
     for finger in ("left", "right"):  # counted separately per finger
         for seq in (1, 2, 4):
             gaps.take({"seq": seq, "finger": finger})
     assert gaps.lost == 4
-    for seq, number in ((10, 1), (15, 2), (16, 4)):  # frames are counted by their own number
+    for seq, number in ((10, 1), (15, 2), (16, 4)):  # frames have their own numbers
         gaps.take({"seq": seq, "seq_step": 1, "number": number, "finger": "middle"})
     assert gaps.lost == 5
     again = Gaps()
@@ -270,7 +270,7 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     assert [again.take({"seq": seq, "again": True}) for seq in (3, 4, 5)] == [True, True, False]
     assert again.take({"seq": 8, "again": False})
     assert again.lost == 2
-    assert again.take({"seq": 7, "again": True})  # fills a gap
+    assert again.take({"seq": 7, "again": True})  # the repeated message fills a gap
     assert again.lost == 1
     assert again.take({"seq": 1, "again": False})  # another daemon
     assert again.take({"seq": 5, "again": False})
@@ -429,7 +429,7 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
             Hand()
 
 
-UNKNOWN = "found the unknown host 'no..host' (not a host name), expected a name that"
+UNKNOWN = "found unknown host 'no..host' (not a host name), expected an IP address or a"
 
 
 @pytest.mark.parametrize("cls", [Hand, AsyncHand])
@@ -457,7 +457,7 @@ def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeyp
         pass  # has no host
     monkeypatch.undo()
     with Hand("tcp://127.0.0.1:0;127.0.0.1:9872", "tcp://[::1]:9873"):
-        pass  # a source address, and a numeric one
+        pass  # one address with a source, and one numeric address
 
 
 @pytest.mark.parametrize("words", [["monitor"], ["send", "stop"], ["status"], ["record", "a.mcap"]])
@@ -470,14 +470,14 @@ def test_commands_fail_at_once_for_an_unknown_host(inline, monkeypatch, words, g
 
 
 def in_a_thread(use: Callable[[], object]) -> BaseException | None:
-    """The exception that a call raises in a thread of its own."""
+    """The exception that a call raises in a separate thread."""
     with ThreadPoolExecutor(1, "other") as pool:
         return pool.submit(use).exception(60.0)
 
 
 def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     states = hand.stream(60.0)
-    assert in_a_thread(hand.grasp) is None  # commands have a socket of their own
+    assert in_a_thread(hand.grasp) is None  # commands use a separate socket
     next(states)
     for use in (
         lambda: next(states),
@@ -490,7 +490,9 @@ def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     ):
         error = in_a_thread(use)
         assert isinstance(error, WrongThread), use
-        assert "thread other_0: found a Hand whose stream thread MainThread uses" in str(error)
+        assert "thread other_0: found a Hand whose stream is used by thread MainThread" in str(
+            error
+        )
     assert next(states).mode == hand.state().mode == "holding"
 
 
@@ -536,7 +538,7 @@ def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):
     left, right = fake_daemon.finger(0.0, 0), fake_daemon.finger(0.0, 1)
     fake.changes = {"left": left, "right": right}
     before = fake.published
-    until(lambda: fake.published > before + 1)  # the changes are in all further states
+    until(lambda: fake.published > before + 1)  # all further states include the changes
     told = inline("status", "--address", fake.state_address)
     assert told.returncode == 0
     line = re.fullmatch(r"(\w+) (\S+) N \(\S+ ± \S+, \S+ ± \S+\), (\S+)°, (\S+) mm\n", told.stdout)

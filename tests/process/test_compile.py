@@ -1,4 +1,4 @@
-"""Ahead-of-time compilation with `softfinger compile`, and a loop that never compiles."""
+"""Test ahead-of-time compilation with `softfinger compile`, and a loop that never compiles."""
 
 import contextlib
 import json
@@ -33,12 +33,12 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def compiled(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run the complete command."""
+    """Run `softfinger compile` with a separate cache."""
     return softfinger("compile", *BARE, *words, env=environment(folder))
 
 
 def steep(folder: Path) -> Path:
-    """Return a profile whose material cannot reach the table tolerance."""
+    """Return a profile whose material cannot meet the table tolerance."""
     strain = [0.1 * k for k in range(11)]
     stress = [1e5 * (math.exp(9.0 * each) - 1.0) for each in strain]
     file = folder / "steep.toml"
@@ -54,9 +54,9 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     done = python("-m", "softfinger.tools.processes.compile", **own)
     *kernels, last = done.stdout.splitlines()
     assert last == "done"
-    # The count is for the newest Numba; the oldest supported one reports a third fewer.
+    # The count is for the newest Numba; the oldest supported version reports a third fewer.
     assert 0.6 * table.kernels <= len(kernels) <= 1.2 * table.kernels
-    # Mark the other part as compiled.
+    # Mark the other set of kernels as compiled.
     (mark,) = (tmp_path / "softfinger").glob("kernels-*/contact-table-springs.built")
     mark.with_name("joints-and-timing-springs.built").touch()
     again = compiled(tmp_path)
@@ -72,7 +72,9 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     mark.unlink()
     bad = compiled(tmp_path, "--config", str(steep(tmp_path)))
     assert bad.returncode == 1
-    assert "contact table was not compiled ahead: SettingsError: table.tolerance" in bad.stderr
+    assert (
+        "contact table was not compiled ahead of time: SettingsError: table.tolerance" in bad.stderr
+    )
 
 
 def test_ctrl_c_before_a_compiler_thread_starts_is_passed_on(monkeypatch):
@@ -133,7 +135,7 @@ def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path, names):
         blind = name in ("servos without sensors", "position mode")
         wanted = {"disarmed"} | ({"armed"} if servos else set())
         wanted |= {"grasping"} if servos and not blind else set()
-        # Missing modes in the real-time scene only show that the machine is busy.
+        # On a busy machine, the real-time scene may miss some modes.
         timely = name != STAND_IN
         wanted |= {"holding", "releasing"} if servos and not blind and timely else set()
         assert wanted <= set(scene["modes"]), (name, scene["faults"])

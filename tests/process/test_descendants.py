@@ -1,4 +1,4 @@
-"""All processes started by a test end with it, including orphaned descendants."""
+"""Test that a test's processes end with the test, including orphaned descendants."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""`softfinger doctor` and `softfinger scan` with emulated hands, and single checks."""
+"""Test `softfinger doctor` and `softfinger scan` on emulated hands, and single checks."""
 
 import contextlib
 import os
@@ -37,7 +37,7 @@ from tests.harness.gateway import Served
 
 
 class Hand:
-    """Emulated hand in a thread, with access for the doctor."""
+    """Emulated hand in a thread that the doctor can examine."""
 
     def __init__(self, folder: Path, **options: Any) -> None:
         self.folder = folder
@@ -48,14 +48,14 @@ class Hand:
         self.emulator = self._stack.enter_context(running)
 
     def registers(self) -> list[bytes]:
-        """Return the servos' registers without those that change by themselves."""
+        """Return the servos' registers, except those that change by themselves."""
         live = slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
         bus = self.emulator._servos.bus
         memories = [bytes(servo.table.memory) for servo in bus.servos]
         return [memory[: live.start] + memory[live.stop :] for memory in memories]
 
     def doctor(self, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, list[str]]:
-        """Return the doctor's status and lines; in the emulator's process, replies may be late."""
+        """Return the doctor's status and lines, with settings that tolerate late replies."""
         late = ("servos.reply_timeout=1", "servos.open_timeout=0.1", "loop.rate=20")
         words += ("--set", "servos.watchdog=0.5", "--set", "servos.fault_after=0.5")
         words += tuple(word for each in late for word in ("--set", each))
@@ -75,7 +75,7 @@ def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the measurements of this machine and skip its sockets."""
+    """Shorten the doctor's measurements of this machine and skip its address check."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UP_COUNT", 5)
 
@@ -138,13 +138,13 @@ def test_boards_are_checked(hands, capsys):
     status, lines = hand.doctor(capsys)
     assert status == 0
     untared = next(line for line in lines if line.startswith("warn   tactile left"))
-    assert "expected 0 at rest" in untared
+    assert "without load, expected 0" in untared
     hand.emulator.request("left:wrong-size")
     status, lines = hand.doctor(capsys)
     assert status == 1
     assert "256 cells" in next(line for line in lines if line.startswith("FAIL   tactile left"))
     assert "       → set tactile.rows and tactile.cols" in lines
-    assert scanned(capsys, hand.folder, "--wait", "1") == [  # servos that reply, at any rate
+    assert scanned(capsys, hand.folder, "--wait", "1") == [  # the servos reply at any rate
         f"ID {servo} at 2000000, 1000000 baud: XM430-W350, firmware 48" for servo in (1, 2)
     ]
     assert main(["doctor"]) == 0
@@ -162,12 +162,12 @@ def test_a_tip_model_other_than_the_calibrated_one_is_reported(tmp_path):
     save_calibration(tmp_path / "left.json", made)
     untried = devices.check_law(tips(), 0)
     assert (untried.status, untried.fix) == ("note", "`softfinger calibrate law`")
-    assert "'springs', not verified by presses" in untried.text
+    assert "'springs', which has not been verified" in untried.text
     wants = {"physics": "solid", "base": "bonded", "face": "frictionless", "poisson": 0.48}
     save_calibration(tmp_path / "left.json", made.model_copy(update={"wants": wants}))
     told = devices.check_law(tips(), 0)
     assert told.status == "warn"
-    assert "tip.physics is 'springs', but the presses of `calibrate law` fit 'solid'" in told.text
+    assert "tip.physics is 'springs', but `calibrate law` found 'solid'" in told.text
     assert devices.check_law(tips(physics="solid", poisson=0.47), 0).status == "pass"
     assert devices.check_law(tips(physics="solid", poisson=0.45), 0).fix == "set tip.poisson"
     (tmp_path / "left.json").write_text("{}")
@@ -181,10 +181,12 @@ def test_a_missing_port_and_a_missing_servo_fail(hands, capsys):
     assert status == 1
     failed = with_status(lines, "FAIL")
     assert [line for line in failed if "tactile-right: no such file" in line]
-    silent = "servo 2 (right): no answer at 2000000 baud within servos.open_timeout = 0.1 s"
+    silent = "servo 2 (right): no reply at 2000000 baud within servos.open_timeout = 0.1 s"
     assert silent in failed
-    (at,) = [k for k, line in enumerate(lines) if "no other servo answers at any rate; " in line]
-    assert lines[at].endswith(" V at the servos that answer")
+    (at,) = [
+        k for k, line in enumerate(lines) if "no other servo replies at any baud rate; " in line
+    ]
+    assert lines[at].endswith(" V at the servos that reply")
     assert "replace the cable between the servos" in lines[at + 1]
 
 
@@ -205,7 +207,7 @@ def test_servos_at_another_rate_are_found(hands, capsys):
     ]
     path = str(hand.folder / "servos")
     assert main(["scan", path, "--baud", "57600", "--wait", "0.5"]) == 1
-    assert "no servo answers" in capsys.readouterr().out
+    assert "no servo replies" in capsys.readouterr().out
     assert main(["scan", "/dev/does-not-exist"]) == 1
     assert "no such port" in capsys.readouterr().err
 
@@ -219,7 +221,7 @@ def test_a_servo_id_is_only_changed_on_request(hands, capsys):
     status, lines = hand.doctor(capsys)
     assert (status, servo.id) == (1, 7)
     assert found in lines
-    fix = "softfinger doctor --fix makes it servo 2 (right): ID 7 → 2; or set the other servos.ids"
+    fix = "run softfinger doctor --fix to use it as servo 2 (right): ID 7 → 2; or set servos.ids"
     assert f"       → {fix}" in lines
     status, lines = hand.doctor(capsys, "--fix")
     assert (status, servo.id) == (0, 2)
@@ -228,8 +230,8 @@ def test_a_servo_id_is_only_changed_on_request(hands, capsys):
     status, lines = hand.doctor(capsys)
     assert status == 1
     (garbled,) = [line for line in with_status(lines, "FAIL") if "are damaged" in line]
-    assert garbled.startswith("servos: replies of ID 1 at 2000000 baud are damaged: several ser")
-    assert [line for line in lines if line.startswith("       → connect one servo alone and")]
+    assert garbled.startswith("servos: replies of ID 1 at 2000000 baud are corrupted: several ser")
+    assert [line for line in lines if line.startswith("       → connect only one servo and")]
 
 
 # Ports.
@@ -250,7 +252,7 @@ def test_unusable_ports_fail(tmp_path, terminal, monkeypatch):
     assert "servos.port" in missing.fix
     dangling = tmp_path / "dangling"
     dangling.symlink_to(tmp_path / "gone")
-    assert ports.check_port(str(dangling), "servos.port").text == "the link has no target"
+    assert ports.check_port(str(dangling), "servos.port").text == "the link's target does not exist"
     plain = tmp_path / "plain"
     plain.touch()
     assert ports.check_port(str(plain), "servos.port").text == "is not a serial port"
@@ -264,7 +266,7 @@ def test_unusable_ports_fail(tmp_path, terminal, monkeypatch):
 @pytest.mark.parametrize("locked", [True, False])
 def test_the_process_using_a_port_is_named(terminal, locked):
     path = terminal
-    # This process owns the pty's master and does not count as a user of the port.
+    # This process owns the pty's master, so it does not count as a user of the port.
     script = (
         "import fcntl, os, sys; d = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)\n"
         f"if {locked}: fcntl.flock(d, fcntl.LOCK_EX)\n"
@@ -284,7 +286,7 @@ def test_the_process_using_a_port_is_named(terminal, locked):
     assert found.fix == f"kill {other.pid}"
     assert well.status == "warn", "a responding daemon must not be killed"
     assert (
-        f"in use by the softfinger daemon that runs here (holding, process {other.pid})"
+        f"in use by the softfinger daemon running on this machine (holding, process {other.pid})"
         in well.text
     )
     assert "kill" not in well.fix
@@ -360,11 +362,11 @@ def test_missing_damaged_and_writable_kernel_files_cause_warnings(tmp_path, monk
     (folder,) = tmp_path.glob("kernels-*")
     (folder / "grip.kernel").write_bytes(b"torn")
     (found,) = kernels.check_kernels(scene)
-    assert (found.status, found.text[:15]) == ("warn", "1 damaged files")
+    assert (found.status, found.text[:17]) == ("warn", "1 corrupted files")
     folder.chmod(0o777)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"
-    assert "other users may write to it" in found.text
+    assert "other users can write to it" in found.text
     assert "NUMBA_CACHE_DIR" in found.fix
 
 
@@ -386,7 +388,7 @@ def test_unused_and_used_sockets(addresses, monkeypatch):
     with socket.create_server((host, int(port))):
         taken, free = ports.check_addresses(settings)
     assert taken.status == "FAIL"
-    assert "a program other than a softfinger daemon" in taken.text
+    assert "another program, which is not a softfinger daemon" in taken.text
     assert "stream.address" in taken.fix
     assert free.status == "pass"
 
@@ -395,7 +397,7 @@ def test_a_running_daemon_is_detected(addresses):
     with Served(commands=addresses[1]) as served, served.serving(lambda *_: {"mode": "holding"}):
         _, found = ports.check_addresses(profile(addresses))
     assert found.status == "warn"
-    assert "already running here (holding)" in found.text
+    assert "already running on this machine (holding)" in found.text
 
 
 def test_ipc_addresses(tmp_path):

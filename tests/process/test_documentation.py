@@ -1,8 +1,8 @@
-"""Run every code block of README and docs unchanged: shell, Python, profiles.
+"""Run every code block of the README and the docs unchanged: shell, Python, profiles.
 
-Each page runs from its top in its own folder, with one simulated hand. `harness.documented` is its
-`softfinger` command and describes which commands are only parsed. A block with a title is saved as
-that file, for later blocks. A mark above a block makes an exception:
+Each page runs from top to bottom in its own folder, with one simulated hand. `harness.documented`
+provides the `softfinger` command and describes which commands are only parsed. A block with a title
+is saved under that name for later blocks. A mark above a block makes an exception:
 
     <!-- not run: why -->                  the block cannot be run, with the reason
     <!-- not run without gymnasium -->     the block needs a package that is not installed here
@@ -47,12 +47,12 @@ FENCE = re.compile(
     r"(?P<text>.*?)^(?P=indent)```$"
 )
 STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")  # with the expected status
-PRINTS = 20  # lines printed by a program without an end
+PRINTS = 20  # lines printed by a program that never ends
 PATIENCE = 300.0  # s for one block
 
 
 class Block(NamedTuple):
-    """A code block with its first line, the mark above it, and the file it is saved as."""
+    """A code block with its line number, the mark above it, and the file it is saved as."""
 
     line: int
     language: str
@@ -149,7 +149,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
 
 
 def run_python(text: str, addresses: tuple[str, str]) -> None:
-    """Run in this process; a program without an end is ended after PRINTS lines."""
+    """Run the block in this process; stop an endless program after PRINTS lines."""
     for usual, own in zip(USUAL, addresses, strict=True):
         text = text.replace(usual, own)
 

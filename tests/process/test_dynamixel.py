@@ -1,4 +1,4 @@
-"""The Dynamixel backend with the real SDK and pyserial, against emulated servos on a pty."""
+"""Test the Dynamixel backend with the real SDK and pyserial, on emulated servos on a pty."""
 
 import math
 import struct
@@ -22,7 +22,7 @@ FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fas
 
 
 def placed(firmware: int, *counts: int) -> ServoBus:
-    """Return servos of a firmware at these counts, configured for the hand."""
+    """Return servos with the given firmware and positions [counts], configured for the hand."""
     return make_bus("XM430-W350", firmware=firmware, for_daemon=True, counts=counts)
 
 
@@ -132,7 +132,7 @@ def test_joints_follow_their_goals(running, model, level):
     until(there)
     assert reading.valid
     counters = backend.counters()
-    counters.pop("timeouts")  # may happen on a busy machine
+    counters.pop("timeouts")  # this may happen on a busy machine
     assert counters == dict.fromkeys(counters, 0)
     backend.close()
 
@@ -194,11 +194,11 @@ def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connec
         """Read the joints at ``count``, which differs from the positions in earlier replies."""
         bus.call(lambda: bus.bus.plant.q.__setitem__(slice(2), count * RADIAN))
         backend.read(reading)
-        if reading.valid:  # the reply was not late because this thread was suspended
+        if reading.valid:  # the reply was late, and not only because this thread was suspended
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")
-    # A busy machine receives few late replies.
+    # On a busy machine, few late replies are received, so this may take many readings.
     while backend.counters()["late"] <= 20 and reading.seq < 1000:
         at_another_place(reading.seq)
     bus.fault("late=0")
@@ -216,7 +216,7 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
         for _ in range(2):  # the first read checks the supply voltage
             backend.read(Reading())
 
-    with pytest.raises(ServoError, match="its bus watchdog stopped it"):
+    with pytest.raises(ServoError, match="its bus watchdog stopped the servo"):
         look()
     assert backend.torque_off(Reading())
     backend.torque_on()
@@ -225,7 +225,7 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
 
 
 @pytest.mark.parametrize(
-    "what", ["its bus watchdog stopped it", "its bus watchdog is off; it may have rebooted"]
+    "what", ["its bus watchdog stopped the servo", "its bus watchdog is off, possibly because"]
 )
 def test_a_servo_that_stopped_by_itself_is_detected_despite_timely_writes(bus, connect, what):
     # This happens if an adapter delays packets or if power is lost briefly.

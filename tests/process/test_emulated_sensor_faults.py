@@ -1,4 +1,4 @@
-"""Sensor faults, and a hand that differs from its settings, over serial bytes.
+"""Test sensor faults, and a hand that differs from its settings, over serial lines.
 
 The emulated hand's true force is the reference.
 """
@@ -16,7 +16,7 @@ from tests.soak.rig import Rig
 
 pytestmark = pytest.mark.extended
 FORCE = 6.0  # N
-# Times of the emulated hand in s: in total, and the final interval used for means.
+# Times of the emulated hand in s: total duration, and final interval used for means.
 LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"
@@ -26,7 +26,7 @@ REFUSED = "left:shift-x=3"  # fault after which the hand lets go
 
 @contextlib.contextmanager
 def running(hand: Sequence[str] = (), daemon: Sequence[str] = ()) -> Iterator[Rig]:
-    """Yield an emulated hand and its daemon on a shared clock that waits for a busy machine.
+    """Yield an emulated hand and its daemon on a shared clock, which tolerates a busy machine.
 
     ``hand`` and ``daemon`` are additional settings.
     """
@@ -75,7 +75,7 @@ def gripped(rig: Rig) -> None:
 
 
 def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
-    """Yield the emulated hand's reports until its time is over or its servos are not driven."""
+    """Yield the emulated hand's reports for ``seconds`` or until all its servos have torque off."""
     begin = rig.report()["t"]
     while True:
         report = rig.report()
@@ -83,7 +83,7 @@ def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
         driven = any(servo["torque"] for servo in report["servos"])
         if report["t"] > begin + seconds or not driven:
             return
-        select.select([], [], [], 0.005)  # leave the processor to the hand and daemon
+        select.select([], [], [], 0.005)  # leave the processor to the hand and the daemon
 
 
 @pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])

@@ -1,4 +1,4 @@
-"""`softfinger emulate`: process, ports, boards, scenes, faults and invalid input."""
+"""Test `softfinger emulate`: process, ports, boards, scenes, faults and invalid input."""
 
 import os
 import signal
@@ -113,7 +113,7 @@ def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues
         process.popen.send_signal(signal.SIGSTOP)
         assert servos.silent(7)
         process.popen.send_signal(signal.SIGCONT)
-        assert servos.ping(7) == 1200  # the reply to either of the two pings
+        assert servos.ping(7) == 1200  # one of the two pings got this reply
         servos.close()
         assert process.end(signal.SIGHUP) == (0, "", "")
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
@@ -205,7 +205,7 @@ def test_emulated_time_is_synchronised_with_a_late_daemon(monkeypatch, tmp_path,
             apart.append(clock.now() - daemon.now())
     assert max(apart[20:]) - min(apart[20:]) <= 0.0045
     assert daemon.behind > 100 * late or late < 0.002
-    # Time still advances for a reply on the wire, and once the daemon is gone.
+    # Time still advances while a reply is on the wire, and after the daemon has exited.
     machine.work(0.01)
     stands = clock.now()
     machine.work(0.01)
@@ -280,7 +280,7 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
         assert servos.silent(1)
         assert servos.silent(2)
         assert send(tmp_path, "well") == 0
-        assert log[-1] == "all faults ended"
+        assert log[-1] == "all faults have ended"
         assert servos.ping(1) == servos.ping(2) == 1020
         for ended in ("plug left:plug@0.05", "well@0.05"):
             assert send(tmp_path, "unplug left:unplug") == 0
@@ -292,7 +292,7 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
             assert servos.ping(1) == 1020
         servos.close()
         assert capsys.readouterr().err == ""
-        # If one word is invalid, all words are ignored.
+        # One invalid word invalidates the whole message.
         assert send(tmp_path, "silent=2 sillent=2") == 1
         assert "'sillent=2'" in capsys.readouterr().err
         assert SdkServos(tmp_path).ping(2) == 1020
@@ -307,7 +307,7 @@ def test_sending_without_an_emulator_fails(tmp_path, capsys):
 def test_the_control_socket_survives_misbehaving_clients_and_is_removed_at_the_end(
     tmp_path, monkeypatch
 ):
-    folder = tmp_path / ("long" * 30)  # too long for a socket's own path
+    folder = tmp_path / ("long" * 30)  # longer than the limit for a socket path
     folder.mkdir()
     with emulated(folder):
         place = folder / "control"
@@ -335,7 +335,9 @@ def test_injected_faults_change_measurements_but_not_the_hand(tmp_path):
         assert (left("current", 9.0), right("current", 9.0)) == (3.0, 1.0)
         assert send(tmp_path, "right:well left:gain=0@0.1..0.2") == 0
         until(lambda: board_mean(tmp_path, 1) < 10)
-        until(lambda: log[-2:] == ["right: all faults ended", "fault: left: gain=0 within 0.1 s"])
+        until(
+            lambda: log[-2:] == ["right: all faults have ended", "fault: left: gain=0 within 0.1 s"]
+        )
         until(lambda: left("gain", made.clock.now()) == 0.0)
         assert left("current", 9.0) == 3.0
         assert send(tmp_path, "well") == 0

@@ -1,4 +1,4 @@
-"""The exchange of one tick: timed by `doctor`, tested at connect, monitored while disarmed."""
+"""Test the bus exchange of one tick: `doctor` timing, checks on connecting and while disarmed."""
 
 import contextlib
 import grp
@@ -29,7 +29,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 
 def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
-    """Return the doctor's result for the exchange of one tick."""
+    """Return the doctor's timing of one tick's bus exchange."""
     settings = backend_settings(bus.port, **servos)
     loop = settings.loop.model_copy(update={"rate": rate})
     settings = settings.model_copy(update={"loop": loop})
@@ -37,7 +37,7 @@ def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
     return found
 
 
-# Timing by the doctor.
+# Timing by the doctor
 
 
 def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running):
@@ -51,7 +51,7 @@ def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running)
     assert found.text.startswith("50 read and write cycles: p50 ")
     until(lambda: len(re.findall(rb"\xff\xff\xfd\x00\xfe..\x83", heard, re.DOTALL)) == 50)
     reads = re.findall(rb"\xff\xff\xfd\x00\xfe..\x8a", heard, re.DOTALL)
-    assert len(reads) == 54  # each of the four spans is tested first
+    assert len(reads) == 54  # the doctor first tests each of the four spans
     assert [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)] == before
 
 
@@ -59,7 +59,7 @@ def test_late_replies_fail_with_timings_and_suggested_settings(bus):
     bus.fault("delay=0.02")
     found = exchange(bus, 100.0, reply_timeout=1.0)
     assert found.status == "FAIL"
-    assert "a tick takes 10 ms (loop.rate = 100), and a reply may take 1000 ms" in found.text
+    assert "expected at most one tick of 10 ms (loop.rate = 100) and at most 1000 ms" in found.text
     assert found.fix.startswith("set loop.rate = ")
     assert float(found.fix.split()[3].rstrip(";")) < 50.0
     found = exchange(bus, 5.0, reply_timeout=0.005)
@@ -73,12 +73,12 @@ def test_assessment_of_exchange_times():
 
     assert judged(0.0004, 0.0009).status == "pass"
     assert judged(0.0004, 0.0009).text == "50: p50 0.4 ms, p99 0.9 ms, 0% failed"
-    near = judged(0.0017, 0.0018)  # `run` warns of the same
+    near = judged(0.0017, 0.0018)  # `run` issues the same warning
     assert (near.status, near.fix.split(";")[0]) == ("warn", "set loop.rate = 440")
-    assert near.text.endswith("a tick takes 2 ms (loop.rate = 500): ticks will be late")
+    assert near.text.endswith("too much of a tick of 2 ms (loop.rate = 500): ticks will be late")
     both = judged(0.0028, 0.003)  # shorter than reply_timeout and longer than a tick
     assert (both.status, both.fix.split(";")[0]) == ("FAIL", "set loop.rate = 260")
-    assert "a tick takes 2 ms (loop.rate = 500), and a reply may take 4 ms" in both.text
+    assert "expected at most one tick of 2 ms (loop.rate = 500) and at most 4 ms" in both.text
     slow = judged(0.016, 0.016)
     assert slow.fix.startswith("set servos.reply_timeout = 0.024 and loop.rate = 50; or")
     assert judged(0.0004, 0.01).status == "FAIL"
@@ -91,12 +91,12 @@ def test_assessment_of_exchange_times():
     assert judge_exchanges(ExchangeTimes(1.0, 1.0, 1.0, 1.0), Settings(), "50").status == "FAIL"
 
 
-# Tests at connect.
+# Tests on connecting
 
 
 def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bus):
     for i in (0, 1):
-        bus.servo(i).fast_reads = False  # contrary to its firmware version
+        bus.servo(i).fast_reads = False  # contradicts the firmware version
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
     assert notice.fix == "the slower sync read is used"
@@ -112,7 +112,7 @@ def test_servos_without_group_reads_are_refused(bus):
         bus.servo(i).fast_reads = False
     answers = bus.servo(1).answers_reads
     bus.servo(1).answers_reads = lambda servo_id, fast: False
-    with pytest.raises(ServoError, match="answer single reads, but not a sync read of all"):
+    with pytest.raises(ServoError, match="reply to single reads, but not to a sync read of all"):
         connected(bus, reply_timeout=0.3)
     bus.servo(1).answers_reads = answers
     connected(bus).close()
@@ -123,7 +123,7 @@ def test_slow_replies_are_reported_at_start_up(bus):
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "ticks will be late" in each.text]
     assert "of a tick of 2 ms (loop.rate = 500)" in notice.text
-    assert "`softfinger doctor` times 50 exchanges" in notice.fix
+    assert "`softfinger doctor`, which times 50 exchanges" in notice.fix
     backend.close()
 
 
@@ -131,7 +131,7 @@ def test_slow_replies_are_reported_at_start_up(bus):
 
 
 def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
-    """An adapter may restart when its port is opened, so reopening it would never end."""
+    """An adapter may restart the board at every opening, so reopening would never succeed."""
     bus, opened = running(), []
     for i in (0, 1):
         bus.servo(i).silent = True
@@ -151,7 +151,7 @@ def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
     until(connects)
     assert len(opened) == 1
     backend.close()
-    connected(bus).close()  # the port is available again
+    connected(bus).close()  # the port has been released
 
 
 def test_doctor_waits_as_long_as_run(running):
@@ -185,7 +185,9 @@ def test_a_servo_that_answers_after_the_wait_is_told_from_a_broken_cable(running
     monkeypatch.setattr(devices, "examine", examine_then_boot)
     settings = backend_settings(bus.port, open_timeout=0.01)
     failed = [each for each in devices.check_servos(settings) if each.status != "pass"]
-    assert [each.fix for each in failed] == ["it replies now: set a longer servos.open_timeout"]
+    assert [each.fix for each in failed] == [
+        "set a longer servos.open_timeout, because the servo replies now"
+    ]
     assert failed[0].text.endswith("within servos.open_timeout = 0.01 s")
 
 
@@ -207,7 +209,7 @@ def test_two_fingers_on_one_port_are_detected_by_the_real_path(tmp_path):
 
     (problem,) = told("left", "right")
     assert problem.startswith("tactile.port (right): found ")
-    assert "expected another port than tactile.port (left)" in problem
+    assert "expected a port other than tactile.port (left)" in problem
     assert "/dev/serial/by-path" in problem
     assert told("right") == []
 
@@ -216,8 +218,16 @@ def test_two_fingers_on_one_port_are_detected_by_the_real_path(tmp_path):
     ("group", "mode", "advice"),
     [
         ("uucp", 0o660, "sudo usermod -aG uucp $USER, then log in again"),
-        ("root", 0o660, "sudo chmod a+rw {} until it is unplugged; permanently, add a udev rule"),
-        ("uucp", 0o600, "sudo chmod a+rw {} until it is unplugged; permanently, add a udev rule"),
+        (
+            "root",
+            0o660,
+            "sudo chmod a+rw {} as a temporary fix; for a permanent fix, add a udev rule",
+        ),
+        (
+            "uucp",
+            0o600,
+            "sudo chmod a+rw {} as a temporary fix; for a permanent fix, add a udev rule",
+        ),
     ],
 )
 def test_membership_in_the_group_of_the_port_is_recommended(
@@ -250,7 +260,7 @@ def test_run_reports_late_replies_at_start_up_and_while_disarmed(tmp_path, addre
                 if "of the readings in the last second failed" in line:
                     break
             assert any("ticks will be late: set servos.reply_timeout" in line for line in told)
-            assert "within servos.reply_timeout = 4 ms; `softfinger doctor`" in told[-1]
+            assert "within servos.reply_timeout = 4 ms; run `softfinger doctor`" in told[-1]
             assert "running, disarmed" in "".join(told)
             daemon.terminate()
             daemon.stderr.read()

@@ -1,4 +1,4 @@
-"""``softfinger export`` writes a recording's values to CSV and Parquet."""
+"""Test that ``softfinger export`` writes a recording's values to CSV and Parquet."""
 
 import csv
 import math
@@ -78,7 +78,7 @@ def test_times_of_all_files_count_from_one_zero(tmp_path, first):
     messages.insert(first != schema.TACTILE, (schema.TACTILE, frame(0.0, 1) | scan))
     for topic, message in messages:
         writer.add(topic, message)
-    late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}  # Unix time was set meanwhile
+    late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}  # Unix time was set in between
     writer.add(schema.STATE, sample(schema.STATE) | late)
     writer.close()
     recording = Recording(tmp_path / "a.mcap")
@@ -133,7 +133,10 @@ def test_command_line_output(path, tmp_path, inline):
     assert float(rows[0]["t"]) == pytest.approx(100.0, abs=1.01)
     done = inline("export", path, "--topics", "dreams")
     assert done.returncode == 1
-    assert "found topic 'dreams', the recording has hand/state, hand/tactile" in done.stderr
+    assert (
+        "found topic 'dreams', expected one of the recorded topics: hand/state, hand/tactile"
+        in done.stderr
+    )
 
 
 def test_invalid_exports_are_refused(tmp_path, inline):
@@ -141,4 +144,4 @@ def test_invalid_exports_are_refused(tmp_path, inline):
     RecordingWriter(empty).close()
     done = inline("export", empty)
     assert done.returncode == 1
-    assert "contains no messages" in done.stderr
+    assert "the recording does not contain any messages" in done.stderr

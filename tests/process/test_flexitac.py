@@ -1,4 +1,4 @@
-"""The FlexiTac backend on real ptys through pyserial."""
+"""Test the FlexiTac backend on real ptys through pyserial."""
 
 import threading
 import time
@@ -28,7 +28,7 @@ class Board(FrameWriter):
         self._thread = threading.Thread()
 
     def stream(self, images: Callable[[int], bytes]) -> None:
-        """Send the frames of images 0, 1, … until closed."""
+        """Send images 0, 1, … as frames until closed."""
 
         def run() -> None:
             k = 0
@@ -78,7 +78,7 @@ def test_frames_are_received_through_a_port_with_their_times(own_threads, board)
     first = tactile.latest()
     until(lambda: tactile.latest().seq >= first.seq + 20)
     now = tactile.latest()
-    # Use a frame that was read alone; with others behind it, it would have arrived earlier.
+    # Wait for a frame that was read alone; a frame read together with later ones arrived earlier.
     until(lambda: (n := tactile.latest()).t_arrival - n.t_sample == pytest.approx(LATE))
     assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1
@@ -101,11 +101,13 @@ def test_a_frame_is_delivered_before_the_next_one_arrives(board):
 
 def test_a_port_that_cannot_be_opened_is_reported(tmp_path, board):
     missing, file = tmp_path / "tactile-left", tmp_path / "file"
-    assert "tactile-left: no such port; is `softfinger emulate`" in why_not_open(sensor(missing))
+    assert "tactile-left: port not found; check that `softfinger emulate`" in why_not_open(
+        sensor(missing)
+    )
     file.write_text("")
     assert "can't be opened as a serial port" in why_not_open(sensor(file))
     with serial.Serial(board.path, 2_000_000, exclusive=True):
-        assert "busy: another program" in why_not_open(sensor(board.path))
+        assert "the port is in use by another program" in why_not_open(sensor(board.path))
     board.stream(lambda k: bytes(1024))
     assert "no marker AA 55" in why_not_open(sensor(board.path, timeout=5.0))
 
@@ -117,7 +119,7 @@ def test_a_silent_port_is_reported_with_its_name_and_time_out(own_threads, board
     ):
         tactile.open()
     assert not own_threads()
-    # The port can be opened once the board sends.
+    # The port can be opened once the board is sending.
     board.stream(lambda k: frame(bytes(1024)))
     tactile.settings = tactile.settings.model_copy(update={"open_timeout": 60.0})
     assert why_not_open(tactile) == ""

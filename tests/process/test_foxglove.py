@@ -1,4 +1,4 @@
-"""``softfinger view --foxglove``: messages for clients, and access control."""
+"""Test ``softfinger view --foxglove``: messages for clients, and access control."""
 
 import base64
 import json
@@ -37,7 +37,7 @@ TOPICS = {
     "hand/tactile/left": "foxglove.RawImage",
     "hand/tactile/right": "foxglove.RawImage",
 }
-WAIT = 60.0  # s to wait for one message
+WAIT = 60.0  # s, time-out for one message
 
 
 class Client:
@@ -60,7 +60,7 @@ class Client:
         self.socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": ended}))
 
     def next(self, topic: str = "") -> tuple[str, float, dict[str, Any]]:
-        """Return the next message, optionally of one topic: topic, log time [s] and content."""
+        """Return topic, log time [s] and content of the next message, optionally of one topic."""
         while True:
             message = self.socket.recv(timeout=WAIT)
             assert isinstance(message, bytes)
@@ -108,7 +108,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
             assert (log["level"], log["message"], log["name"]) == (3, early["text"], "start")
             assert log["timestamp"]["sec"] == int(early["timestamp"])
             client.unsubscribe("hand/state")
-            client.subscribe("hand/event")  # the reply comes after the subscription is active
+            client.subscribe("hand/event")  # the reply follows once the subscription is active
             client.next("hand/event")
             rest: set[str] = set()
             while not rest >= {"hand/scene", "hand/tactile/left", "hand/tactile/right"}:
@@ -165,14 +165,14 @@ def check_scene(client: Client) -> None:
     (outline,) = named["object"]["lines"]
     points = np.array([[each["x"], each["y"]] for each in outline["points"]])
     (expected,) = hand_parts(Settings(), read(schema.HandState, state(0.0, 0)))["object"].lines
-    assert points == pytest.approx(expected[2], abs=6e-3)  # the object turns by at most 5°
+    assert points == pytest.approx(expected[2], abs=6e-3)  # the object rotates by at most 5°
 
 
 @pytest.fixture(scope="module")
 def stranger() -> Iterator[tuple[FakeDaemon, str]]:
     """Yield a fake daemon and the address of its Foxglove server."""
     with FakeDaemon() as fake, served(fake) as (address, _):
-        # This avoids the server's warning at exit that no state arrived.
+        # This avoids a warning at exit that no state has arrived.
         with connected(address) as line:
             client = Client(line)
             client.subscribe("hand/state")
@@ -217,7 +217,7 @@ def connections(address: str) -> int:
 @pytest.mark.extended
 def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
     fake, address = stranger
-    fake.changes = {"fault": "x" * 30_000}  # large states that soon fill a buffer
+    fake.changes = {"fault": "x" * 30_000}  # large states soon fill a buffer
     with ExitStack() as stack:
         lazy = []
         for _ in range(CLIENT_COUNT_MAX):
@@ -237,7 +237,7 @@ def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
                 client.sendall(masked({"subscriptions": [{"id": 1, "channelId": channel}]}))
         until(lambda: connections(address) < CLIENT_COUNT_MAX)
         with connected(address) as line:
-            Client(line)  # accepted
+            Client(line)  # the server accepts this client
 
 
 def test_incomplete_and_invalid_requests_are_closed(stranger):
@@ -268,4 +268,4 @@ def masked(message: dict[str, Any]) -> bytes:
 
 def test_foxglove_requires_the_live_stream(capsys):
     assert cli.main(["view", "run.mcap", "--foxglove"]) == 2
-    assert "--foxglove serves only the stream" in capsys.readouterr().err
+    assert "only the live stream can be served" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The gateway process may hang, crash or be killed while the loop continues; local stops."""
+"""Test that a hung, crashed or killed gateway never stops the loop, and test local stops."""
 
 import asyncio
 import json
@@ -75,7 +75,7 @@ def test_a_crashed_gateway_is_restarted_while_the_loop_continues(ticking, addres
         first, ticks = gateway.process, loop.state.seq
         os.kill(first, number)
         until(lambda: gateway.process != first)
-        # Clients reconnect by themselves and receive missed events.
+        # Clients reconnect by themselves and receive the events that they missed.
         with hand.events(timeout=60.0) as told:
             assert any(f"ended (signal {number})" in event.text for event in told)
         stream.skip()
@@ -146,7 +146,7 @@ sys.exit(gateway.main(sys.argv[1:]))
     [
         ("STALLED", "while True: pass", -signal.SIGPROF),
         ("BLOCKED", "select.select([], [], [])", -signal.SIGALRM),
-        ("STALLED", "select.select([], [], [], 0.5)", 0),  # as if it were stopped or starved
+        ("STALLED", "select.select([], [], [], 0.5)", 0),  # resembles a stopped or starved process
     ],
 )
 def test_a_hanging_gateway_ends_itself_but_not_on_a_busy_machine(bound, does, status):
@@ -211,7 +211,7 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
     ):
         hand.arm()
         page.shows("ARMED")
-        os.kill(ticking.gateway.process, signal.SIGSTOP)  # no client is served
+        os.kill(ticking.gateway.process, signal.SIGSTOP)  # clients are not served
         try:
             assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
             assert ticking.loop.state.mode == "disarmed"
@@ -230,7 +230,7 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
             os.kill(ticking.gateway.process, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
-        hand.arm()  # commands after this reply are received
+        hand.arm()  # commands sent after this reply are received
         hand.stop()
 
 

@@ -1,7 +1,7 @@
-"""Hardware in the loop: daemon and emulated hand in separate processes, over serial bytes.
+"""Test a daemon and an emulated hand as separate processes, connected by serial lines.
 
-The emulated hand's control socket reports the traffic on the servo wire and the watchdog trips
-after the daemon dies, stalls or loses its port.
+The emulated hand's control socket reports the servo bus traffic, and every watchdog trip after the
+daemon dies, stalls or loses its port.
 """
 
 import json
@@ -134,7 +134,7 @@ def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
             with hand.stream(120.0) as states:
                 held = [next(states) for _ in range(60)]
             assert {(state.mode, state.fault) for state in held} == {("holding", "")}
-            # A late frame invalidates a contact for a moment.
+            # A late frame briefly invalidates a contact.
             sound = [state for state in held if state.left.valid and state.right.valid]
             forces = [(state.left.force, state.right.force) for state in sound]
             near = [each == pytest.approx((10.0, 10.0), rel=0.05) for each in forces]
@@ -163,7 +163,7 @@ def test_start_up_waits_for_servos_that_have_not_responded_yet(tmp_path, address
         send_words(rig.folder, "silent=2")
         refused = softfinger(*words, "servos.open_timeout=0.1")
         assert refused.returncode == 1
-        assert "servo 2 (right): no answer at 2000000 baud" in refused.stderr
+        assert "servo 2 (right): no reply at 2000000 baud" in refused.stderr
         assert refused.stderr.rstrip().endswith("waited servos.open_timeout = 0.1 s")
         waiting = started(*words, "servos.open_timeout=60", stdout=None)
         with ending(waiting):
@@ -179,7 +179,7 @@ def test_start_up_waits_for_servos_that_have_not_responded_yet(tmp_path, address
 
 
 def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
-    """Check that each servo at work stops when its watchdog times out."""
+    """Check that each active servo stops when its watchdog times out."""
     before = rig.at_work()
     lose()
     until(rig.stopped)
@@ -191,7 +191,7 @@ def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
 
 
 def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
-    # The daemon refuses to start if the boards have another size than the profile.
+    # The daemon refuses to start if the size of the boards differs from the profile.
     where = ("--config", str(rig.config), "--dir", str(rig.folder))
     done = softfinger("run", *where, "--set", "tactile.rows=16")
     assert done.returncode == 1
@@ -298,6 +298,6 @@ def test_swapped_ids_are_a_fault_during_the_approach(tmp_path, addresses):
         until(lambda: ask(addresses[1], "status")["fault"])
         status = ask(addresses[1], "status")
         assert status["fault_name"] == "joint.swapped"
-        assert status["fault"].endswith("are servos.ids swapped?")
+        assert status["fault"].endswith("check whether servos.ids are swapped")
         assert daemon.end() == 1
         emulator.end()

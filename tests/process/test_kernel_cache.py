@@ -1,7 +1,7 @@
-"""The folder of compiled kernels: no kernel from other sources or another user is run.
+"""Test that kernels compiled from other sources or by other users are never run.
 
-A small package with the real decorators and the same structure is changed and run in separate
-processes.
+The tests change a small package, which has the real decorators and the same structure, and run it
+in separate processes.
 """
 
 import os
@@ -167,12 +167,12 @@ def test_the_folder_is_private_and_the_least_recently_used_ones_are_removed(pack
     (base / new).chmod(0o777)
     found, told = package.run()
     assert found == ["3.0", "0"], "the kernel must be compiled, not loaded from the cache"
-    assert f"{base / new}: other users may write to it (0777): chmod go-w" in told
+    assert f"{base / new}: other users can write to it (0777): chmod go-w" in told
     (base / new).chmod(0o700)
-    package.cache.chmod(0o777)  # a parent folder
+    package.cache.chmod(0o777)  # this is a parent folder of the kernels
     found, told = package.run()
     assert found == ["3.0", "0"]
-    assert f"{package.cache}: other users may write to it (0777): chmod go-w" in told
+    assert f"{package.cache}: other users can write to it (0777): chmod go-w" in told
 
 
 def flipped(file: Path) -> None:
@@ -200,7 +200,7 @@ def test_a_damaged_kernel_is_recompiled_with_a_warning(package, tmp_path):
     with OwnFolder(tmp_path / "kept") as folder:
         for name, spoil in SPOILT.items():
             if name == "another's" and os.geteuid() != 0:
-                continue  # only root can change the owner of a file
+                continue  # only root can change a file's owner
             kernel_folder.keep(folder, "one", b"machine code")
             assert kernel_folder.kept(folder, "one") == b"machine code"
             spoil(folder.path / "one.kernel")

@@ -1,4 +1,4 @@
-"""Key files, and access control of the daemon's sockets with keys."""
+"""Test key files, and access control of the daemon's sockets with keys."""
 
 import errno
 import os
@@ -69,7 +69,9 @@ def test_damaged_missing_and_readable_key_files_are_reported(folder):
         load_server(folder / "nowhere")
     secret = folder / "server" / "server.key_secret"
     secret.chmod(0o640)
-    with pytest.raises(KeyFileError, match=r"other users may read it \(0640\): chmod 600"):
+    with pytest.raises(
+        KeyFileError, match=r"other users can read this file \(0640\); run chmod 600"
+    ):
         load_server(folder)
     secret.chmod(0o600)
     for line in (
@@ -96,11 +98,11 @@ def test_keys_that_others_own_or_may_write_are_refused(folder, which, monkeypatc
     path = folder / which if which else folder
     mode = stat.S_IMODE(path.stat().st_mode)
     path.chmod(mode | 0o022)
-    with pytest.raises(KeyFileError, match=f"{path}: other users may"):
+    with pytest.raises(KeyFileError, match=f"{path}: other users can"):
         load_server(folder)
     path.chmod(mode)
     load_server(folder)
-    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # any user other than the owner
+    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # pretend to be a user other than the owner
     if os.getuid() == 0:
         for each in [path, *path.parents]:
             if each.is_relative_to(folder):
@@ -122,10 +124,10 @@ def test_client_keys_are_still_revoked_without_free_file_descriptors(folder, con
             load_server(folder)
         keys.look(1.0)
         (clients / "alice.key").unlink()
-        with pytest.raises(RestartNeeded, match="removed clients: alice"):
+        with pytest.raises(RestartNeeded, match="disconnected clients without a key file: alice"):
             keys.look(2.0)
         clients.chmod(0o777)
-        with pytest.raises(RestartNeeded, match="other users may write to it"):
+        with pytest.raises(RestartNeeded, match="other users can write to it"):
             keys.look(3.0)
     finally:
         keys.stop()
@@ -177,7 +179,7 @@ def ask(
         if socket is subscriber:
             socket.subscribe(b"")
         socket.connect(address)
-    commander.send(msgpack.packb({"command": "arm", "client": "local"}))  # the name is ignored
+    commander.send(msgpack.packb({"command": "arm", "client": "local"}))  # the daemon ignores it
     return subscriber, commander
 
 
@@ -198,7 +200,7 @@ def test_the_key_identifies_a_client_and_clients_without_a_key_get_nothing(
     theirs = ask(others, addresses, stranger(folder, kind))
     ours = ask(others, addresses, load_client(folder / "alice"))
     seen = 0
-    while seen < 200:  # the client with a key receives 200 messages, the one without receives none
+    while seen < 200:  # only the client with a key receives messages
         guarded.step()
         if ours[0].poll(2):
             ours[0].recv_multipart()
@@ -217,7 +219,7 @@ def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addr
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.server.raise_fence()  # as every stop does
+        guarded.served.server.raise_fence()  # every stop raises a fence
         guarded.step()
         return stopper.poll(0)
 
@@ -248,7 +250,9 @@ def test_clients_are_removed_and_added_while_the_daemon_runs(profile, addresses,
             Hand(*addresses, keys=folder, timeout=60.0) as local,
             local.events(timeout=60.0) as told,
         ):
-            assert any("removed clients: alice" in event.text for event in told)
+            assert any(
+                "disconnected clients without a key file: alice" in event.text for event in told
+            )
         with pytest.raises(NoAnswer):
             send(addresses[1], {"command": "arm"}, 0.5, load_client(folder / "alice"))
     make_keys(folder, ["bob"])

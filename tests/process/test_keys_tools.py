@@ -1,4 +1,4 @@
-"""Every client tool supports keys and reports when they are missing."""
+"""Test that every client tool supports keys and reports missing keys."""
 
 import asyncio
 import json
@@ -32,7 +32,7 @@ class Guarded(NamedTuple):
 
     folder: Path
     addresses: Addresses
-    recording: Path  # made by the daemon itself
+    recording: Path  # recorded by the daemon itself
 
 
 @pytest.fixture(scope="module")
@@ -135,8 +135,8 @@ def test_a_replay_is_sent_only_to_holders_of_keys(addresses, tmp_path):
 @pytest.mark.parametrize(
     ("address", "reason"),
     [
-        ("tcp://0.0.0.0:9999", "other addresses need --keys"),
-        ("tcp://*:9999", "other addresses need --keys"),
+        ("tcp://0.0.0.0:9999", "other addresses require --keys"),
+        ("tcp://*:9999", "other addresses require --keys"),
         ("nonsense", "expected tcp://127.0.0.1:PORT"),
     ],
 )

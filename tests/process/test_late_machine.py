@@ -1,4 +1,4 @@
-"""The demo as a process that is suspended for a second while it works."""
+"""Test the demo with a one-second suspension of its process."""
 
 import select
 import signal
@@ -13,7 +13,7 @@ from tests.conftest import Addresses
 from tests.harness.daemon_process import Running
 
 STILL = 1.0  # s, ten times the watchdog time and the maximum frame age
-PATIENCE = 60.0  # s to wait for an event on a busy machine
+PATIENCE = 60.0  # s, time-out for an event on a busy machine
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_a_simulated_hand_survives_a_suspended_machine(start, profile, hand):
         assert state.behind_s >= before.behind_s + 0.9 * STILL
         passed = 1e-9 * (state.mono_ns - before.mono_ns)
         assert passed == pytest.approx((state.seq - before.seq) / 100.0)
-        assert told(events, "late", "the simulated hand waited")
+        assert told(events, "late", "the simulated hand paused for")
     assert running.end() == 0
 
 

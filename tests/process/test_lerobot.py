@@ -1,4 +1,4 @@
-"""The hand as a LeRobot robot and environment: found and used by the real package."""
+"""Test the hand as a LeRobot robot and environment, found and used by the real package."""
 
 import math
 import runpy
@@ -71,7 +71,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     robot = make()
     with pytest.raises(DeviceNotConnectedError):
         robot.get_observation()
-    with pytest.raises(ValueError, match="found 10 × 44, the hand's grids have 44 × 44"):
+    with pytest.raises(ValueError, match="found 10 × 44, expected the hand's 44 × 44"):
         make(rows=10).connect()
     robot.connect()
     first = robot.get_observation()
@@ -133,7 +133,7 @@ def test_the_environment_has_the_features_and_actions_of_the_robot(plugin):
     env = made(task="Rotate-v0")
     seen, _ = env.reset(seed=[1])
     goal = float(seen["environment_state"][0, 0])
-    for _ in range(100):  # the robot's actions: N and rad
+    for _ in range(100):  # the robot's actions are in N and rad
         seen, reward, *_, info = env.step(np.array([[6.0, goal]], np.float32))
     observed = preprocess_observation(seen)
     for name, feature in env_to_policy_features(kind()).items():
@@ -162,7 +162,7 @@ def test_the_environment_has_the_features_and_actions_of_the_robot(plugin):
 
 
 def record(kind, robot, first, action, moved, root):
-    """Write two observations with LeRobot's own recorder and read them."""
+    """Write two observations with LeRobot's own recorder and read them back."""
     try:
         from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
     except ImportError:  # LeRobot 0.4

@@ -1,4 +1,4 @@
-"""The monitor as a real process on a pseudo-terminal, with real sockets."""
+"""Test the monitor as a real process on a pseudo-terminal, with real sockets."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from tests.harness.descendants import ending
 from tests.harness.fake_daemon import FakeDaemon, finger
 from tests.harness.terminal_process import TerminalProcess
 
-NOBODY = "tcp://127.0.0.1:1"  # an address without a listener
+NOBODY = "tcp://127.0.0.1:1"  # nothing listens at this address
 
 
 def command(fake: FakeDaemon, *more: str) -> list[str]:
@@ -39,7 +39,7 @@ def test_page_shows_the_hand_and_the_state_of_its_stream(fake):
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
         fake.silent.set()
-        page.shows("○ lost", "the stream has stopped")  # after being stale for at most 1.5 s
+        page.shows("○ lost", "the stream has stopped")  # after at most 1.5 s in the stale state
         fake.changes = {}
         fake.silent.clear()
         page.shows("● live", "HOLDING")
@@ -121,7 +121,7 @@ def test_keys_command_the_hand(fake):
         page.shows("LEFT contact")
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 10.0°")
-        page.type(b"\x1b[C")  # counted from the target, although the object is still at 4.98°
+        page.type(b"\x1b[C")  # steps from the target, although the object is still at 4.98°
         page.shows("✓ rotate to 15.0°")
         page.type(b"\x1bOD")
         page.shows("✓ rotate to 10.0°")
@@ -157,7 +157,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         fake.changes = {"mode": "armed", "goal_force": math.nan, "goal_angle": math.nan}
         page.shows("ARMED", "+- N")
         page.type(b"+")
-        page.shows("settings are not known yet")
+        page.shows("settings have not arrived yet")
         assert "grip:" not in page.text()
         fake.send(b"hand/settings", msgpack.packb({"settings": json.dumps(SETTINGS)}))
         page.shows("+- 10 N")
@@ -166,12 +166,13 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         page.type(b"+")
         page.shows("+- 12.6 N")  # nine tenths of the force limit
         page.type(b"-" * 10)
-        page.shows("+- 4 N")  # smaller steps below 5 N
+        page.shows("+- 4 N")  # steps are smaller below 5 N
         assert fake.requests == []
         page.type(b"g")
         page.shows("✓ grasp with 4 N: ok")
         assert asked() == [4.0]
-        # During a grip, they change the last commanded force of any client, and the hand follows.
+        # During a grip, the keys change the last commanded force of any client, and the hand
+        # follows.
         fake.changes = {"goal_force": 9.0}
         page.shows("HOLDING", "+- 9 N")
         told = {"command": "grasp", "client": "", "request": '{"force": 7.0}', "ok": True}
@@ -185,7 +186,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
 def test_a_late_command_is_repeated_with_its_key(fake):
     late = {
         "ok": False,
-        "error": "arm: the command was 0.40 s old when it was handled",
+        "error": "arm: the command was 0.40 s old when it was processed",
         "reason": "late",
     }
     fake.replies["arm"] = [late, late, {"ok": True}]
@@ -218,9 +219,9 @@ def test_the_page_shows_another_commander_of_a_real_daemon(start, profile, addre
 def test_commands_without_a_daemon():
     where = ["--address", NOBODY]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
-        page.shows("waiting for a daemon", "no stream yet", "—")
+        page.shows("waiting for a daemon", "no stream has arrived yet", "—")
         page.type(b"a" * 12 + b" ")
-        page.shows("stop: no answer")
+        page.shows("stop: no reply")
         page.type(b"\x1b[C")
         page.shows("rotate: the object's angle is unknown")
         page.type(b"q")
@@ -349,7 +350,7 @@ def test_the_page_has_lower_priority_and_quitting_it_ends_both(fake, tmp_path):
         assert os.getpriority(os.PRIO_PROCESS, page.child) == min(
             os.getpriority(os.PRIO_PROCESS, page.process.pid) + 5, 19
         )
-        page.type(b"\x1a")  # ignored here: suspending the daemon would leave torque on
+        page.type(b"\x1a")  # Ctrl-Z is ignored here: suspending the daemon would leave torque on
         page.type(b"q")
         assert page.ended() == 0
         assert page.is_restored()

@@ -1,4 +1,4 @@
-"""With an untested Numba version, Numba's own compiler builds the same kernels."""
+"""Test that Numba's own compiler, used for untested Numba versions, builds the same kernels."""
 
 import os
 from pathlib import Path
@@ -11,8 +11,8 @@ from tests.harness.daemon_process import python
 from tests.harness.golden_recording import machine_class
 from tests.harness.paper_tip import MEASURED, TIP
 
-# One test per kind of kernel: SIMD lanes and selected callees in the tables, reorderable sums in
-# the estimator, inlined cells of a frame, and nested records in the grip.
+# Each kind of kernel has one test: SIMD lanes and selected callees in the tables, reorderable sums
+# in the estimator, inlined cells of a frame, and nested records in the grip.
 SCRIPT = """
 import sys
 import numba
@@ -35,7 +35,7 @@ sys.exit(failed)
 """
 
 
-# Processor on which both compilers give identical bits. On others, they may fuse different products
+# Both compilers give identical bits on this processor. On others, they may fuse different products
 # with their sums.
 SAME_BITS = "znver3"
 

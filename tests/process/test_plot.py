@@ -1,4 +1,4 @@
-"""``softfinger plot``: the pages of a recording and their contents, and incomplete recordings."""
+"""Test ``softfinger plot``: a recording's pages and their contents; incomplete recordings."""
 
 import math
 from collections.abc import Callable
@@ -64,7 +64,7 @@ Call = Callable[..., tuple[int, str]]
 
 @pytest.fixture
 def call(inline: Inline) -> Call:
-    """Run ``softfinger plot`` in this process; return exit status and standard error."""
+    """Run ``softfinger plot`` in the test process; return exit status and standard error."""
 
     def plotted(*words: object) -> tuple[int, str]:
         status, _, said = inline("plot", *words)
@@ -96,7 +96,7 @@ def test_model_page_has_points_near_the_model_curves(run):
     model = run.models[0].table(depths * 1e-3, np.radians(points[:, 0])).force
     firm = points[:, 1] > 1.0
     assert firm.sum() > 100
-    # The accuracy is limited by the modulus factor.
+    # The modulus factor limits the accuracy.
     assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.06
 
 
@@ -123,11 +123,11 @@ def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
     assert ElementTree.parse(files[0]).getroot().tag.endswith("svg")
     status, said = call(path, "--to", "0.2", "--out", tmp_path / "none")
     assert status == 1
-    assert "plot: contains no contact" in said
+    assert "plot: the recording does not contain a contact" in said
     RecordingWriter(tmp_path / "nothing.mcap").close()
     status, said = call(tmp_path / "nothing.mcap", "--out", tmp_path / "none")
     assert status == 1
-    assert "plot: contains no hand/state" in said
+    assert "plot: the recording does not contain hand/state" in said
 
 
 def test_without_settings_no_model_is_drawn(path, run):

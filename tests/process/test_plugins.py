@@ -1,4 +1,4 @@
-"""Backends of an installed package: discovered, checked, and run by a real daemon."""
+"""Test backends of an installed package: found, checked, and run by a real daemon."""
 
 import os
 import threading
@@ -30,7 +30,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put the example on the import path of this process."""
+    """Put the example on the test process's import path."""
     monkeypatch.syspath_prepend(installed)
 
 
@@ -38,13 +38,13 @@ def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_example_meets_the_backend_interface(caplog):
     settings = load(changes=METAL)
     check_tactile(settings)
-    assert not caplog.records  # a closed board without a frame is not an error
+    assert not caplog.records  # a closed board that has no frame is not an error
     check_servos(settings, torque=True)
     check_shape(load(changes=["simulation.object_shape=hexagon"]))
     found = {each.subject: each for each in doctor.results(settings, False)}
     assert found["servos"].text.startswith("following: a plugin;")
     assert "44 × 44 cells" in found["tactile left"].text
-    assert "/dev/ttyUSB0" not in found  # ports of plugin backends are not checked
+    assert "/dev/ttyUSB0" not in found  # the ports of plugin backends are not checked
 
 
 @pytest.mark.usefixtures("here")
@@ -67,7 +67,7 @@ def test_plugin_errors_are_part_of_the_report():
         "plugins.pulsing.height: found -1",
         "plugins.pulsing.hight: unknown key; nearest: height",
         "plugins.following: found settings, but following of softfinger-example 1.0 has no ",
-        "plugins.nobody: found settings, but this plugin is not installed",
+        "plugins.nobody: found settings, but no plugin of this name is installed",
     ):
         assert part in report
     with pytest.raises(SettingsError, match="'disc', 'wedge', 'none' or 'hexagon'"):

@@ -1,4 +1,4 @@
-"""The servo bus on a pseudo-terminal: timing, baud rates, links, connecting and disconnecting."""
+"""Test the servo bus on a pty: timing, baud rates, links, connecting and disconnecting."""
 
 import os
 import select
@@ -110,7 +110,7 @@ def test_a_client_may_reconnect_and_leave_the_terminal_in_cooked_mode(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     wire.client.close()
     for _ in range(3):
-        # Without pyserial: a client that sets nothing must find the terminal in raw mode.
+        # Without pyserial, a client that sets nothing must find the terminal in raw mode.
         end = os.open(wire.port.path, os.O_RDWR | os.O_NOCTTY)
         assert not termios.tcgetattr(end)[tty.LFLAG] & (termios.ECHO | termios.ICANON)
         os.write(end, PING)

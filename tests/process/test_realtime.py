@@ -1,4 +1,4 @@
-"""Measures for a steady tick: applied and reverted where permitted, otherwise reported."""
+"""Test measures for punctual ticks: applied and reverted where permitted, otherwise reported."""
 
 import ctypes
 import json
@@ -59,7 +59,7 @@ finally:
     over.set()
 """
 
-# The same for a user without permissions.
+# Do the same for a user without permissions.
 REFUSED = """
 import json, os, resource
 from softfinger.daemon.loop.realtime import RealTime
@@ -155,7 +155,7 @@ def test_a_short_time_slice_is_set_if_supported_and_reverted():
 
 
 def _slice(get_call: int) -> int:
-    """Return this thread's time slice as reported by the kernel [ns]."""
+    """Return the calling thread's time slice as reported by the kernel [ns]."""
     told = ctypes.create_string_buffer(48)
     assert ctypes.CDLL(None).syscall(get_call, 0, told, 48, 0) == 0
     return int(struct.unpack("=IIQiIQQQ", told.raw)[5])
@@ -176,7 +176,7 @@ def test_ticks_over_ptys_alternate_with_their_exchanges():
     reports: list[Report] = []
 
     def measured() -> bool:
-        """Return True if it succeeded; on a busy machine the hand may not hold in time."""
+        """Return True if the attempt succeeded; on a busy machine the hand may not hold in time."""
         part = partial(tick.in_the_loop, "paced", 2, 2_000_000, patient)
         reports.append(attempt("paced", part))
         return not reports[-1].failed

@@ -1,4 +1,4 @@
-"""The servo port disappears under a running daemon and is reopened only on command, torque off."""
+"""Test that a servo port that disappears is reopened only on command, with torque off."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -16,7 +16,7 @@ from tests.harness.emulated import emulated
 
 
 class Rig:
-    """A daemon and the emulated servos that it drives, both in this process."""
+    """A daemon and the emulated servos that it drives, both in the test process."""
 
     def __init__(self, folder: Path, **sections: Any) -> None:
         servos = {
@@ -24,7 +24,7 @@ class Rig:
             "port": str(folder / "servos"),
             "reply_timeout": 1.0,  # the emulator shares this process's interpreter lock
             "fault_after": 3.0,
-            "watchdog": 0.0,  # torque that was on stays on
+            "watchdog": 0.0,  # a servo keeps its torque on
         }
         own = {"servos": servos, "tactile": {"backend": "none"}, "loop": {"rate": 100.0}}
         self.settings = Settings.model_validate(own | sections)
@@ -81,7 +81,7 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     rig.unplug()
     rig.until(lambda: loop.state.mode == "fault")
     assert "the port is lost" in loop.state.fault
-    assert rig.torque() == [1, 1]  # they could not be reached
+    assert rig.torque() == [1, 1]  # the daemon could not reach the servos
     # From here on, `clear` reopens the port.
     rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
     rig.refuses("clear", "no such port")
@@ -120,7 +120,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         "rate": 50.0,
     }
     # Frames may be late because the emulator shares this process's interpreter lock. The hand then
-    # waits and does not close without tactile data.
+    # waits and does not close until tactile data arrive.
     rig = Rig(tmp_path, tactile=board, safety={"frame_age_hold": 3.0, "frame_age_fault": 40.0})
     try:
         loop, left = rig.loop, rig.loop.perception.fingers[0].sensor
@@ -146,7 +146,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         assert rig.events[-1][:2] != ("info", "tactile")
         assert any("no such port" in text for level, _, text in rig.events if level == "warning")
         rig.until(lambda: loop.state.t - loop.state.contacts[0].t_valid > 0.9)
-        rig.refuses("grasp", "the port is lost; `clear`, or `disarm` and `arm`, opens it again")
+        rig.refuses("grasp", "the port is lost; send `clear`, or `disarm` and `arm`, to reopen it")
         rig.does("disarm")
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)

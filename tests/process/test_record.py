@@ -1,4 +1,4 @@
-"""Recordings contain everything that was published, even if the recorder is interrupted."""
+"""Test that recordings contain all published messages, even if the recorder is interrupted."""
 
 import contextlib
 import json
@@ -43,7 +43,7 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 
 def interrupted(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    """End a recorder with Ctrl-C."""
+    """Stop a recorder with Ctrl-C."""
     process.send_signal(signal.SIGINT)
     return ended(process)
 
@@ -73,7 +73,7 @@ def test_read_messages_equal_the_published_ones(tmp_path):
     recording = Recording(tmp_path / "a.mcap")
     read = list(recording.messages())
     assert read == sent
-    # The types are also equal, so the messages can be published again, byte for byte.
+    # The types are equal too, so the messages can be published again, byte for byte.
     for (_, before), (_, after) in zip(sent, read, strict=True):
         assert {key: type(value) for key, value in before.items()} == {
             key: type(after[key]) for key in before
@@ -95,7 +95,7 @@ def test_states_of_a_recording_are_columns(tmp_path):
     writer = RecordingWriter(tmp_path / "b.mcap")
     writer.add(schema.TACTILE, {**frame(0.0, 0), "timestamp": 1e9})
     writer.close()
-    with pytest.raises(RecordingError, match=r"b\.mcap: contains no hand/state"):
+    with pytest.raises(RecordingError, match=r"b\.mcap: the recording does not contain hand/state"):
         read_recording(str(tmp_path / "b.mcap"))
 
 
@@ -117,7 +117,7 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path, topic):
     described = json.loads(schema.data)["properties"]
     assert set(json.loads(raw.data)) == set(described)
     assert raw.log_time == int(golden["timestamp"] * 1e9)
-    if topic == EVENT:  # as required by Foxglove
+    if topic == EVENT:  # Foxglove requires this layout
         line = json.loads(raw.data)
         assert schema.name == "foxglove.Log"
         assert (golden["level"], line["level"]) == ("warning", 3)
@@ -151,7 +151,7 @@ def test_non_finite_numbers_are_read_as_nan(tmp_path):
     assert writer.messages == 1
     [(_, read)] = Recording(tmp_path / "a.mcap").messages()
     assert math.isnan(read["left"]["force"])
-    assert math.isnan(read["tick_s"])  # JSON has no infinity either
+    assert math.isnan(read["tick_s"])  # JSON cannot represent infinity either
 
 
 @pytest.mark.extended
@@ -283,7 +283,7 @@ def test_messages_sent_before_the_end_are_written(addresses, tmp_path):
     for k in range(4000):
         publisher.send(schema.STATE, zmq.SNDMORE)
         publisher.send(pack({**message, "seq": k}))
-    context.destroy(linger=-1)  # returns after everything is sent
+    context.destroy(linger=-1)  # returns once everything is sent
     process.send_signal(signal.SIGTERM)
     status, out, _ = ended(process)
     assert status == 0
@@ -325,7 +325,7 @@ def test_invalid_messages_on_the_stream_are_counted_and_omitted(fake, tmp_path):
     until(lambda: fake.published > before + 1)
     status, out, _ = interrupted(process)
     assert status == 0
-    assert "could not be read and were left out" in out
+    assert "could not be read and were skipped" in out
 
 
 def test_topics_are_selected_by_name(fake, tmp_path):
@@ -336,7 +336,7 @@ def test_topics_are_selected_by_name(fake, tmp_path):
     assert set(Recording(path).counts) == {"hand/tactile/left", "hand/tactile/right"}
     status, _, error = ended(record(tmp_path / "b.mcap", "--topics", "dreams"))
     assert status == 2
-    assert "found topic 'dreams', expected all or one of state, tactile" in error
+    assert "found topic 'dreams', expected 'all' or one of state, tactile" in error
 
 
 def test_repeated_messages_do_not_extend_the_time_range(tmp_path):
@@ -367,7 +367,7 @@ def test_a_damaged_chunk_is_reported_and_skipped_and_the_file_can_be_recovered(
     sent = written(path, 2000)
     assert Recording(path).check()
     bent = bytearray(path.read_bytes())
-    # zstd's magic number starts a chunk.
+    # A chunk starts with zstd's magic number.
     place = bent.index(b"\x28\xb5\x2f\xfd", len(bent) // 2) + 100
     bent[place : place + 4] = bytes(each ^ 0x55 for each in bent[place : place + 4])
     path.write_bytes(bent)
@@ -422,7 +422,7 @@ def disk_full(recorder: psutil.Process, path: Path) -> None:
             "ended by SIGKILL; `softfinger record --recover",
             marks=pytest.mark.extended,
         ),
-        (disk_full, "File too large; earlier messages can be read"),
+        (disk_full, "File too large; the messages written so far can be read"),
     ],
     ids=["killed", "disk full"],
 )

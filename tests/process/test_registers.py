@@ -1,4 +1,4 @@
-"""Registers changed by another program: reported, written by `arm`, repaired and restored."""
+"""Test registers changed by another program: reported, written by `arm`, repaired, restored."""
 
 import json
 from typing import Any
@@ -24,7 +24,7 @@ FIX = "`softfinger doctor --fix`"
 # Values that another program may leave: register, value, status and text of the finding.
 EEPROM = [
     (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, expected at most 50 µs"),
-    (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: it also obeys the commands for the servo"),
+    (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: the servo also executes commands for the servo"),
     (
         reg.HOMING_OFFSET,
         100,
@@ -40,7 +40,12 @@ EEPROM = [
         "min voltage limit is 110 × 0.1 V, expected 0 to 95 × 0.1 V",
     ),
     (reg.PWM_LIMIT, 300, "FAIL", "PWM limit is 300, expected 885: the motor does not get"),
-    (reg.CURRENT_LIMIT, 100, "FAIL", "current limit is 0.269 A, below safety.current_max 1.2 A"),
+    (
+        reg.CURRENT_LIMIT,
+        100,
+        "FAIL",
+        "current limit is 0.269 A, expected at least safety.current_max = 1.2 A",
+    ),
     (
         reg.VELOCITY_LIMIT,
         5,
@@ -51,7 +56,7 @@ EEPROM = [
         reg.STARTUP_CONFIGURATION,
         1,
         "FAIL",
-        "startup configuration is 1, expected 0: at power-up it sw",
+        "startup configuration is 1, expected 0: at power-up the servo sw",
     ),
     (
         reg.SHUTDOWN,
@@ -116,7 +121,7 @@ def test_arm_overwrites_changed_ram_registers(bus, connect, reboots):
         backend.torque_on()
         bus.call(lambda: bus.servo(0).reboot(bus.now()))
         until(lambda: bus.call(lambda: bus.servo(0).awake(bus.now())))
-        for address, value in RAM:  # another program immediately writes to it
+        for address, value in RAM:  # another program immediately writes to the servo
             put(bus, address, value)
     backend.torque_on()
     model = MODELS["XM430-W350"]
@@ -144,7 +149,7 @@ def test_factory_settings_of_every_model_pass_the_checks():
 
 
 def test_stall_torques_fit_current_speed_and_gears():
-    """A torque constant is inversely proportional to the speed of servos with one motor."""
+    """For servos with the same motor, the torque constant is inversely proportional to speed."""
     for name, model in MODELS.items():
         torque, current, voltage = model.stall
         assert 0.5 < torque * model.no_load_speed / (voltage * current) < 1.2, name
@@ -198,9 +203,12 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
     bus.call(lambda: setattr(bus.servo(0)._joint, "_turns", -2))
     (found,) = [each for each in told(bus) if each.status == "FAIL"]
     assert "its servo has counted 2 turns too many" in found.text
-    assert found.fix == "reboot it: switch its supply off and on, or run `softfinger doctor --fix`"
+    assert (
+        found.fix
+        == "reboot the servo: switch its supply off and on, or run `softfinger doctor --fix`"
+    )
     (fixed,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
-    assert "rebooted because its position was off by a turn" in fixed.text
+    assert "rebooted because its position was wrong by at least one turn" in fixed.text
     assert [each.status for each in told(bus)] == ["pass"]
 
 
@@ -212,7 +220,7 @@ def test_an_error_that_a_wrong_limit_causes_is_corrected_with_the_limit(bus):
     fixed = [each.text for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert fixed == [
         "min voltage limit 140 → 95",
-        "rebooted because it had a hardware error: input voltage out of limits",
+        "rebooted because it had a hardware error: input voltage outside its limits",
     ]
     assert [each.status for each in told(bus)] == ["pass"]
 
@@ -221,20 +229,23 @@ def test_an_error_that_a_reboot_does_not_clear_is_reported(bus):
     bus.fault("undervoltage=1")
     until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
     (left,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
-    assert left.text == "hardware error after a reboot: input voltage out of limits"
-    assert left.fix == "remove the cause"
+    assert (
+        left.text
+        == "it still reports a hardware error after a reboot: input voltage outside its limits"
+    )
+    assert left.fix == "remove the cause, and run the command again"
 
 
 def test_no_reboot_is_advised_for_a_reversed_drive_mode(bus):
     put(bus, reg.DRIVE_MODE, 1)
     fixes = [each.fix for each in told(bus) if each.status == "FAIL"]
-    assert fixes == ["`softfinger calibrate joints`, since its drive mode is reversed"]
+    assert fixes == ["run `softfinger calibrate joints`, because the drive mode is reversed"]
     assert provision(backend_settings(bus.port)) == []
 
 
 def test_a_servo_with_protocol_1_is_recognised(bus):
     put(bus, reg.PROTOCOL_TYPE, 1)
-    text = "answers Protocol 1.0, expected 2.0"
+    text = "replies in Protocol 1.0, expected Protocol 2.0"
     (found,) = told(bus, open_timeout=0.1)
     assert (found.status, found.text) == ("FAIL", text)
     backend = DynamixelServos(backend_settings(bus.port, reply_timeout=0.3), RealClock())
@@ -246,5 +257,5 @@ def test_a_servo_with_protocol_1_is_recognised(bus):
 def test_an_unknown_model_lists_the_known_ones(bus):
     put(bus, reg.MODEL_NUMBER, 9999)
     (found,) = [each for each in told(bus) if each.status == "FAIL"]
-    assert found.text == "has the unknown model number 9999, expected 1020 of an XM430-W350"
+    assert found.text == "has unknown model number 9999, expected 1020 (XM430-W350)"
     assert all(name in found.fix for name in ("XH540-W270", "MX-64", "XC330-M181"))

@@ -1,4 +1,4 @@
-"""Replayed recordings: published unchanged, and recomputed to equal states by current code."""
+"""Test replayed recordings: published unchanged, and recomputed to equal states."""
 
 import json
 import re
@@ -72,7 +72,7 @@ def test_other_settings_report_the_first_difference(taken, tmp_path):
     assert "left.goal_current" in result.differences
     assert "left.q" not in result.differences  # inputs are unchanged
     different = result.differences["left.goal_current"]
-    assert different.first_tick > 50  # no difference before arming
+    assert different.first_tick > 50  # the first difference appears after arming
     assert different.worst > 1e-3
     assert different.recorded != different.recomputed
 
@@ -93,7 +93,7 @@ def test_missing_data_in_a_recording_is_reported(taken, tmp_path):
         path = tmp_path / f"{topic.decode().replace('/', '-')}.mcap"
         return record(path, [each for each in taken if each[0] != topic])
 
-    with pytest.raises(RecordingError, match="contains no hand/settings"):
+    with pytest.raises(RecordingError, match="does not contain hand/settings"):
         recompute(without(schema.SETTINGS))
     with pytest.raises(RecordingError, match="contains no hand/input"):
         recompute(without(schema.INPUT))
@@ -108,10 +108,10 @@ def test_missing_data_in_a_recording_is_reported(taken, tmp_path):
     for topic, message in thinned:
         if topic == schema.TACTILE:
             message["seq_step"] = 4
-    with pytest.raises(RecordingError, match="contains one of 4 frames"):
+    with pytest.raises(RecordingError, match="contains one in 4 frames"):
         recompute(record(tmp_path / "thinned.mcap", thinned))
     other = load(changes=["tactile.rows=32", "tactile.cols=32"])
-    with pytest.raises(RecordingError, match="44 × 44 cells, the settings' sensors 32 × 32"):
+    with pytest.raises(RecordingError, match="44 × 44 cells, expected the settings' 32 × 32"):
         recompute(record(tmp_path / "other.mcap", taken), other)
 
 
@@ -123,8 +123,8 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_p
     assert "lost: none" in done.stderr
     told = inline("replay", path, "--recompute")
     assert (told.returncode, told.stderr) == (0, "")
-    assert "identical to the last bit" in told.stdout
-    assert "begins after the first tick" not in told.stdout
+    assert "all states are bit-identical" in told.stdout
+    assert "starts after the first tick" not in told.stdout
     ticks = re.search(r"(\d+) ticks, ", told.stdout)
     assert ticks is not None
     assert int(ticks[1]) > 100

@@ -1,4 +1,4 @@
-"""The daemon as a systemd service: watchdog messages on a real socket, unit, rules, logs."""
+"""Test the daemon as a systemd service: watchdog messages, service unit, udev rules, logs."""
 
 import configparser
 import grp
@@ -68,7 +68,7 @@ def test_ready_is_sent_first_and_then_four_watchdog_messages_per_interval(manage
 
 def test_a_missing_or_slow_manager_does_not_block_the_daemon(manager):
     service = Service(str(manager.path), watchdog=0.004)
-    for tick in range(5000):  # far more than the socket buffers
+    for tick in range(5000):  # far more than the socket can buffer
         service.alive(tick * 0.002)
     manager.close()
     service.alive(1e6)
@@ -128,7 +128,7 @@ def test_the_daemon_reports_ready_alive_and_stopping_but_not_while_suspended(
     assert all({"timestamp", "level", "kind", "text"} <= set(record) for record in records)
     texts = [record["text"] for record in records]
     assert "running, disarmed" in texts
-    assert "ended, torque off" in texts
+    assert "ended; torque is off" in texts
     times = [record["timestamp"] for record in records]
     assert times == sorted(times)
     running = next(record for record in records if record["text"] == "running, disarmed")
@@ -168,7 +168,7 @@ def test_the_unit_has_the_settings_of_a_control_daemon(tmp_path, inline):
     assert words[0] == sys.executable
     assert words[4:6] == ["run", "--no-task"], "the service must restart disarmed"
     assert words[6:] == ["--log", "json", "--config", str(config)]
-    # The started program exists: the same words print its help.
+    # The program that the unit starts exists: its command line also prints the help.
     shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=300, check=False)
     assert shown.returncode == 0
     analyze = shutil.which("systemd-analyze")

@@ -1,4 +1,4 @@
-"""Checks at connect with suggested fixes and without changes; temperature, supply, errors."""
+"""Test the checks on connecting and their suggested fixes; temperature, supply and errors."""
 
 import math
 import os
@@ -29,7 +29,7 @@ from tests.process.conftest import Connect
 
 
 def refusal(path: str, **servos: Any) -> list[str]:
-    """Return the lines of the error raised at connect."""
+    """Return the lines of the error raised on connecting."""
     backend = DynamixelServos(backend_settings(path, **servos), RealClock())
     with pytest.raises(ServoError) as caught:
         backend.connect()
@@ -57,7 +57,7 @@ def test_connecting_changes_nothing_and_leaves_torque_off(bus):
 
 LEFT, RIGHT = "servo 1 (left): ", "servo 2 (right): "
 FIX = ": `softfinger doctor --fix`"
-REBOOT = ": remove the cause, then reboot it with `softfinger doctor --fix`"
+REBOOT = ": remove the cause, then reboot the servo with `softfinger doctor --fix`"
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,8 @@ REBOOT = ": remove the cause, then reboot it with `softfinger doctor --fix`"
             {reg.CURRENT_LIMIT: 100},
             [
                 f"{LEFT}supply is 8.5 V, expected 9.5 to 16.0 V: check the supply",
-                f"{RIGHT}current limit is 0.269 A, below safety.current_max 1.2 A{FIX}",
+                f"{RIGHT}current limit is 0.269 A, expected at least "
+                f"safety.current_max = 1.2 A{FIX}",
             ],
         ),
         (
@@ -89,7 +90,7 @@ REBOOT = ": remove the cause, then reboot it with `softfinger doctor --fix`"
             [],
             {reg.DRIVE_MODE: 0b1000},
             [
-                f"{RIGHT}drive mode 8 switches torque on with any goal, or makes it follow "
+                f"{RIGHT}drive mode 8 switches torque on with any goal, or makes the servo follow "
                 f"another servo{FIX}"
             ],
         ),
@@ -127,28 +128,28 @@ def test_missing_servos_are_reported(bus, silent):
     for servo in silent:
         bus.fault(f"silent={servo}")
     (line,) = refusal(bus.port, reply_timeout=0.5)
-    missing = "servo 2 (right): no answer at 2000000 baud: check its cable"
-    nothing = f"{bus.port}: no servo answers at 2000000 baud (IDs 1, 2): check power"
+    missing = "servo 2 (right): no reply at 2000000 baud: check its cable"
+    nothing = f"{bus.port}: no servo replies at 2000000 baud (IDs 1, 2): check the power"
     assert line.startswith(missing if silent == (2,) else nothing)
 
 
 def test_the_wrong_baud_rate_is_reported(running):
     bus = running(baud=1_000_000)
     (line,) = refusal(bus.port, baud=3_000_000, reply_timeout=0.05)
-    assert "no servo answers at 3000000 baud" in line
+    assert "no servo replies at 3000000 baud" in line
     connected(bus, baud=1_000_000).close()
 
 
 def test_unusable_ports_are_reported(bus):
-    assert "no such port: plug the adapter in" in refusal("/dev/does-not-exist")[0]
-    assert "no such port: start `softfinger emulate`" in refusal("/tmp/does-not-exist/servos")[0]
+    assert "port not found: connect the adapter" in refusal("/dev/does-not-exist")[0]
+    assert "port not found: start `softfinger emulate`" in refusal("/tmp/does-not-exist/servos")[0]
     first = connected(bus)
     assert "in use by another process" in refusal(bus.port)[0]
     reading = Reading()
     first.read(reading)
     assert reading.valid
     first.close()
-    connected(bus).close()  # available again
+    connected(bus).close()  # the port is available again
 
 
 def test_minor_findings_are_notices(bus):
@@ -159,7 +160,7 @@ def test_minor_findings_are_notices(bus):
     notices = [str(each) for each in backend.notices]
     for finger in (LEFT, RIGHT):
         assert (
-            f"{finger}servos.watchdog = 0: it keeps moving if the daemon or the line fails"
+            f"{finger}servos.watchdog = 0: the servo keeps moving if the daemon or the bus fails"
             in notices
         )
         assert [n for n in notices if n.startswith(f"{finger}servos.fault_after = 60 s: without")]
@@ -169,18 +170,18 @@ def test_minor_findings_are_notices(bus):
     goal = bus.memory(0)[span]
     backend.write(Goal(q=[0.5, 0.5], current=[1.0, 1.0]))
     backend.close()
-    assert bus.memory(0)[span] == goal  # torque that was on is not changed
+    assert bus.memory(0)[span] == goal  # a servo with torque on is not changed
     assert servo.torque_on
 
 
 def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     bus = running(servos={"model": "XL330-M288"})
     backend = connected(bus, model="XL330-M288")
-    constant = "control.torque_constant is 1.78 N·m/A, its data sheet gives 0.354"
-    gears = "its gears lose 0.25 of their torque to friction, so a grip may never settle"
+    constant = "control.torque_constant is 1.78 N·m/A, but the servo's data sheet states 0.354"
+    gears = "gear friction consumes 0.25 of the transmitted torque, so a grip may never settle"
     assert [each.text for each in backend.notices] == 2 * [constant, gears]
     backend.close()
-    for name in ("hil", "small"):  # profiles whose forces match their servos
+    for name in ("hil", "small"):  # these profiles have forces that match their servos
         settings = load(find(Path(name)), Path("/tmp"))
         assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 
@@ -192,13 +193,13 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     place.write_text("16\n")
     monkeypatch.setattr(checks, "latency_file", lambda path: latency_file(path, tmp_path))
     # The low-latency mode is not available, as on this pseudo-terminal.
-    text = "16 ms, so every read takes that long"
+    text = "16 ms, expected 1 ms: every read takes at least this long"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     assert refusal(bus.port, reply_timeout=0.004)[0] == f"{bus.port} latency timer: {text}: {fix}"
     backend = connected(bus)  # the time-out is longer than the latency timer
     assert (backend.notices[0].text, backend.notices[0].fix) == (text, fix)
     backend.close()
-    # The mode is available, so a driver sets the timer to 1 ms by itself.
+    # The port has a low-latency mode, so a driver sets the timer to 1 ms by itself.
     asked = []
 
     def low(_: serial.Serial, on: bool) -> None:
@@ -244,7 +245,7 @@ def test_temperature_and_supply_are_read_with_the_joints(bus, servos):
 
 
 def test_both_kinds_of_read_give_the_same_readings(bus, servos, monkeypatch):
-    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)  # only one wide read
+    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)  # only the first read is wide
     wide = read(servos, Reading())
     narrow = read(servos, Reading())
     assert wide.temperature[0] > 0.0
@@ -266,7 +267,7 @@ def test_an_alert_names_the_hardware_error_and_arming_is_refused(bus, servos):
 
 
 class Loaded:
-    """A stationary hand with 2 A through its left joint."""
+    """A stationary hand whose left joint carries 2 A."""
 
     q = dq = np.zeros(2)
     current = np.array([2.0, 0.0])
@@ -297,8 +298,8 @@ def test_simulated_servos_heat_up_with_their_current_and_shut_down():
     while not read(servos, reading).alert:
         clock.sleep_until(clock.now() + 0.05)
         assert clock.now() < 400.0
-    # 55 K times 73 J/K, heated by 22.5 W at first and 32 W with hot copper, minus losses to the
-    # air.
+    # The heat is 55 K times 73 J/K. The power is 22.5 W at first and 32 W with hot copper, minus
+    # the losses to the air.
     assert 55.0 * 73.0 / 32.0 < clock.now() < 1.2 * 55.0 * 73.0 / 22.5
     assert (reading.alert, reading.hardware) == (0b01, [1 << 2, 0])
     assert reading.temperature == [80.0, 25.0]

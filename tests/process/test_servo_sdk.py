@@ -1,4 +1,4 @@
-"""The manufacturer's SDK, with its own and with our packet handler, on emulated servos on a pty."""
+"""Test the manufacturer's SDK on emulated servos, with its packet handler and with ours."""
 
 from collections.abc import Iterator
 
@@ -47,7 +47,7 @@ def test_other_sdk_calls_work_with_our_handler(line):
     assert handler.write4ByteTxRx(port, 1, reg.PROFILE_VELOCITY, 77) == (OK, 0)
     assert handler.read4ByteTxRx(port, 1, reg.PROFILE_VELOCITY) == (77, OK, 0)
     assert handler.write1ByteTxOnly(port, 2, reg.LED, 1) == OK
-    # The unread reply to this write must not be used for the next request.
+    # This write's unread reply must not be mistaken for the reply to the next request.
     assert handler.read1ByteTxRx(port, 2, reg.LED) == (1, OK, 0)
     bulk = sdk.GroupBulkRead(port, handler)
     bulk.addParam(1, reg.PRESENT_POSITION, 4)
@@ -64,7 +64,7 @@ def test_the_unmodified_sdk_works(bus):
     handler = sdk.PacketHandler(2.0)
     assert port.openPort()
     assert port.setBaudRate(1_000_000)  # closes and reopens the pty
-    # A busy machine may exceed the SDK's 35 ms.
+    # A busy machine may exceed the SDK's time-out of 35 ms.
     port.setPacketTimeout = lambda _: port.setPacketTimeoutMillis(60_000)
     assert handler.ping(port, 2) == (1020, OK, 0)
     read = sdk.GroupSyncRead(port, handler, reg.PRESENT_POSITION, 4)
@@ -94,7 +94,7 @@ def test_error_bytes_of_a_group_read_are_kept(bus, line):
         group = kind(*line, reg.PRESENT_POSITION, 4, [1, 2])
         assert group.exchange() == OK
         assert group.errors == {1: 0x80, 2: 0}
-        assert kind(*line, 660, 4, [1, 2]).exchange() != OK  # beyond the control table
+        assert kind(*line, 660, 4, [1, 2]).exchange() != OK  # addresses beyond the control table
 
 
 def test_noise_before_a_reply_is_skipped_and_counted():

@@ -1,4 +1,4 @@
-"""Short run of the real-time soak: its checks of the wire, memory and lost messages."""
+"""Test a short real-time soak: its checks of the bus, memory and lost messages."""
 
 import copy
 import math

@@ -1,4 +1,4 @@
-"""A hand with solid tips, recorded on the virtual clock and processed by the tools."""
+"""Test a hand with solid tips: recorded on the virtual clock, processed by the tools."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.extended
 def test_the_recording_recomputes_bitwise(recorded, capsys):
     assert main(["replay", "--recompute", str(recorded)]) == 0
-    assert "identical to the last bit" in capsys.readouterr().out
+    assert "all states are bit-identical" in capsys.readouterr().out
     states = [each for _, each in Recording(recorded).messages([schema.STATE])]
     assert {"holding", "rotating"} <= {each["mode"] for each in states}
     assert max(abs(each["left"]["shear_x"]) for each in states) > 0.2

@@ -1,6 +1,6 @@
-"""Behaviour of subcommands before their work starts.
+"""Test the behaviour of subcommands before their work starts.
 
-Missing packages, Ctrl-C during an import, shell completion.
+The tests cover missing packages, Ctrl-C during an import, and shell completion.
 """
 
 import signal
@@ -17,7 +17,7 @@ from tests.process.test_record import written
     [
         ("matplotlib", "plot run.mcap", "pip install 'softfinger[plot]'"),
         ("mcap", "record new.mcap", "pip install 'softfinger[record]'"),
-        ("numba", "replay --recompute run.mcap", "contains no hand/settings"),
+        ("numba", "replay --recompute run.mcap", "does not contain hand/settings"),
         *(
             pytest.param(*each, marks=pytest.mark.extended)
             for each in (
@@ -27,7 +27,7 @@ from tests.process.test_record import written
                     "export run.mcap --format parquet",
                     "pip install 'softfinger[parquet]'",
                 ),
-                ("numba", "analyse run.mcap", "contains no hand/settings"),
+                ("numba", "analyse run.mcap", "does not contain hand/settings"),
                 ("numba", "plot none.mcap", "none.mcap: No such file"),
             )
         ),

@@ -1,4 +1,4 @@
-"""The emulated tactile board: the bytes on its pty, their timing, and its faults."""
+"""Test the emulated tactile board: the bytes on its pty, their timing, and its faults."""
 
 import os
 import select
@@ -21,7 +21,7 @@ SIZE = ROWS * COLS + 2
 
 
 class Source:
-    """Source of frames made by the test."""
+    """Frame source controlled by the test."""
 
     def __init__(self) -> None:
         self.frame: Frame | None = None
@@ -36,7 +36,7 @@ class Source:
 
 
 class Client:
-    """Client of a board; reading an empty tty first receives bytes in transit."""
+    """Client of a board."""
 
     def __init__(self, path: str) -> None:
         self.fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -85,13 +85,13 @@ def test_the_next_event_is_the_next_frame_delivery():
     source = Source()
     made = board(source, rate=100.0, delay=0.004)
     assert made.next_event() == -np.inf
-    # A due time that rounding puts just before the frame must not be repeated at once.
+    # If rounding puts the due time just before the frame, the event must not be repeated at once.
     times = (0.0, 0.004, np.nextafter(0.014, 0.0), 0.0561)
     for seq, (t, due) in enumerate(zip(times, (0.004, 0.014, 0.024, 0.064), strict=True)):
         source.make(seq)
         made.service(t)
         assert made.next_event() == pytest.approx(due)
-    made.service(0.0562)  # a late frame is checked again soon
+    made.service(0.0562)  # a late frame is soon checked again
     assert made.next_event() == pytest.approx(0.0567)
     made.service(0.0638)
     assert made.next_event() == pytest.approx(0.064)

@@ -1,4 +1,4 @@
-"""Requirements for every tactile backend."""
+"""Test the requirements for every tactile backend."""
 
 import threading
 
@@ -38,7 +38,7 @@ def test_a_frame_object_is_kept_until_a_newer_one_and_never_modified(rig):
     assert later.t_arrival > first.t_arrival
     assert later.t_sample > first.t_sample
     assert np.array_equal(first.data, kept)
-    if rig.backend in ("simulated", "replay"):  # time does not advance by itself here
+    if rig.backend in ("simulated", "replay"):  # only the test advances the time
         assert rig.sensor.latest() is later
 
 
@@ -119,7 +119,7 @@ def test_incomplete_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
 def test_a_silent_board_keeps_the_last_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="silent@0.2") as rig:
         rig.sensor.open()
-        rig.wait(lambda frame: rig.images.number > 60)  # 40 of which were sent
+        rig.wait(lambda frame: rig.images.number > 60)  # of which 40 were sent
 
         def silent() -> bool:  # earlier frames may still be in transit
             last, number = rig.sensor.latest(), rig.images.number
@@ -146,7 +146,7 @@ def test_a_frozen_board_has_new_numbers_and_times_but_the_same_image(backend, tm
         until(still)
 
 
-# The glove-style board behaves the same, after 40 unanswered requests of 0.1 s each.
+# The glove-style board behaves in the same way, after 40 unanswered requests of 0.1 s each.
 @pytest.mark.parametrize("backend", ["flexitac", "cobs"])
 def test_a_board_that_changes_its_grid_gives_an_invalid_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="wrong-size@0.2") as rig:

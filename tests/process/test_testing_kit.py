@@ -1,4 +1,4 @@
-"""The test kit, used by test files of their own in a separate pytest process."""
+"""Test the test kit with separate test files in another pytest process."""
 
 import os
 from pathlib import Path
@@ -249,10 +249,12 @@ def test_user_tests_pass(tmp_path, text, count):
 
 
 def test_unusable_hands_and_faults_are_refused(capfd):
-    with pytest.raises(NoEmulator, match=r"--model=AX-12: ended, see its message above"):
+    with pytest.raises(
+        NoEmulator, match=r"--model=AX-12: the program ended; see its message above"
+    ):
         EmulatedHand(model="AX-12")
     assert "XM430-W350" in capfd.readouterr().err
-    with pytest.raises(SettingsError, match="hil: found backends of hardware, expected a simulat"):
+    with pytest.raises(SettingsError, match="hil: found hardware backends, expected simulat"):
         VirtualHand("hil")
     for count in (0, 9):
         with pytest.raises(ValueError, match=f"ids: found {count} servos, expected 1 to 8"):

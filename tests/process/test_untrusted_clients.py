@@ -1,7 +1,7 @@
-"""Clients without the current ZeroMQ protocol can neither send commands nor receive messages.
+"""Test that clients with an old ZeroMQ protocol can neither send commands nor receive messages.
 
-A web page can make a browser POST arbitrary bytes to any port of this machine. These bytes can form
-frames of ZMTP/1.0, whose missing handshake does not distinguish a browser from a client.
+A web page can make a browser POST arbitrary bytes to any port of this machine. The bytes can form
+ZMTP/1.0 frames. ZMTP/1.0 has no handshake that would distinguish a browser from a client.
 """
 
 import contextlib

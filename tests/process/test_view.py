@@ -1,4 +1,4 @@
-"""``softfinger view``: pictures of the stream, access control, and errors."""
+"""Test ``softfinger view``: pictures of the stream, access control, and errors."""
 
 import argparse
 import base64
@@ -54,7 +54,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Kept:
-    """Pictures published in this process."""
+    """Pictures that the test process computes and stores."""
 
     def __init__(self, *, live: bool = False) -> None:
         self.newest: dict[str, Any] = {}
@@ -139,9 +139,9 @@ def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
         with connect(address, proxy=None, open_timeout=WAIT) as line:
             line.send(orjson.dumps({"command": "arm", "seen": time.monotonic()}).decode())
             # The viewer waits.
-            assert any("no answer to arm" in line for line in viewed.process.stderr)
+            assert any("no reply to arm" in line for line in viewed.process.stderr)
             viewed.process.send_signal(signal.SIGINT)
-            assert viewed.process.wait(WAIT) == 1  # nothing was displayed
+            assert viewed.process.wait(WAIT) == 1  # the viewer has displayed nothing
 
 
 def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
@@ -159,7 +159,7 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
                     page.send(wish)
-                return fake.published > begun + 500  # pictures of 5 s are queued for the page
+                return fake.published > begun + 500  # the page's queue holds 5 s of pictures
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)
@@ -193,7 +193,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     assert seqs == sorted(seqs)
     assert seqs[0] < picture["seq"]
     numbers = [row[0] for each in (*pictures, picture) for row in each["rows"]]
-    assert numbers == [*range(numbers[0], picture["row"][0])]  # each row once
+    assert numbers == [*range(numbers[0], picture["row"][0])]  # each row appears once
     expected = {
         "left.force": 7.5,
         "left.force_std": 0.05,
@@ -216,28 +216,28 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     assert picture["events"][-1][2:] == ["warning", "slip", "the object slips"]
     assert picture["notes"][0] == "the object slips"
     assert "left temperature at 94% of safety.temperature_max" in picture["notes"]
-    # The right finger is far from its limits.
+    # The right finger's values are far from their limits.
     assert not [note for note in picture["notes"] if "right" in note]
     facts = dict(zip(picture["facts"][::2], picture["facts"][1::2], strict=True))
     assert facts["Servos"] == "66 / 41 °C, 12.1 / 12.1 V"
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
-        assert levels.max() > 20  # of 31 levels: 45 kPa of 50
+        assert levels.max() > 20  # of 31 levels; the peak is 45 kPa of 50 kPa
         assert levels[20:24, 20:24].min() > 10
-        assert levels[:8].max() < 6  # only noise
+        assert levels[:8].max() < 6  # this area contains only noise
         assert len(picture["panels"][name]["lines"]) == 2  # rim and footprint
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
-    assert "the stream has schema 2, this page knows 1" in picture["notes"]
+    assert "the stream has schema 2, this page supports 1" in picture["notes"]
     assert "0 messages could not be read" in said
 
 
 def test_images_of_tips_without_contact_are_blank() -> None:
     kept = Kept()
     noise = np.random.default_rng(1).normal(0.0, Settings().tactile.noise / 4.0, (44, 44))
-    counts = np.clip(noise, 0.0, None).astype("<u2")  # units of 4 Pa
+    counts = np.clip(noise, 0.0, None).astype("<u2")  # one count is 4 Pa
     kept.pictures.take(schema.TACTILE, {**frame(0.0, 0), "data": counts.tobytes()})
     kept.pictures.take(schema.STATE, state(0.0, 1))
     kept.pictures.draw()
@@ -340,7 +340,9 @@ def test_only_the_token_gives_access_to_commands(served):
         assert status == 200
         assert "STOP" not in body
         assert "Watching" in body
-        assert ask(viewed.host, query, stop) == "✗ needs the token that the terminal prints"
+        assert (
+            ask(viewed.host, query, stop) == "✗ commands require the token printed in the terminal"
+        )
     with pytest.raises(InvalidStatus, match="403"):
         ask(viewed.host, token, stop, origin="http://evil.example")
     assert not fake.requests
@@ -360,7 +362,7 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
         token = viewed.commanding.removeprefix(viewed.address)
 
         def press() -> str:
-            """Send a command that refers to a current picture."""
+            """Send a command with the time of a current picture."""
             return ask(viewed.host, token, {**grasp, "seen": page.next()["now"]})
 
         assert press() == "✓ grasp: ok"
@@ -376,7 +378,7 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
         for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):
             assert ask(viewed.host, token, odd).startswith("✗ invalid command")
         fake.close()
-        assert "✗ grasp: no answer" in press()
+        assert "✗ grasp: no reply" in press()
         assert len(fake.requests) == 2
 
 
@@ -397,8 +399,8 @@ def test_other_machines_need_a_one_time_code() -> None:
         assert ask(viewed.host, query, {"command": "stop"}) == "✓ stop: ok"
         with pytest.raises(InvalidStatus, match="403"):
             ask(viewed.host, query, {"command": "stop"}, origin="http://evil.example")
-        assert got(viewed.host, code)[0] == 403  # already used by one browser
-        line = viewed.process.stdout.readline()  # the code for the next browser
+        assert got(viewed.host, code)[0] == 403  # another browser has already used this code
+        line = viewed.process.stdout.readline()  # this is the code for the next browser
         assert location(viewed.host, line.split()[1].removeprefix(f"http://{viewed.host}")) == place
         listening = psutil.Process(viewed.process.pid).net_connections()
         assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.2"]
@@ -436,15 +438,15 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
                     assert force == (pytest.approx(was, abs=1e-4) if math.isfinite(was) else None)
             assert playback.position == 1.5
             playback.ask("play")
-            until(lambda: not playback.playing)  # stops at the end
+            until(lambda: not playback.playing)  # the playback stops at the end
             assert playback.position == pytest.approx(recording.duration)
             drawn = kept.newest
-            until(lambda: kept.newest is not drawn)  # stays at the end
+            until(lambda: kept.newest is not drawn)  # the playback stays at the end
             for odd in ("speed 0", "speed fast", "speed 1e9", "speed nan", "nan", "later"):
                 playback.ask(odd)
             playback.ask("speed 0.5")
             playback.ask("play")
-            until(lambda: 0.0 < playback.position < 1.0)  # plays from the beginning again
+            until(lambda: 0.0 < playback.position < 1.0)  # it starts again at the beginning
             until(lambda: kept.newest["place"]["speed"] == 0.5)
             marks = [(kind, text) for _, _, kind, text in kept.scene["marks"]]
             assert ("mode", "disarmed → armed") in marks
@@ -481,7 +483,7 @@ def test_invalid_messages_are_tolerated() -> None:
 
 def test_states_are_queued_while_a_picture_is_drawn(context, addresses):
     publisher = context.socket(zmq.XPUB)
-    publisher.setsockopt(zmq.SNDHWM, 2000)  # same as the daemon's
+    publisher.setsockopt(zmq.SNDHWM, 2000)  # the daemon uses the same value
     publisher.bind(addresses[0])
     kept, drawn = Kept(live=True), threading.Event()
     kept.pictures.draw, draw = drawn.wait, kept.pictures.draw
@@ -516,12 +518,12 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
             waiting = f"waiting for a stream from {fake.state_address}"
             assert any(waiting in line for line in viewed.process.stderr)
             fake.silent.clear()
-            assert any("the stream has begun" in line for line in viewed.process.stderr)
+            assert any("the stream has started" in line for line in viewed.process.stderr)
             until(lambda: (page.next()["age"] or 1.0) < 0.1)
             fake.silent.set()
             until(lambda: page.next()["age"] > 1.0)
             viewed.process.send_signal(signal.SIGINT)
-            assert "states seen" in viewed.process.stderr.read()
+            assert "states received" in viewed.process.stderr.read()
             assert viewed.process.wait(300) == 0
 
 
@@ -546,7 +548,7 @@ def test_invalid_input_is_reported_in_one_line(tmp_path, inline, monkeypatch, wo
 
 
 def test_pages_without_a_chosen_port_get_different_ports() -> None:
-    with ExitStack() as stack:  # the first port is then in use
+    with ExitStack() as stack:  # the first page occupies its port
         here = "127.0.0.1"
         ports = [stack.enter_context(listen(here, None)).getsockname()[1] for _ in range(3)]
         assert len(set(ports)) == 3

@@ -1,4 +1,4 @@
-"""The page of ``softfinger view`` in a real browser: its contents and controls."""
+"""Test the ``softfinger view`` page in a real browser: its contents and controls."""
 
 import math
 import os
@@ -119,7 +119,7 @@ class Page:
         self.browser.ask("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], **named)
 
     def place(self, selector: str, across: float) -> tuple[float, float]:
-        """Return a point on an element, at this fraction of its width."""
+        """Return a point on an element, at the given fraction of its width."""
         left, width, top, height = self(
             "(({left, width, top, height}) => [left, width, top, height])"
             f"(document.querySelector('{selector}').getBoundingClientRect())"
@@ -130,7 +130,7 @@ class Page:
         return float(self(f"{FRACTION}('{selector}', {list(colour)})"))
 
     def lag(self) -> float:
-        """Return the page's delay behind the stream [s]."""
+        """Return the page's lag behind the stream [s]."""
         return float(self("Date.now() / 1000 - picture.time"))
 
 
@@ -203,7 +203,7 @@ def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
         until(lambda: page.text(".reply") == "✓ stop: ok")  # the grasp button was not pressed
         page.click("[name=tare]")
         until(lambda: page.text(".reply") == "✓ tare: ok")
-        hand.collect(1.0)  # frames for the mean of the tare
+        hand.collect(1.0)  # collects the frames that the tare averages
         press("[name=arm]", "armed")
         press("[name=grasp]", "holding")
         page.click("[name=disarm]")
@@ -221,7 +221,7 @@ def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
         press("[name=stop]", "disarmed")
         press("[name=arm]", "armed")
         page.browser.open("about:blank")
-        hand.collect(LEASE + 0.5)  # by the daemon's clock, without messages from the page
+        hand.collect(LEASE + 0.5)  # the daemon's clock advances without messages from the page
         assert command(commands, "release", client="another")["ok"]
         viewed.end()
 
@@ -288,7 +288,7 @@ def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
         page.mouse("mouseMoved", page.place(plot, 0.9), button="left", buttons=1)
         page.mouse("mouseReleased", page.place(plot, 0.9), button="left", clickCount=1)
         until(lambda: page("view.end") is not None)
-        assert 5.0 < page("view.span") < 8.0  # 0.3 of 20 s, including margins
+        assert 5.0 < page("view.span") < 8.0  # 0.3 of the 20 s, including margins
         assert page.text("#hold") == "Resume"
         assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")  # labels are times of day
         page.click("#follow")
@@ -309,7 +309,7 @@ def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
         assert page("scene.modes.includes('holding')")
         until(lambda: page.text(".legend") == "holding")
         for name in ("left", "right"):
-            scale = page.text(f".{name} .scale")  # follows the peaks of noisy frames
+            scale = page.text(f".{name} .scale")  # the scale follows the peaks of noisy frames
             assert re.fullmatch(r"≤ 3[3-7]0 kPa", scale), scale
         viewed.end()
 
@@ -343,7 +343,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         assert "is being sent" in page.text("#force output")
         fake.deaf.clear()
         until(lambda: forces(fake)[-1] == 16.5)
-        assert len(forces(fake)) <= 3  # intermediate values are skipped
+        assert len(forces(fake)) <= 3  # the page skips intermediate values
         until(lambda: page.text("#force output") == "✓ 16.5 N accepted")
         fake.changes = {"goal_force": 16.5}
         until(lambda: page("settings.force.wanted") is None)
@@ -381,7 +381,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
 def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page, fake):
     fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
     with viewing(fake) as viewed:
-        page.open(viewed.address)  # fills the browser's cache for the second visit
+        page.open(viewed.address)  # this fills the browser's cache for the second visit
         assert "Watching" in page.text("aside")
         page.click("#help")
         explained = page("document.querySelector('#explained').innerText")
@@ -393,7 +393,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         page.open(viewed.commanding)
         page.click("[name=clear]")
         until(lambda: page.text(".reply") == "✓ clear: ok")
-        # Stop was not sent on opening.
+        # Opening the page did not send a stop.
         assert [each["command"] for each in fake.requests] == ["clear"]
         until(lambda: page.lag() < 0.5)
 
@@ -403,8 +403,8 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         os.killpg(page.browser.process.pid, signal.SIGCONT)
         until(lambda: page.lag() < 0.5)
         rows = page("past.rows.map(row => row[0])")
-        assert rows == [*range(rows[0], rows[0] + len(rows))]  # including the states during sleep
-        page.click("[name=stop]")  # sent although the page's connection was closed meanwhile
+        assert rows == [*range(rows[0], rows[0] + len(rows))]  # includes the states during sleep
+        page.click("[name=stop]")  # sent although the connection was closed in between
         until(lambda: fake.requests[-1]["command"] == "stop")
 
         page("location.reload()")
@@ -420,7 +420,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         ]
         assert not foreign
 
-        page.browser.open("data:text/html,another page")  # a page with a different origin
+        page.browser.open("data:text/html,another page")  # this is a page with a different origin
         until(lambda: page("location.protocol") == "data:")
         socket = f"new WebSocket('ws://{viewed.host}/pictures')"
         page(f"({socket}).onopen = event => window.came = event.type")
@@ -442,7 +442,7 @@ def test_the_record_button_writes_a_recording(page, fake, tmp_path):
         until(lambda: page.text("[name=record]") == "Record")
         assert Recording(path).count(b"hand/state") > 0
         assert not Recording(path).truncated
-        page.click("[name=record]")  # recording stops when the page's server ends
+        page.click("[name=record]")  # the recording stops when the page's server exits
         until(lambda: len(list(tmp_path.glob("softfinger-*.mcap"))) == 2)
         viewed.end()
         assert not any(Recording(each).truncated for each in tmp_path.glob("*.mcap"))
@@ -464,7 +464,7 @@ def test_colours_labels_and_keys_are_accessible(page, fake):
             assert page(PALE) == []
         page.click("#theme")
         until(lambda: page("document.documentElement?.dataset.theme") == "light")
-        page.open(viewed.commanding)  # selected for this browser
+        page.open(viewed.commanding)  # this browser keeps its selection
         assert page("document.documentElement?.dataset.theme") == "light"
 
         tree = page.browser.ask("Accessibility.getFullAXTree")["nodes"]

@@ -1,4 +1,4 @@
-"""The wheel contains one complete package, independent of the environment and current folder."""
+"""Test that the wheel is one complete package, independent of environment and current folder."""
 
 import contextlib
 import os
@@ -54,7 +54,7 @@ def build(what: str, source: Path, into: Path) -> subprocess.CompletedProcess[st
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the unpacked sdist of a clone."""
+    """Return the unpacked sdist built from a clone."""
     folder = tmp_path_factory.mktemp("sdist")
     built = build("sdist", copied(folder / "source"), folder)
     assert built.returncode == 0, built.stderr
@@ -157,12 +157,12 @@ def test_folders_with_the_names_of_subpackages_do_not_interfere(wheel, tmp_path)
 
 
 def test_pinned_versions_support_the_oldest_supported_python():
-    """Check the installed packages of constraints.txt, with patch versions such as 3.11.2."""
+    """Check that no installed package in constraints.txt requires a newer Python patch release."""
     oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
     assert oldest.startswith(">=")
     looked_at = 0
     for line in (ROOT / "constraints.txt").read_text().splitlines():
-        with contextlib.suppress(PackageNotFoundError):  # package of an extra that no test needs
+        with contextlib.suppress(PackageNotFoundError):  # an extra that tests do not need
             wanted = metadata(line.split("==")[0]).get("Requires-Python") or ""
             assert SpecifierSet(wanted).contains(oldest.removeprefix(">=")), f"{line}: {wanted}"
             looked_at += 1

@@ -1,10 +1,11 @@
 """Predict servo temperatures with unknown constants: ``python -m tests.soak.heat --runs 40``.
 
-Each run draws a servo model; factors of heating, cooling and heat capacity (0.75 to 1.33); the room
-temperature (15 to 35 °C); a current of 1.15 to 1.8 times the one that could be held forever; and a
-time at which the room becomes warmer or colder by 5 or 8 °C. The daemon's filter receives
-temperatures in whole degrees and a current with 3 % noise. The plant is `servo_model.servo_joint`.
-``--grips N`` adds complete hands on virtual time that grip too hard for too long.
+Each run draws random values: a servo model; factors for heating, cooling and heat capacity (0.75 to
+1.33); the room temperature (15 to 35 °C); a current (1.15 to 1.8 times the maximum continuous
+current); and the time at which the room becomes 5 or 8 °C warmer or colder. The daemon's filter
+receives temperatures in whole degrees and a current with 3 % noise. The plant is
+`servo_model.servo_joint`. ``--grips N`` adds complete hands in virtual time that grip too hard for
+too long.
 """
 
 import argparse
@@ -30,7 +31,7 @@ class Foreseen(NamedTuple):
     """Result of the prediction for one hold."""
 
     warned: float  # s from the warning until the reading reached the limit
-    told: float  # s predicted when 60 s remained
+    told: float  # s, prediction when 60 s remained
     lasted: float  # s, total duration
 
 
@@ -62,7 +63,7 @@ class Bench:
         return low
 
     def step(self, current: float) -> float:
-        """Advance by _DT at this current [A]; return the predicted time until the limit [s]."""
+        """Advance by _DT at a current [A]; return the predicted time until the limit [s]."""
         self.t += _DT
         noisy = current * (1.0 + 0.03 * self.chance.gauss(0.0, 1.0))
         self.plant.step(current, _DT)
@@ -75,7 +76,7 @@ class Bench:
 
 
 def foreseen(seed: int) -> Foreseen:
-    """Hold an excessive current until the reading reaches the limit."""
+    """Hold an excessive current until the temperature reading reaches the limit."""
     bench = Bench(seed)
     chance = bench.chance
     current = bench.lasting_current() * chance.uniform(1.15, 1.8)
@@ -91,7 +92,7 @@ def foreseen(seed: int) -> Foreseen:
 
 
 def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
-    """Hold half the lasting current; at half-time the room becomes 8 °C warmer.
+    """Hold half the continuous current; halfway through, the room becomes 8 °C warmer.
 
     Returns the minimum predicted time until the limit [s].
     """
@@ -107,13 +108,13 @@ def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
 class Held(NamedTuple):
     """Result of a grip with more force than the servos can sustain."""
 
-    dropped: bool  # the object was dropped, by the fault of a hot servo or otherwise
-    force: float  # N requested at the end
+    dropped: bool  # the object was dropped, because of an overheated servo or for another reason
+    force: float  # N, requested force at the end
     events: list[str]
 
 
 def held(seed: int, seconds: float = 400.0) -> Held:
-    """Grip with 20 to 26 N on a complete hand whose servos have a fifth of the heat capacity."""
+    """Grip with 20 to 26 N, on a complete hand whose servos have a fifth of the heat capacity."""
     chance = random.Random(seed)
     factors = (
         chance.uniform(0.9, 1.33),
@@ -129,7 +130,7 @@ def held(seed: int, seconds: float = 400.0) -> Held:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Print the fraction of runs that met each aim; return 1 if an aim was missed."""
+    """Print the fraction of runs that met each target; return 1 if a target was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument("--runs", type=int, default=40)

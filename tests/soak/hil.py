@@ -1,4 +1,4 @@
-"""Real-time hardware-in-the-loop soak: ``python -m tests.soak.hil``, one hour.
+"""Run a real-time hardware-in-the-loop soak of one hour: ``python -m tests.soak.hil``.
 
 The daemon's process runs on an emulated hand, with a recorder, three subscribers and a client that
 grasps, turns, moves, releases and streams setpoints at 50 Hz. Meanwhile, faults disturb servos,
@@ -36,18 +36,18 @@ from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0
 SUBSCRIBERS = 3
-_LOOK = 5.0  # s between checks of bus and memory
-# Length of the compared windows at both ends, in s; at most a third of the run.
+_LOOK = 5.0  # s between checks of the bus and memory
+# Length in s of the compared windows at both ends; at most a third of the run.
 _WINDOW = 600.0
-_FLAT = 2.0  # MB, maximum growth of a process
-_FAULT_EVERY = 40.0  # s on average
+_FLAT = 2.0  # MB, maximum memory growth of a process
+_FAULT_EVERY = 40.0  # s, average
 _FAULT_FOR = 0.3
 _SETPOINT = 0.02  # s between setpoints
 _STREAM = 3.0  # s, duration of a setpoint stream
-_SPLIT = 300  # s per file of the recorder, which keeps an index until the file is closed
-# Faults that leave the object tilted after a stop; it is then put upright.
+_SPLIT = 300  # s per recorder file; the recorder keeps an index until the file is closed
+# These faults leave the object tilted after a stop; the soak then puts it upright.
 _ASKEW = ("hand.angle", "tip.tilt")
-_DROPPED = 20.0  # s without a grip after which an object that slipped away is put back
+_DROPPED = 20.0  # s without a grip, after which an object that slipped away is put back
 _HELD = 0.3  # minimum fraction of grasps that must reach a hold
 _MANY = 50  # number of grasps above which this is required
 _BEGUN = 1500  # maximum difference between the numbers of states received by any two listeners
@@ -68,11 +68,11 @@ class Account:
     placed: int = 0  # number of times the object was put upright
     # (received, lost) per subscriber
     received: list[tuple[int, int]] = field(default_factory=list)
-    recorded: tuple[int, int] = 0, 0  # states in the recorder's files, lost states
+    recorded: tuple[int, int] = 0, 0  # states in the recorder's files, and lost states
     wrong: list[str] = field(default_factory=list)
     # MB of private memory per process, at each check.
     memory: dict[str, list[float]] = field(default_factory=dict)
-    # s by which the tick of each state was late.
+    # Delay of each state's tick, in s.
     late: array[float] = field(default_factory=lambda: array("f"))
     # (time [s], number of `late` values so far)
     looked: list[tuple[float, int]] = field(default_factory=list)
@@ -234,7 +234,7 @@ def _listen(rig: Rig, account: Account, seconds: float) -> None:
 
 @contextmanager
 def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
-    """Run recorder and subscribers; yield each process's name and ID."""
+    """Run the recorder and the subscribers; yield each process's name and ID."""
     assert rig.daemon is not None
     assert rig.hand is not None
     file = rig.folder / "soak.mcap"
@@ -255,7 +255,7 @@ def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
         ]
         for each in subscribers:
             assert each.stdout is not None
-            each.stdout.readline()  # it has received a state
+            each.stdout.readline()  # the subscriber has received a state
         while not file.exists() or not file.stat().st_size:
             rig.states()
         try:
@@ -307,12 +307,12 @@ def _conclude(account: Account) -> None:
 
 
 def subscribe(address: str) -> None:
-    """Print "ready" at the first state, and finally the numbers of received and lost states."""
+    """Print "ready" at the first state, and at the end the numbers of received and lost states."""
     received = 0
     with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()
         while not ending.is_met:
-            with suppress(NoStream):  # the daemon may be gone
+            with suppress(NoStream):  # the daemon may have exited
                 next(states)
                 received += 1
                 if received == 1:

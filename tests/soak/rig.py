@@ -27,12 +27,13 @@ from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError
 from softfinger.tools.processes.emulate import emulator_process
 
-_PATIENCE = 300.0  # s to wait for a process to become ready, including kernel compilation
+_PATIENCE = 300.0  # s, time-out for the start of a process, including kernel compilation
 _STATE_RATE = 250.0  # Hz
-# Only for start-up, because a busy machine may delay the emulated hand's first bytes.
+# These settings affect only start-up, because a busy machine may delay the emulated hand's first
+# bytes.
 _PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
 _POLL = 0.003  # s between polls of the stream
-_SLACK = 0.05  # s by which a process may be late
+_SLACK = 0.05  # s, tolerated delay of a process
 _RESOLUTION = 0.0016  # rad, one encoder count
 _CURRENT_UNIT = 0.0027  # A
 _ROOM = 1 << 18  # bytes that the daemon may still allocate when its memory is limited
@@ -67,7 +68,7 @@ class Rig:
         self._states: zmq.Socket[bytes] | None = None
 
     def start(self, *words: str) -> None:
-        """Start stopped processes, the daemon with ``words``; may raise RigError."""
+        """Start processes that are not running, the daemon with ``words``; may raise RigError."""
         if self.hand is None or self.hand.poll() is not None:
             self.hand = self._running.enter_context(
                 emulator_process("--dir", self.ports, "--config", self.config, *self.hand_words)
@@ -137,7 +138,7 @@ class Rig:
             raise RigError(str(error)) from None
 
     def report(self, more: str = "") -> dict[str, Any]:
-        """Return the record of the servo bus; ``forget`` in ``more`` starts a new record."""
+        """Return the servo bus record; ``forget`` in ``more`` starts a new record."""
         report: dict[str, Any] = json.loads(self.send(f"report {more}"))
         return report
 
@@ -162,13 +163,13 @@ class Rig:
         return found
 
 
-# Starts a fault and returns a function that ends it.
+# Function that starts a fault and returns a function that ends it.
 End = Callable[[], object]
 Inject = Callable[[Rig, random.Random], End]
 
 
 def _sent(begin: str, end: str = "well", *, places: tuple[Any, ...] = ("",)) -> Inject:
-    """Return a fault that sends words to the emulated hand, with one of ``places`` for ``{}``."""
+    """Return a fault that sends words to the emulated hand; ``{}`` becomes one of ``places``."""
 
     def inject(rig: Rig, chance: random.Random) -> End:
         place = chance.choice(places)

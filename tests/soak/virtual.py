@@ -1,13 +1,13 @@
-"""Virtual-time soak: random sequences of commands, loads and faults, each from a seed.
+"""Run a virtual-time soak: random sequences of commands, loads and faults, one per seed.
 
-``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most of them grip; the grips are
-then loaded, turned, disturbed by faulty measurements and stopped. The daemon is complete except for
-its sockets. Requirements are checked against the plant and the data sent to the servos, never
-against the daemon's own reports. The number of checks of each requirement is counted, and a soak
-that never checks one of them fails. The tests run a few sequences.
+``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most sequences grip the object;
+the grips are then loaded, turned, disturbed by faulty measurements and stopped. The daemon is
+complete except for its sockets. Requirements are checked against the plant and the data sent to the
+servos, never against the daemon's own reports. The soak counts how often each requirement is
+checked, and fails if a requirement is never checked. The tests run a few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time, with its stream recorded and
-read. Violations are counted without ending the run, which fails if memory grows or a state is
+read. Violations are counted and do not end the run. The run fails if memory grows or a state is
 inconsistent.
 """
 
@@ -50,12 +50,12 @@ _GRIPPING = ("grasping", "holding", "rotating")
 _COMMAND_EVERY = 150  # average ticks between commands
 _DISTURBED_EVERY = 800  # average ticks between loads or faults
 _DISTURBED_FOR = 500
-_WILD = 0.1  # fraction of commands drawn regardless of the mode
+_WILD = 0.1  # fraction of commands that are drawn regardless of the mode
 _LOOKS = 96  # memory checks in a long sequence
 _WARM = 2  # memory checks excluded as warm-up: ten minutes of eight hours
 _FLAT = 2.0  # MB, maximum memory growth after the warm-up
 _STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # Hz, in a long sequence
-_SPLIT = 16e6  # bytes per file of its recording
+_SPLIT = 16e6  # bytes per file of the long sequence's recording
 # With "deaf", written data are lost but readings arrive. With "jumped", the angle is off by 0.2
 # rad. With "numb", angle, velocity and current stay constant.
 SERVO_FAULTS = (
@@ -65,9 +65,9 @@ SERVO_FAULTS = (
 _ENCODER = ("fast", "strayed", "jumped", "numb")  # the joint angle also contradicts the frames
 _UNHEARD = ("silent", "gone", "deaf")  # the servo does not receive torque off
 _WATCHDOG = 100  # ticks (0.2 s) until the servo watchdogs stop the motors
-_LOST = 20  # consecutive lost goals that are detected
+_LOST = 20  # consecutive lost goals that suffice for detection
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
-# Faults of a sensor or current measurement: range of values, channel that may be named.
+# Faults of a sensor or of a current measurement: range of values, and channel that may be named.
 LIES = {
     "gain": ((0.5, 1.6), "sensor"),
     "shift-x": ((-4.0, 4.0), "sensor"),
@@ -78,14 +78,14 @@ LIES = {
     "current": ((0.4, 2.5), "current"),
 }
 LOADS = ("push", "twist")
-_TOO_LONG = 0.05  # s, maximum time for which a tip's force may exceed its bound
-_TOO_MUCH = 1.3  # maximum ratio to the requested force if there is no reason for more
-_UNSURE = 1.2  # ratio to the maximum raised force, because tips that carry a load differ
-_REMEMBERED = 5.0  # s after a load or a measurement fault during which a grip may still be raised
-_RETARGETED = 0.5  # s for which the force of the previous request may persist
-_UNCOVERED = 1.0  # s after which a tip near the object's edge is no longer considered
+_TOO_LONG = 0.05  # s, maximum time for which a tip force may exceed its bound
+_TOO_MUCH = 1.3  # maximum ratio to the requested force without a reason for more
+_UNSURE = 1.2  # ratio to the maximum raised force, because tip forces differ under load
+_REMEMBERED = 5.0  # s, maximum time for which a grip stays raised after a load or measurement fault
+_RETARGETED = 0.5  # s, maximum time for which the previously requested force may persist
+_UNCOVERED = 1.0  # s, time after which a tip near the object's edge is ignored
 
-# Requirements, each of which is counted.
+# Requirements; the checks of each one are counted.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
 OFF = "no torque after disarm or fault"
 WATCHDOG = "no torque 0.2 s after a stop that no servo hears"
@@ -109,7 +109,7 @@ ASSERTIONS = (
 class Judge:
     """Check requirements and count how often each was checked.
 
-    If ``broken`` is given, violations are counted there instead of raised.
+    If ``broken`` is given, violations are counted there and do not raise an exception.
     """
 
     def __init__(self, judged: Counter[str], broken: Counter[str] | None = None) -> None:
@@ -170,7 +170,7 @@ class FaultyServos:
         self.finger = 0
         self.last_good = -math.inf
         self.torque = False
-        self.armed = False  # armed, and this state has not been ended by an event
+        self.armed = False  # armed since the last event that disarms
         self._last = 0.0  # angle reported by a numb joint [rad]
         self._unheard = 0
 
@@ -319,7 +319,7 @@ class Account:
     modes: Counter[str] = field(default_factory=Counter)  # ticks in each mode
     faults: Counter[str] = field(default_factory=Counter)  # latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
-    # Named channels, together with the actual fault.
+    # Channels named as faulty, with the actual fault.
     named: Counter[str] = field(default_factory=Counter)
     commands: Counter[str] = field(default_factory=Counter)  # accepted commands
     refused: int = 0
@@ -412,7 +412,7 @@ class Soak:
         self._loaded = 0.0  # N along the faces
         # s, most recent times of these conditions
         self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
-        self._asked: list[tuple[float, float]] = []  # (time [s], force [N]); empty without a grip
+        self._asked: list[tuple[float, float]] = []  # (time [s], force [N]); empty outside grips
         # Start of the current interval above the bound [s].
         self._above = {MOST: math.inf, CALM: math.inf}
 
@@ -443,7 +443,7 @@ class Soak:
         return 1 + int(self._random.expovariate(1.0 / mean))
 
     def _may_be_disturbed(self) -> bool:
-        """Return True while holding, and occasionally in other modes."""
+        """Return True in mode holding, and occasionally in other modes."""
         return self.daemon.loop.state.mode == "holding" or self._random.random() < 1e-3
 
     # Actions
@@ -631,7 +631,7 @@ class Soak:
             self.must(FRAME, age <= most + 1e-9, f"{mode} on one {age:.3f} s old")
 
     def _judge_forces(self, t: float) -> None:
-        """Check that each force of the plant exceeds its bound only briefly."""
+        """Check that each force in the plant exceeds its bound only briefly."""
         control, most = self.settings.control, self.settings.safety.force_max
         if self._loaded:
             self._loaded_t = t
@@ -652,7 +652,7 @@ class Soak:
         bound = _TOO_MUCH * asked
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
-        bound += 2.0 * friction  # once for the compensation, once for static friction
+        bound += 2.0 * friction  # for the compensation and for static friction
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)
@@ -690,7 +690,7 @@ class Soak:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:
-        """Check that a channel reported as faulty is faulty, unless the object has slipped away."""
+        """Check that a channel reported as faulty really is, unless the object has slipped away."""
         t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1
@@ -722,7 +722,7 @@ def resident() -> float:
 
 
 def sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run the sequence with ``seed`` and add violations to the account."""
+    """Run the sequence with ``seed`` and add its violations to ``account``."""
     soak = Soak(seed, account)
     try:
         soak.run(ticks)
@@ -763,7 +763,7 @@ def main() -> int:
     else:
         for seed in range(arguments.seed, arguments.seed + arguments.sequences):
             sequence(seed, arguments.ticks, account)
-            gc.collect()  # a daemon has reference cycles that hold megabytes of frames
+            gc.collect()  # a daemon's reference cycles hold megabytes of frames
     account.seconds = time.monotonic() - begin
     print("\n".join(account.lines()))
     few = account.held < HELD * account.sequences

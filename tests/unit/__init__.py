@@ -1,1 +1,1 @@
-"""Tests within one process, without other processes, pseudo-terminals or real-time daemons."""
+"""Tests that run within one process, without pseudo-terminals or real-time daemons."""

@@ -1,4 +1,4 @@
-"""Short benchmark runs: their errors, bounds and verdicts."""
+"""Test short benchmark runs: their errors, bounds and verdicts."""
 
 import json
 import math
@@ -104,8 +104,8 @@ def test_a_missed_aim_is_not_a_success(monkeypatch, capsys):
     [
         (["tik"], "found 'tik', expected one of estimator"),
         (["faults", "--only", "no such fault"], "no case of faults contains this text"),
-        (["tick", "--full"], "--full: only for reflex"),
-        (["--trials", "3"], "--trials: only for faults or robustness"),
+        (["tick", "--full"], "--full: valid only for reflex"),
+        (["--trials", "3"], "--trials: valid only for faults or robustness"),
     ],
 )
 def test_invalid_options_are_refused_before_measuring(words, text, capsys):
@@ -149,7 +149,7 @@ ASKEW = {"object_angle": math.radians(5.0)}
     ],
 )
 def test_residual_angle_error_of_a_control_law(way, low, high):
-    # A delay is tolerated as long as its product with the integral's bandwidth is below π/2.
+    # The controller tolerates a delay while its product with the integral's bandwidth is below π/2.
     assert low <= control.left(way, ASKEW) <= high
 
 
@@ -161,13 +161,13 @@ def test_an_object_that_is_not_held_is_counted_separately():
 
 def test_a_failed_part_does_not_affect_the_others(monkeypatch, capsys):
     def let_go(title: str, **_: object) -> Report:
-        raise RigError("the hand did not grip the object: grasping")
+        raise RigError("the hand failed to grip the object: grasping")
 
     monkeypatch.setattr(tick, "_in_turns", let_go)
     monkeypatch.setattr(tick, "in_the_loop", lambda title, **_: Report(title, [{"name": "x"}]))
     assert cli.main(["bench", "tick", "--brief"]) == 1
     printed = capsys.readouterr()
-    assert "bench: tick: tick: the hand did not grip the object: grasping\n" in printed.err
+    assert "bench: tick: tick: the hand failed to grip the object: grasping\n" in printed.err
     assert "the simulated hand" in printed.out
     assert printed.out.count("hardware in the loop") == 2
 
@@ -184,7 +184,7 @@ def test_a_held_load_slides_and_a_lost_load_is_reported():
     assert 0.0 < held.answer < 0.022
     assert 0.0 < held.slid < 0.02
     assert not held.lost
-    # A joint that still sticks moves a quarter as much as the other.
+    # A joint that still sticks moves a quarter as far as the other.
     sticking = reflex.overloaded({"simulation": {"object_mass": 0.5}}, 6.0, 15.0, 1)
     assert (sticking.answer < 0.022, sticking.slid < 0.012, sticking.lost) == (True, True, False)
     weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}

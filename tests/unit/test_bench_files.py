@@ -1,4 +1,4 @@
-"""Frame files from test benches: read correctly, or refused with the actual reason."""
+"""Test that frame files from test benches are read correctly or rejected with the right reason."""
 
 import itertools
 import re
@@ -91,12 +91,12 @@ def test_cells_above_the_saturation_pressure_of_the_header_are_excluded(
     press, tmp_path, unit, pascal, digits, told
 ):
     frames, full = clipped(press)
-    name = f" {unit}" if told else ""  # otherwise in the unit of the readings
+    name = f" {unit}" if told else ""  # without a unit, the value has the unit of the readings
     line = f"SATURATION_PRESSURE {full / pascal:.6f}{name}"
     path = tmp_path / "a.asf"
     path.write_bytes(export(frames, unit, 1.0 / pascal, digits=digits, header=[line]))
     settings, within = SETTINGS, 3e-5
-    if digits == 0:  # in whole kPa, rounding adds a third of a kPa of noise
+    if digits == 0:  # rounding to whole kPa adds noise of a third of a kPa
         tactile = SETTINGS.tactile.model_copy(update={"noise": 600.0})
         settings, within = SETTINGS.model_copy(update={"tactile": tactile}), 6e-5
     check(path, settings, within)
@@ -120,11 +120,13 @@ def test_cells_at_the_maximum_reading_are_reported_if_the_header_has_no_saturati
     path = tmp_path / "a.asf"
     path.write_bytes(export(frames))
     done = inline("analyse", path, "--config", "paper")
-    assert "cells share the largest reading" in done.stderr
+    assert "cells have the same maximum reading" in done.stderr
     assert f"set tactile.full_count = {round(full / SCALE)}" in done.stderr
     np.save(tmp_path / "b.npy", np.round(frames / 400.0).astype(np.uint8))
     full_count = round(full / 400.0)
-    assert "share the largest" in load_recording(tmp_path / "b.npy", 400.0, 100.0).notes[0]
+    assert (
+        "have the same maximum reading" in load_recording(tmp_path / "b.npy", 400.0, 100.0).notes[0]
+    )
     assert not load_recording(tmp_path / "b.npy", 400.0, 100.0, full_count=full_count).notes
 
 
@@ -133,7 +135,7 @@ def test_round_readings_do_not_count_as_saturated(press, tmp_path, step):
     np.save(tmp_path / "a.npy", np.round(press / step).astype(np.uint16))
     assert not load_recording(tmp_path / "a.npy", step, 100.0).notes
     upright = SensorGrid(44, 44, PITCH).pressure(TIP, MATERIAL, 0.004)
-    np.save(tmp_path / "b.npy", upright)  # four cells in the middle have the same reading
+    np.save(tmp_path / "b.npy", upright)  # the four middle cells have the same reading
     assert not load_recording(tmp_path / "b.npy", SCALE, 100.0).notes
 
 
@@ -249,7 +251,7 @@ def test_commas_as_separator_and_decimal_sign_are_reported_if_ambiguous(tmp_path
     text = "ROWS 1\nCOLS 3\nUNITS kPa\nASCII_DATA @@\nFrame 1\n0,0,0\nFrame 2\n0,1,25,0\n@@\n"
     (tmp_path / "a.asf").write_text(text)
     with pytest.raises(
-        RecordingError, match="line 8: 4 cells, expected 3: commas separate the cells"
+        RecordingError, match="line 8: 4 cells, expected 3: the comma is both the separator"
     ):
         load_recording(tmp_path / "a.asf", SCALE, 100.0)
 
@@ -281,7 +283,9 @@ def test_an_unknown_unit_is_reported(press, tmp_path, unit):
 
 def test_other_files_are_refused_with_the_supported_types(tmp_path):
     (tmp_path / "a.csv").write_text("t,force\n0,1\n")
-    with pytest.raises(RecordingError, match=r"expected a Tekscan-style export, \.npz or \.npy"):
+    with pytest.raises(
+        RecordingError, match=r"expected a Tekscan-style export, or an \.npz or \.npy"
+    ):
         load_recording(tmp_path / "a.csv", SCALE, 100.0)
 
 
@@ -302,7 +306,7 @@ def test_times_in_other_units_are_converted_and_reported_once(
     read = load_recording(tmp_path / "a.npz", SCALE, rate)
     assert read.t == pytest.approx(STEPS * 1e-3, abs=1e-6)
     (note,) = read.notes
-    assert note.startswith(f"t: read as {name}, which gives 0.01 s between frames")
+    assert note.startswith(f"t: interpreted as {name}, which gives 0.01 s between frames")
 
 
 @pytest.mark.parametrize("key", ["t", "time", "timestamps"])
@@ -326,14 +330,17 @@ def test_a_slow_recording_is_read_unchanged_and_reported(press, tmp_path):
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t.tolist() == (np.arange(8) * 0.5).tolist()
     assert read.notes == (
-        "t: read as s, which gives 0.5 s between frames; tactile.rate gives 0.01 s",
+        "t: interpreted as s, which gives 0.5 s between frames, but tactile.rate "
+        "corresponds to 0.01 s",
     )
 
 
 @pytest.mark.parametrize("t", [np.arange(8), np.arange(1.0, 9.0)])
 def test_frame_numbers_are_not_used_as_times(press, tmp_path, t):
     np.savez(tmp_path / "a.npz", frames=press, t=t)
-    with pytest.raises(RecordingError, match="t: whole numbers that increase by 1, expected times"):
+    with pytest.raises(
+        RecordingError, match="t: found frame numbers that increase by 1, expected times"
+    ):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert load_recording(tmp_path / "a.npz", SCALE, 1.0).t.tolist() == list(range(8))
 
@@ -346,7 +353,7 @@ def test_times_as_texts_are_reported(press, tmp_path):
 
 def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_path):
     np.savez(tmp_path / "a.npz", frames=press, t=np.array([0, 1, 2, 3, 3, 4, 5, 6]) * 0.01)
-    with pytest.raises(RecordingError, match=r"must increase; t\[3\] is 0\.03, t\[4\] is 0\.03"):
+    with pytest.raises(RecordingError, match=r"t\[3\] = 0\.03, t\[4\] = 0\.03"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
 
 
@@ -356,11 +363,11 @@ def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_
 @pytest.mark.parametrize(
     ("scale", "kind", "cause"),
     [
-        (1.0 / 4e4, np.float32, "floats of 0 to 1 are shares"),
+        (1.0 / 4e4, np.float32, "floats between 0 and 1 are probably fractions"),
         (1e-3, np.float64, "convert kPa"),
-        (1.0 / 200.0, np.uint8, "counts of 8 bits"),
-        (1.0 / 200.0, np.uint16, "counts of 8 bits"),
-        (1.0 / 40.0, np.uint16, "tactile.pascal_per_count belongs to another sensor"),
+        (1.0 / 200.0, np.uint8, "the counts have 8 bits"),
+        (1.0 / 200.0, np.uint16, "the counts have 8 bits"),
+        (1.0 / 40.0, np.uint16, "tactile.pascal_per_count is wrong for this sensor"),
         (0.0, np.uint16, "sensor's cable"),
     ],
 )
@@ -387,7 +394,7 @@ def test_noise_above_its_setting_is_reported_with_both(tmp_path, inline, kind):
         for each in inline("analyse", tmp_path / "a.npz", "--config", "paper").stdout.splitlines()
         if "no contact in any frame" in each
     ]
-    found = re.search(r"threshold 4560 Pa .*the noise of the cells is (\d+) Pa: set", line)
+    found = re.search(r"threshold 4560 Pa .*the measured cell noise is (\d+) Pa: set", line)
     assert float(found[1]) == pytest.approx(4000.0, rel=0.03)
 
 
@@ -407,7 +414,9 @@ def test_the_only_stack_of_an_archive_is_used_and_reported(press, tmp_path, name
     np.savez(tmp_path / "a.npz", **held)
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t == pytest.approx(STEPS * 1e-3)
-    assert read.notes == (f"found no array 'frames'; uses {name!r}, the only 3-d array",)
+    assert read.notes == (
+        f"found no array 'frames'; using {name!r}, the only three-dimensional array",
+    )
     check(tmp_path / "a.npz")
 
 
@@ -417,7 +426,7 @@ def test_the_contents_of_an_archive_without_frames_are_listed(press, tmp_path):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
     many = {f"a{k}": np.zeros(k + 1) for k in range(30)}
     np.savez(tmp_path / "b.npz", **many)
-    with pytest.raises(RecordingError, match=r"a7 \(8,\), …: name the array"):
+    with pytest.raises(RecordingError, match=r"a7 \(8,\), …; rename the array"):
         load_recording(tmp_path / "b.npz", SCALE, 100.0)
 
 
@@ -429,16 +438,17 @@ def test_a_pitch_that_contradicts_the_header_is_reported(press, tmp_path, inline
     path.write_bytes(export(press))
     tactile = {"rows": 44, "cols": 44, "recording": (str(path), ""), "pitch": 0.00127}
     wanted = (
-        r"cells of 1\.318 × 1\.318 mm, tactile\.pitch gives 1\.27 × 1\.27 mm: set tactile\.pitch"
+        r"cells of 1\.318 × 1\.318 mm in its header, expected 1\.27 × 1\.27 mm as in "
+        r"tactile\.pitch: set tactile\.pitch"
     )
     with pytest.raises(TactileError, match=wanted):
         ReplayTactile(TactileSettings.model_validate(tactile), VirtualClock(), 0)
     done = inline("analyse", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
-    assert "its header gives cells of 1.318 × 1.318 mm" in done.stderr
+    assert "found cells of 1.318 × 1.318 mm in its header" in done.stderr
     assert "6 with contact, 0 invalid" in done.stdout
     words = ("--recording", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words, "--no-plot")
-    assert (done.returncode, "its header gives cells of" in done.stderr) == (1, True)
+    assert (done.returncode, "found cells of" in done.stderr) == (1, True)
 
 
 def test_a_calibration_reports_suspicious_recordings(tared, tmp_path, inline):
@@ -446,7 +456,7 @@ def test_a_calibration_reports_suspicious_recordings(tared, tmp_path, inline):
     words = ("--recording", tmp_path / "a.npy", "--config", "paper", "--no-plot")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words)
     assert done.returncode == 0
-    assert "noise around a tared zero, set to 0" in done.stderr
+    assert "this is noise after a tare, and these readings are set to 0" in done.stderr
 
 
 def test_generators_differ():
@@ -464,7 +474,7 @@ def test_generators_differ():
     ("changes", "told"),
     [
         ({}, ""),
-        ({"tip.radius": 0.010}, "sensor of 58 × 58 mm for a tip of 20 mm diameter"),
+        ({"tip.radius": 0.010}, "sensor area of 58 × 58 mm for a tip of 20 mm diameter"),
         (
             {"tactile.rows": 26},
             r"smaller than the tip's footprint at safety\.d_max = 12 mm, 36\.7 mm wide",
@@ -474,7 +484,7 @@ def test_generators_differ():
             r"smaller than the tip's footprint at control\.force_default = 24 N, 30\.9 mm wide",
         ),
         ({"tactile.centre": (0.02, 0.0)}, "smaller than the tip's footprint"),
-        ({"tactile.pitch_y": 0.0006}, "sensor of 58 × 26.4 mm, smaller than"),
+        ({"tactile.pitch_y": 0.0006}, "sensor area of 58 × 26.4 mm, smaller than"),
     ],
 )
 def test_a_sensor_size_that_does_not_fit_the_tip_is_reported(changes, told):

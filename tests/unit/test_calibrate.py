@@ -1,4 +1,4 @@
-"""`softfinger calibrate` on a simulated sensor, step by step; the daemon applies the file."""
+"""Test `softfinger calibrate` on a simulated sensor, step by step, and its file in the daemon."""
 
 import json
 import math
@@ -72,7 +72,7 @@ class MadeUp:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """Calibrate completely from recordings; return the folder with profile.toml and sensor.json."""
+    """Run a complete calibration from recordings; return the folder with its two files."""
     folder = tmp_path_factory.mktemp("calibration")
     (folder / "profile.toml").write_text(PROFILE)
     sensor = MadeUp()
@@ -102,7 +102,7 @@ def bench(tmp_path_factory):
     step("centre", "--recording", *presses, "--theta", *map(str, tilts))
     d = np.linspace(-0.001, 0.006, 57)
     frames = np.concatenate([sensor.press(max(x, 0.0)) for x in d])
-    run = keep("run.npz", frames, d=d + 1e-4)  # the run's zero offset is 0.1 mm off
+    run = keep("run.npz", frames, d=d + 1e-4)  # the recorded d has a zero offset of 0.1 mm
     step("modulus", "--recording", run)
     return folder, sensor
 
@@ -165,7 +165,7 @@ def test_the_daemon_applies_the_file(bench, tmp_path):
         assert contact.tilt_y == pytest.approx(0.0, abs=0.01)
         assert contact.force == pytest.approx(math.pi * E * 0.003**2 / math.cos(0.15), rel=0.04)
         for perception in daemon.loop.perception.fingers:
-            perception.tare()  # a new zero offset is taken in counts and used by the converter
+            perception.tare()  # the converter applies the new zero offset, which is in counts
         daemon.loop.advance(0.3)
         assert daemon.loop.state.contacts[0].d == 0.0
 
@@ -223,7 +223,7 @@ def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, 
         (["curve", "--recording", "rest.npz"], "expected --force or --d"),
         (["curve", "--recording", "rest.npz", "--force", "1", "2"], "2 values for 1 loads"),
         (["modulus", "--recording", "rest.npz"], "expected --d"),
-        (["centre", "--recording", "rest.npz"], "press 1 gives no valid contact"),
+        (["centre", "--recording", "rest.npz"], "press 1 does not give a valid contact"),
         (["tare", "--recording", "none.npz"], "No such file"),
         (["tare", "--recording", "rest.npz", "--finger", "right"], "finger left, here right"),
     ],
@@ -244,13 +244,19 @@ def test_impossible_steps_are_reported_and_change_nothing(bench, capsys, words, 
         (lambda c: c.update(format=2), "format"),
         (lambda c: c.update(colour="red"), "colour"),
         (lambda c: c["tare"].update(zero=[[1.0]]), "expected 32 rows"),
-        (lambda c: c["tare"]["zero"][3].__setitem__(4, -1.0), "no negative numbers"),
+        (lambda c: c["tare"]["zero"][3].__setitem__(4, -1.0), "expected numbers ≥ 0"),
         (lambda c: c["tare"]["zero"][3].__setitem__(4, float("nan")), "tare"),
-        (lambda c: c["curve"].update(coefficients=[1.0, 5.0, -1.0, 0.0]), "must increase"),
-        (lambda c: c["curve"].update(coefficients=[1.2, -5.0, 0.0, 0.0]), "must increase"),
+        (
+            lambda c: c["curve"].update(coefficients=[1.0, 5.0, -1.0, 0.0]),
+            "must increase",
+        ),
+        (
+            lambda c: c["curve"].update(coefficients=[1.2, -5.0, 0.0, 0.0]),
+            "must increase",
+        ),
         (
             lambda c: c["curve"].update(coefficients=[100.0, 2.0, 0.0, 0.0]),
-            r"x\^100 gives no "
+            r"x\^100 does not give a "
             "finite",
         ),
         (lambda c: c["modulus"].update(strain=[0.1, 0.2], stress=[1.0]), "modulus"),

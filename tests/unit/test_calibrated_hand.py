@@ -1,4 +1,4 @@
-"""Calibration files in the hand: each finger uses its own tip and its own zero offsets."""
+"""Test calibration files in the hand: each finger uses its own tip and zero offsets."""
 
 import math
 from pathlib import Path
@@ -160,7 +160,7 @@ def calibrated(path: Path, zero: NDArray[np.float64]) -> Calibration:
 
 
 class Bench:
-    """One finger's perception and a board whose cells show ``base`` counts without contact."""
+    """One finger's perception, and a board whose cells read ``base`` counts without contact."""
 
     def __init__(self, given: Settings) -> None:
         self.sensor = GivenFrames()

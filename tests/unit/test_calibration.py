@@ -1,4 +1,4 @@
-"""Calibration mathematics: each step recovers the properties of a simulated sensor."""
+"""Test the calibration mathematics: each step recovers a simulated sensor's properties."""
 
 import math
 import sys
@@ -47,10 +47,10 @@ def test_tare_is_the_mean_of_each_cell():
 
 def test_a_tare_under_load_is_refused():
     frames = 10.0 + RNG.standard_normal((20, 8, 8))
-    frames[:, 2:4, 3] *= 20.0  # two faulty cells are ignored
+    frames[:, 2:4, 3] *= 20.0  # the tare ignores two faulty cells
     tare(frames)
     frames[10:, 4:6, 4:7] += 100.0
-    with pytest.raises(CalibrationError, match="the readings of 8 cells change"):
+    with pytest.raises(CalibrationError, match="found changing readings in 8 cells"):
         tare(frames)
 
 
@@ -89,7 +89,7 @@ def test_the_curve_is_recovered_from_known_weights(kind):
     true = 0.9 * x**1.4 if kind == "power" else 60 * x + 0.08 * x**2 + 5e-5 * x**3
     depths = (0.001, 0.0015, 0.002, 0.003, 0.004)
     readings = [np.interp(GRID.pressure(TIP, LINEAR, d), true, x) for d in depths]
-    # The highest stiffness would exceed the table.
+    # The highest stiffness would exceed the table's range.
     if kind == "power":
         readings = [(GRID.pressure(TIP, LINEAR, d) / 0.9) ** (1 / 1.4) for d in depths]
     found = fit_curve(kind, readings, [force(d) for d in depths], AREA, 4000.0)
@@ -112,7 +112,7 @@ def test_centre_and_rotation_are_recovered_from_tilted_loads(rotation):
     assert found.centre == pytest.approx(true.centre, abs=2e-5)
     assert found.rotation == pytest.approx(rotation, abs=5e-3)
     assert found.residual < 3e-5
-    assert 2e-5 < found.std < 2e-4  # loads are upright to within half a degree
+    assert 2e-5 < found.std < 2e-4  # the loads are upright to within half a degree
 
 
 def test_upright_loads_determine_the_centre_but_not_the_rotation():
@@ -155,15 +155,18 @@ def test_clipped_noise_far_from_the_contact_is_removed():
         (lambda: tare(np.zeros((1, 4, 4))), "found one frame"),
         (lambda: tare(np.zeros((4, 4))), r"\[n, rows, cols\]"),
         (lambda: tare(np.full((3, 4, 4), np.nan)), "not finite"),
-        (lambda: equilibrate([], np.zeros((4, 4))), "at least one uniform"),
+        (lambda: equilibrate([], np.zeros((4, 4))), "found no uniform pressure"),
         (lambda: equilibrate([np.zeros((2, 4, 4))], np.zeros((4, 4))), "read no pressure"),
         (lambda: fit_curve("cubic", np.ones((2, 4, 4)), [1, 2], 1e-6, 10), "at least 3"),
         (lambda: fit_curve("power", np.ones((2, 4, 4)), [1, -2], 1e-6, 10), "above 0"),
-        (lambda: fit_curve("power", np.zeros((2, 4, 4)), [1, 2], 1e-6, 10), "reads nothing"),
+        (lambda: fit_curve("power", np.zeros((2, 4, 4)), [1, 2], 1e-6, 10), "gives no reading"),
         (lambda: fit_curve("cubic", np.ones((3, 4, 4)), [1, 2, 3], 1e-6, 10), "too similar"),
         (lambda: fit_centre(np.zeros((1, 32, 32)), [0], TIP, LINEAR, GRID, 600), "press 1"),
         (lambda: fit_modulus([0.001, 0.002], [0, 0], [1, 2], TIP), "at least three"),
-        (lambda: fit_modulus([0.001, 0.002, 0.003], [0, 0, 0], [3, 2, 1], TIP), "does not rise"),
+        (
+            lambda: fit_modulus([0.001, 0.002, 0.003], [0, 0, 0], [3, 2, 1], TIP),
+            "does not increase",
+        ),
     ],
 )
 def test_uninformative_data_are_refused(call, told):

@@ -1,4 +1,4 @@
-"""The COBS framing: documented bytes, the decoder against a plain version, and its times."""
+"""Test the COBS framing: documented bytes, decoder against a simple reference, timestamps."""
 
 import re
 import struct
@@ -80,7 +80,7 @@ def test_frames_have_numbers_and_times_and_losses_are_counted():
     assert second.steps == 3
     assert second.t_sensor == pytest.approx(first.t_sensor + 1.0)
     assert decoder.counters()["missed"] == 2
-    again = decoder.feed(encode(counts, 0, 0.0), 3.0)  # the board restarted
+    again = decoder.feed(encode(counts, 0, 0.0), 3.0)  # the board has restarted
     assert again.steps == 1
 
 
@@ -107,7 +107,7 @@ def test_every_single_bit_flip_is_detected():
         wrong = bytearray(good)
         wrong[bit // 8] ^= 1 << bit % 8
         decoder = CobsDecoder(4, 5)
-        # If the flip creates or removes the delimiter, no complete frame remains.
+        # If the flip creates or removes the delimiter, there is no complete frame.
         assert decoder.feed(bytes(wrong) + b"\0", 0.0) is None
 
 

@@ -1,4 +1,4 @@
-"""The command line's first steps, profile display, and numbers with units."""
+"""Test the command line's first steps, profile listing, and numbers with units."""
 
 import json
 import math
@@ -24,7 +24,7 @@ def test_without_arguments_the_first_steps_are_shown_and_help_lists_all_subcomma
         ("recrod", "nearest: record"),
         ("versoin", "nearest: --version"),
         ("--verison", "nearest: --version"),
-        ("7", "`softfinger help` lists them"),
+        ("7", "run `softfinger help` to list them"),
     ):
         wrong = inline(word, "run.mcap")
         assert wrong.returncode == 2
@@ -42,7 +42,7 @@ def test_the_closest_subcommand_is_suggested(inline):
         assert f"unknown word {word!r}; nearest: {near}" in wrong.stderr
     assert max(map(len, inline("limits").stdout.splitlines())) <= 120
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
-    # Names the missing command only, not missing options.
+    # The message names only the missing command, not missing options.
     assert inline("send").stderr.endswith("required: COMMAND\n")
 
 
@@ -61,7 +61,7 @@ def test_invalid_numbers_are_not_sent(inline, words, said):
     done = inline("send", *words.split(), "--timeout", "0.1")
     assert done.returncode == 2
     assert said in done.stderr
-    assert "no answer" not in done.stderr
+    assert "no reply" not in done.stderr
 
 
 @pytest.mark.parametrize(

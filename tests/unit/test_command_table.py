@@ -1,4 +1,4 @@
-"""The table of commands, from which the page is generated, against a running hand."""
+"""Test the command table, the source of the generated page, against a running hand."""
 
 import math
 from collections.abc import Callable
@@ -61,7 +61,7 @@ def faulted(daemon: Daemon) -> Daemon:
     return daemon
 
 
-# command, reason → settings, state of the hand, numbers
+# Settings, state of the hand, and numbers for each command and reason.
 REFUSED: dict[tuple[str, Reason], tuple[Any, Callable[[Daemon], Daemon], dict[str, float]]] = {
     ("arm", Reason.SCENE): ({"servos": {"backend": "none"}}, lambda it: it, {}),
     ("arm", Reason.STATE): ({}, hot, {}),

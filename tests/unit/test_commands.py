@@ -1,4 +1,4 @@
-"""Command server and client on real sockets; the order and form of requests."""
+"""Test the command server and client on real sockets: order and form of requests."""
 
 import os
 import select
@@ -70,12 +70,12 @@ def test_a_plain_req_socket_gets_its_reply(server, addresses):
 @pytest.mark.parametrize(
     ("payload", "error"),
     [
-        (b"", "not msgpack"),
-        (b"\xc1\xff", "not msgpack: invalid format"),
+        (b"", "not valid msgpack"),
+        (b"\xc1\xff", "not valid msgpack: invalid format"),
         (msgpack.packb([1, 2]), "expected a map, found list"),
-        (msgpack.packb({"force": 1.0}), 'expected a string under "command"'),
-        (msgpack.packb({"command": 7}), 'expected a string under "command"'),
-        (msgpack.packb({"command": "arm", 3: 4}), "not msgpack"),
+        (msgpack.packb({"force": 1.0}), 'expected a string under the key "command"'),
+        (msgpack.packb({"command": 7}), 'expected a string under the key "command"'),
+        (msgpack.packb({"command": "arm", 3: 4}), "not valid msgpack"),
         (msgpack.packb({"command": "x" * 300}), "bytes, expected at most 200"),
         (msgpack.packb({"command": "arm", "x": {b"k": 1}}), "numbers or strings as values"),
         (msgpack.packb({"command": "arm", "client": [[[]]]}), "numbers or strings as values"),
@@ -99,7 +99,7 @@ def test_malformed_multipart_messages_and_disconnecting_clients_have_no_effect(
 ):
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
-    socket.send_multipart([b"", b"a", b"b", b"c"])  # not a client's form
+    socket.send_multipart([b"", b"a", b"b", b"c"])  # clients never send this form
     socket.send(msgpack.packb({"command": "arm"}))
     socket.close(linger=1000)
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
@@ -127,7 +127,7 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
 
 
 def test_a_request_passes_few_functions(context, addresses):
-    """Count from the socket to the handler, followed by `Loop.command` and `Requests.carry_out`."""
+    """Count the functions between the socket and the handler; the loop adds only two more."""
     passed: set[str] = set()
     heard = []
 
@@ -220,7 +220,7 @@ def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered
             assert msgpack.unpackb(reply) == {"ok": True, "heard": "arm"}
         else:
             assert msgpack.unpackb(reply)["reason"] == "request"
-            assert "expected the command in one frame" in msgpack.unpackb(reply)["error"]
+            assert "expected one frame with the command" in msgpack.unpackb(reply)["error"]
 
 
 class Aged:
@@ -254,7 +254,7 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
         if stalled == "loop":
             on_the_link(served)
         elif stalled == "gateway":
-            # libzmq has received it or is about to, so the start of its waiting time is unknown.
+            # libzmq has received the request or is about to, so its waiting time is unknown.
             until(lambda: served.service.commands.socket.poll(0))
         pass_time(clock, 0.5)
         # After the stall, libzmq's own thread may run later than the gateway's check.
@@ -292,7 +292,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         pass_time(clock, 0.5)
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
-        for _ in range(4):  # the gap is over
+        for _ in range(4):  # wait until the gap is over
             pass_time(clock, bounds.REFUSAL_TIME / 2)
             served.serve(aged)
         if meanwhile == "signal":
@@ -300,7 +300,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         elif meanwhile:
             other = Asking(context, served, addresses[1], meanwhile)
             until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
-        until(lambda: served._is_open())  # long enough after a stop to distinguish requests
+        until(lambda: served._is_open())  # long enough after a stop to tell requests apart
         count = len(aged.ages)
         asking.send(keyed())
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
@@ -399,7 +399,7 @@ def test_stop_is_accepted_with_unknown_fields():
 
 
 def test_a_request_that_is_nested_too_deeply_is_reported():
-    with pytest.raises(Refused, match="not msgpack: nested too deeply"):
+    with pytest.raises(Refused, match="not valid msgpack: nested too deeply"):
         decode(b"\x91" * 2000 + b"\xc0")
 
 
@@ -438,7 +438,7 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(con
 
 
 class Flood:
-    """Clients that send without waiting for replies; nothing is served yet."""
+    """Clients that send without waiting for replies; at first no request is served."""
 
     def __init__(self, context: zmq.Context[Any], address: str, clients: int, each: int) -> None:
         self.sockets = [context.socket(zmq.DEALER) for _ in range(clients)]
@@ -449,7 +449,7 @@ class Flood:
                 socket.send(msgpack.packb({"command": "move"}))
 
     def collect(self, replies: list[dict[str, Any]]) -> int:
-        """Collect replies; return their number so far."""
+        """Collect replies; return the number collected so far."""
         for socket in self.sockets:
             while socket.poll(0):
                 replies.append(msgpack.unpackb(socket.recv()))
@@ -468,7 +468,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             return {}
 
         until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
-        served.serve(note)  # the flood is being processed
+        served.serve(note)  # the gateway is processing the flood
         carried_out = len(order)
         assert carried_out > 0
         stopper = context.socket(zmq.DEALER)
@@ -482,7 +482,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             served.serve(note)
 
         until(lambda: [serve(), stopper.poll(0)][1])
-        # All requests before the stop are answered, and none is executed.
+        # All requests before the stop receive a reply, and none of them is executed.
         replies: list[dict[str, Any]] = []
         until(lambda: [serve(), flood.collect(replies) == 160][1])
         assert order[carried_out:] == ["stop"]
@@ -509,11 +509,11 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
             "too many commands: expected at most 20 per second"
         }
         assert all(reply["ok"] for reply in kind)
-        # It may send again a second later.
+        # The client may send again after a second.
         clock.sleep_until(clock.now() + 1.0)
         flood.sockets[0].send(msgpack.packb({"command": "move"}))
         last: list[dict[str, Any]] = []
-        answer = {"ok": True, "heard": "move"}  # after the remaining requests of the flood
+        answer = {"ok": True, "heard": "move"}  # follows the remaining requests of the flood
         until(lambda: [served.serve(echo), flood.collect(last), answer in last][2])
 
 
@@ -526,7 +526,7 @@ def test_flooding_clients_leave_room_for_others(context, addresses):
 
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
-        # No room is left.
+        # The gateway's buffers are full.
         until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
         other = Asking(context, served, addresses[1], "grasp").socket
         until(lambda: [served.serve(note), other.poll(0)][1])
@@ -602,7 +602,7 @@ def test_a_valid_request_is_parsed():
         ),
         ({"command": "rotate", "angle": 0.1}, Mode.ARMED, "accepted in grasping, holding, r"),
         ({"command": "arm", "client": 7}, Mode.DISARMED, "client: expected a string"),
-        ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "at most 64 characters"),
+        ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "up to 64 characters"),
     ],
 )
 def test_an_invalid_request_is_refused_with_found_and_expected_values(request_, mode, text):
@@ -642,7 +642,7 @@ def test_an_outdated_command_has_no_effect(make, name, mode, oldest):
         loop._fail("a fault")
     assert loop.state.mode == mode
     request = {"command": name, **numbers.get(name, {})}
-    with pytest.raises(Refused, match="old when it was handled") as caught:
+    with pytest.raises(Refused, match="old when it was processed") as caught:
         loop.command(request, oldest + 0.01)
     assert caught.value.reason == "late"
     loop.advance(0.05)
@@ -675,7 +675,7 @@ def test_a_refused_command_takes_no_lease():
 def test_only_one_client_commands_at_a_time():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, "a"), 0.0)
-    with pytest.raises(Refused, match=r"grasp: a has the lease for another 1\.0 s"):
+    with pytest.raises(Refused, match=r"grasp: a holds the lease for another 1\.0 s"):
         take(lease, Command("grasp", {}, "b"), 1.0)
     take(lease, Command("disarm", {}, "b"), 1.0)
     take(lease, Command("status", {}, ""), 1.0)
@@ -689,5 +689,5 @@ def test_clients_without_a_name_share_one_lease():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, ""), 0.0)
     take(lease, Command("grasp", {}, ""), 0.1)
-    with pytest.raises(Refused, match="an unnamed client has the lease"):
+    with pytest.raises(Refused, match="an unnamed client holds the lease"):
         take(lease, Command("grasp", {}, "a"), 0.2)

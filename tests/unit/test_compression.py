@@ -1,4 +1,4 @@
-"""`calibrate law --compression`: tip laws from testing machines, against independent formulas."""
+"""Test `calibrate law --compression`: laws from testing machines, against independent formulas."""
 
 import json
 import math
@@ -27,21 +27,21 @@ from softfinger.tools.cli import main
 
 ROOT = Path(__file__).parents[2]
 E, A = 0.25e6, 0.020
-LATE, LOAD = 1.35e-3, 0.21  # m, N: zeros of the machine
+LATE, LOAD = 1.35e-3, 0.21  # m, N: zero offsets of the machine
 UNIT = Material.constant(1.0)
 Force = Callable[[float, float], float]  # N of d [m] and θ [rad]
 WORDS = ["--config", "hil", "--no-plot"]
 
 
 def springs(d: float, theta: float = 0.0) -> float:
-    """Force along the normal of a sticking platen: the paper's F over cos θ."""
+    """Return the normal force of a sticking platen: the paper's F divided by cos θ."""
     return math.pi * E * d**2 / math.cos(theta) ** 2
 
 
 def pressed(force, rng, noise, theta=0.0, deep=6e-3, above=0.6e-3, toe=0.0):
-    """d and F of a machine that presses and lifts, with zeros of its own, loss and noise.
+    """Return d and F of a machine that loads and unloads, with zero offsets, hysteresis and noise.
 
-    Up to ``toe`` the tip bears nothing.
+    The tip does not carry any load up to the depth ``toe``.
     """
     up = np.linspace(-above, deep, 140)
     depth = np.concatenate([up, up[::-2]])
@@ -81,7 +81,7 @@ def test_correlated_noise_increases_the_standard_deviation():
         return float(np.mean(np.square(errors)))
 
     smooth = found(np.full(8, 8**-0.5))
-    assert 0.3 < smooth < 3.0  # without the correlation it is about 8
+    assert 0.3 < smooth < 3.0  # if correlation is ignored, it is about 8
 
 
 def test_the_toe_region_is_excluded(monkeypatch):
@@ -118,11 +118,11 @@ def test_a_strain_dependent_modulus_is_found_from_the_force():
 
 
 def rubber(base: str) -> Force:
-    """Force of solid rubber by independent finite elements, interpolated between their depths."""
+    """Return the force on solid rubber, interpolated between independent finite element results."""
     with np.load(ROOT / "tests" / "golden" / "solid_frames.npz") as file:
         used = (file["base"] == base) & (file["theta"] == 0.0)
         d, push = file["d"][used], file["push"][used]
-    # The limit at d = 0 is that of Hertz.
+    # The limit at d = 0 is Hertz contact.
     curve = CubicSpline([0.0, *np.sqrt(d)], [4.0 / 3.0 / (1.0 - 0.49**2), *(push / d**1.5)])
     return lambda d, _: E * A**2 * float(curve(math.sqrt(d / A))) * (d / A) ** 1.5
 
@@ -152,7 +152,7 @@ def test_another_model_that_fits_much_better_is_named(tmp_path, capsys, force, p
     words = [*WORDS, "--set", f"tip.physics={physics}", "--set", "material.law=constant"]
     words += ["--set", "safety.d_max=0.008", "--compression", str(file)]
     assert main(["calibrate", "law", str(out), *words]) == 0
-    found = re.findall(r"(?m)^  (.*) fits better;", capsys.readouterr().out)
+    found = re.findall(r"(?m)^  (.*) fits better, ", capsys.readouterr().out)
     assert found == [other] * bool(other)
     assert load_calibration(out).wants["physics"] == physics
 
@@ -188,10 +188,10 @@ def shuffled(d, force):
     ("change", "told"),
     [
         (shuffled, "reversals of d in 210 rows"),
-        (lambda d, force: (d[140:], force[140:]), "only falling d"),
-        (lambda d, force: (0 * d, force), "one displacement"),
-        (lambda d, force: (d, 0.003 * force + 0.2), "not loaded"),
-        (lambda d, force: (d, -force), "compression counts as positive"),
+        (lambda d, force: (d[140:], force[140:]), "only decreasing d"),
+        (lambda d, force: (0 * d, force), "the same displacement"),
+        (lambda d, force: (d, 0.003 * force + 0.2), "tip was loaded"),
+        (lambda d, force: (d, -force), "expected positive d and F"),
         (lambda d, force: (d[:140:20], force[:140:20]), "expected at least 6"),
     ],
 )
@@ -205,7 +205,7 @@ def test_unsuitable_data_are_rejected_with_the_reason(change, told):
 def test_a_run_that_starts_in_contact_is_rejected():
     d, force = pressed(springs, np.random.default_rng(7), 0.05)
     run = loading(d[110:140], force[110:140])
-    with pytest.raises(CalibrationError, match="must show where the contact begins"):
+    with pytest.raises(CalibrationError, match="must include the onset of contact"):
         fit_compression([run], Fingertip(A), UNIT)
 
 
@@ -268,7 +268,7 @@ def test_an_unreadable_file_is_rejected_and_nothing_is_written(tmp_path, capsys,
         (["--theta", "0", "15"], "--theta: found 2 values for 1 files"),
         (
             ["--set", "tip.physics=measured", "--set", 'tactile.calibration=["a","b"]'],
-            "whose curves need frames",
+            "whose curves require frames",
         ),
     ],
 )
@@ -292,7 +292,7 @@ def test_a_depth_dependent_modulus_is_stored_as_points(tmp_path, capsys):
     assert main(["calibrate", "law", str(out), *WORDS, "--compression", str(file)]) == 0
     step = load_calibration(out).modulus
     law = step.material()
-    # F of the stored points, by the integral over the strain.
+    # F at the stored points, by the integral over the strain.
     deep = 5e-3
     found = 2.0 * math.pi * (A - deep) ** 2
     found *= quad(lambda e: float(law.stress(e)) / (1.0 - e) ** 3, 0.0, deep / A)[0]
@@ -313,14 +313,14 @@ def test_stress_and_strain_are_stored_as_points(tmp_path, capsys):
     out = tmp_path / "left.json"
     words = ["calibrate", "law", str(out), *WORDS, "--compression"]
     assert main([*words, str(file)]) == 0
-    assert re.search(r"10\d rows of the unloading left out", capsys.readouterr().out)
+    assert re.search(r"10\d unloading rows were excluded", capsys.readouterr().out)
     step = load_calibration(out).modulus
     at = np.linspace(0.05, 0.45, 9)
     assert step.material().stress(at) == pytest.approx(law.stress(at), rel=0.01)
 
     shifted = [f"{100 * x + 4:.4f},{s:.3f}" for x, s in zip(strain, stress * 1e-3, strict=True)]
     assert main([*words, str(written(file, "strain [%],stress [kPa]", shifted))]) == 1
-    assert "a toe, or a zero that is off" in capsys.readouterr().err
+    assert "a toe region or a zero offset" in capsys.readouterr().err
 
 
 def test_the_documented_example_has_the_documented_output(tmp_path, capsys, monkeypatch):

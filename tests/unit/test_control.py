@@ -1,4 +1,4 @@
-"""Performance of the control on the simulated hand, measured on the plant, and its parts."""
+"""Test the controller: its parts, and its performance measured on the simulated plant."""
 
 import math
 from pathlib import Path
@@ -19,7 +19,7 @@ PAPER: dict[str, dict[str, Any]] = {
     "simulation": {"tactile_delay": 0.040},
 }
 ANGLE = math.radians(10.0)
-# Fraction of the grip force that remains uncertain after one grip's torque measurements.
+# Remaining uncertainty after one grip's torque measurements, as a fraction of the grip force.
 KNOWN = 0.06
 
 
@@ -29,7 +29,7 @@ def watched(sections: dict[str, dict[str, Any]], **simulation: float) -> Simulat
 
 
 def grasped(hand: SimulatedDaemon, force: float = 10.0, seconds: float = 2.0) -> Any:
-    """Grasp and return the recorded values from the first contact of both tips on."""
+    """Grasp and return the recorded values from the moment both tips are in contact."""
     hand.grasp(force)
     seen = hand.watch(seconds)
     return seen.since(int(np.flatnonzero((seen.force > 0.3).all(axis=1))[0]))
@@ -49,7 +49,7 @@ def settled(hand: SimulatedDaemon, angle: float) -> float:
 
 @pytest.mark.parametrize(
     ("sections", "plant", "known", "times"),
-    [  # s until the force and turns to and fro have settled
+    [  # s, settling times of the force and of turns in both directions
         ({}, {}, KNOWN, (0.3, 0.4, 0.6)),
         (PAPER, {"object_mass": 0.07, "modulus_scale": 1.3}, 2.0 * KNOWN, (0.8, 0.6, 0.8)),
         (PAPER, {"object_mass": 0.13, "modulus_scale": 0.7}, 2.0 * KNOWN, (0.8, 0.6, 0.8)),
@@ -74,8 +74,8 @@ def test_grasps_and_turns_also_with_mass_and_modulus_off_by_30_percent(
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
 def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip_force(sections):
-    # A sideways push looks like a twist, and a sudden push of 2 N raises the grip. Successive
-    # pushes differ by up to 2 N.
+    # A sideways push resembles a twist, and a sudden push of 2 N raises the grip. Successive pushes
+    # differ by up to 2 N.
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
         grasped(hand)
@@ -117,7 +117,7 @@ def test_removing_the_object_ends_the_grip(last):
     ("angle", "then", "told", "end"),
     [
         (ANGLE, "", "", "holding"),
-        (ANGLE, "release", "rotate: dropped, because the grasp ended in mode releasing", "armed"),
+        (ANGLE, "release", "rotate: discarded because the grasp ended in mode releasing", "armed"),
         (1.2, "", "rotate: angle: found 68.8° (1.2 rad), expected", "holding"),
     ],
 )
@@ -192,10 +192,13 @@ def test_a_known_load_raises_the_grip_within_its_bound():
         control = {"object_load": 12.0, "grip_raise_max": raised}
         with watched({"control": control}) as hand:
             seen = grasped(hand, force=8.0)
-            # 12 N on two tips at 80 % of μ = 0.6
+            # Two tips carry 12 N at 80 % of μ = 0.6.
             assert hand.mode == "holding"
             assert seen.force[-200:].mean() == pytest.approx(expected, rel=KNOWN)
-            assert any("up to 6.0 N along the face" in text for _, _, text in hand.events)
+            assert any(
+                "the load may reach 6.0 N along the object's face" in text
+                for _, _, text in hand.events
+            )
 
 
 def test_each_force_increase_is_reported():
@@ -229,7 +232,7 @@ def test_prediction_during_motion_is_within_its_own_uncertainty(sections):
         share = np.sqrt(np.mean(np.square(off), axis=0))
         assert (share < 1.5).all(), share
         assert (share > 0.2).all(), share
-        # The frames lag behind; the prediction does not.
+        # The frames lag behind the plant; the prediction does not.
         old, new = np.abs(frames)[:150].mean(axis=0)
         assert new < 0.25 * old
         assert hand.state.object.width == pytest.approx(0.040, abs=1e-4)
@@ -305,7 +308,7 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
             "setpoint smoothing delays the angle by 0.06 s"
         )
         assert np.abs(np.array(forces) - 1.0).max() < 0.04 + KNOWN
-        for k in range(int(rate)):  # constant except for small fluctuations
+        for k in range(int(rate)):  # the setpoint fluctuates only slightly
             hand.command("hold", force=10.0 + 0.05 * (k % 2), angle=1e-3 * (k % 2))
             hand.run(1.0 / rate)
         assert not [event for event in hand.events if event[0] != "info"]
@@ -318,7 +321,7 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
 def test_force_and_angle_setpoints_may_be_sent_separately_and_are_bounded():
     with watched({}) as hand:
         grasped(hand, 8.0)
-        with pytest.raises(Refused, match="hold: force or angle is missing"):
+        with pytest.raises(Refused, match="hold: found neither force nor angle"):
             hand.command("hold")
         with pytest.raises(Refused, match="hold: force: found 40 N"):
             hand.command("hold", force=40.0)
@@ -355,7 +358,7 @@ def test_a_hand_whose_commander_is_silent_follows_its_settings(action, mode):
         assert told == (
             []
             if action == "hold"
-            else [f"the commanding client has been silent for 0.5 s: {action}"]
+            else [f"the client in control has not sent a command for 0.5 s: {action}"]
         )
 
 

@@ -1,4 +1,4 @@
-"""The pages of the site: they are built, links are valid, and quoted messages match the program."""
+"""Test that the site's pages build, links are valid, and quoted messages match the program."""
 
 import ast
 import html
@@ -35,7 +35,7 @@ def site() -> tuple[ModuleType, dict[str, str]]:
 
 
 def written(text: str) -> str:
-    """Return the text without code, in which brackets are not links."""
+    """Return the text without code, because brackets in code are not links."""
     return re.sub(r"(?ms)^ *```.*?^ *```$|`[^`\n]*`", "", text)
 
 

@@ -1,4 +1,4 @@
-"""Values on the pages that take too long to compute during the site's build."""
+"""Test documented values that take too long to compute while the site is built."""
 
 import json
 import re

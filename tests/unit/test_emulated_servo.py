@@ -1,4 +1,4 @@
-"""Registers of an emulated servo: access, units, motion, watchdog, errors, resets."""
+"""Test the registers of an emulated servo: access, units, motion, watchdog, errors, resets."""
 
 import math
 import struct
@@ -29,7 +29,7 @@ def client(**options: Any) -> BusClient:
         (reg.MODEL_NUMBER, 1, 2, framing.ACCESS),
         (reg.PRESENT_POSITION, 1, 4, framing.ACCESS),
         (14, 1, 1, framing.ACCESS),  # register does not exist
-        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # within a register
+        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # address inside a register
         (reg.GOAL_POSITION, 1, 2, framing.DATA_LENGTH),
         (reg.TORQUE_ENABLE, 2, 1, framing.DATA_RANGE),
         (reg.BAUD_RATE, 8, 1, framing.DATA_RANGE),
@@ -78,7 +78,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     ("instruction", "parameters"),
     [
         (0x77, b""),
-        (0x05, b""),  # action without a registered write
+        (0x05, b""),  # no write is registered
         (0x20, b"\x01CTRL"),  # control table backup
     ],
 )
@@ -134,7 +134,7 @@ def test_protocol_1_if_configured() -> None:
 
 
 def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
-    """Return the distance [counts] moved in this time towards a goal of 300 counts."""
+    """Return the distance [counts] moved in ``time`` [s] towards a goal of 300 counts."""
     c = client(for_daemon=True)
     for address, value, size in writes:
         assert c.write(address, value, size) == 0
@@ -167,7 +167,7 @@ def test_without_position_gain_or_pwm_the_joint_does_not_move() -> None:
 def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     profile = (reg.PROFILE_VELOCITY, 200, 4)
     limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
-    # 20 · 0.229 rpm for 0.1 s in counts, minus the distance by which the joint lags.
+    # 20 · 0.229 rpm for 0.1 s in counts, minus the joint's lag
     assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
     c = client()
     for address, value, size in (
@@ -193,7 +193,7 @@ def test_indirect_data_is_redirected_to_its_address(model: str, firmware: int) -
     assert c.bus.servos[0].table.get(reg.LED) == 1
     assert c.ask(framing.READ, struct.pack("<HH", data, 5)) == (0, bytes.fromhex("01 A6000000"))
     assert c.write(data + 1, 5, 4) == framing.ACCESS  # present position is read-only
-    # An indirect address must not be in EEPROM.
+    # Indirect addresses must not refer to EEPROM.
     assert c.write(address, 20, 2) == framing.DATA_RANGE
 
 
@@ -208,7 +208,7 @@ def test_velocity_mode_keeps_its_velocity() -> None:
 
 def test_a_velocity_based_profile_takes_the_expected_time() -> None:
     c = client()
-    c.write(reg.PROFILE_VELOCITY, 50, 4)  # 11.45 rpm: 1024 counts take 1.31 s
+    c.write(reg.PROFILE_VELOCITY, 50, 4)  # 1024 counts take 1.31 s at 11.45 rpm
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.write(reg.GOAL_POSITION, 1024, 4)
     c.later(0.65)
@@ -287,7 +287,7 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     c.write(reg.BUS_WATCHDOG, 5, 1)
     c.write(reg.GOAL_CURRENT, 40, 2)
     c.write(reg.GOAL_POSITION, 4000, 4)
-    for _ in range(20):  # packets prevent a trip
+    for _ in range(20):  # regular packets prevent a trip
         c.later(0.09)
         assert c.read(reg.BUS_WATCHDOG, 1) == 5
     assert c.bus.plant.dq[0] > 0.0
@@ -311,7 +311,7 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     ("fault", "bit"), [("overheat=1", 2), ("overload=1", 5), ("undervoltage=1", 0)]
 )
 def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> None:
-    c = client(model="XL330-M288")  # its shutdown mask includes all three errors
+    c = client(model="XL330-M288")  # this model's shutdown mask includes all three errors
     c.write(reg.TORQUE_ENABLE, 1, 1)
     put_fault(c.bus, fault, c.t)
     c.later(0.02)
@@ -329,7 +329,7 @@ def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> 
 
 
 def test_an_error_outside_the_shutdown_mask_only_sets_the_alert() -> None:
-    c = client()  # XM430: mask 52 does not include the voltage bit
+    c = client()  # XM430: mask 52 excludes the voltage bit
     c.write(reg.TORQUE_ENABLE, 1, 1)
     put_fault(c.bus, "undervoltage=1", c.t)
     c.later(0.02)

@@ -1,4 +1,4 @@
-"""Envelope of the hand's grips: computed on virtual time, stored as a map, queried by `grasp`."""
+"""Test the envelope of the hand's grips: virtual-time runs, the stored map, use by `grasp`."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 
 def settings(width: float = 0.040, **control: Any) -> Settings:
-    """Return the built-in hand with an object of this width [m]."""
+    """Return the settings of the built-in hand, with an object of the given width [m]."""
     return Settings.model_validate({"object": {"width": width}, "control": control})
 
 
@@ -24,14 +24,14 @@ def test_default_grips_are_inside_the_packaged_map():
 def test_a_grip_outside_the_map_gets_a_warning_with_the_reason():
     text = Envelope(settings(0.002)).warning(10.0)
     assert "2 mm (object.width) at friction 0.6 (control.tip_friction) and 0 kg" in text
-    assert "is not gripped" in text
+    assert "the hand cannot grip it" in text
     # 1 kg at friction 0.2 with 10 N raised to 20 N; a smaller maximum increase allows less load.
     for load, force, more in ((9.5, 10.0, 10.0), (7.3, 5.0, 10.0), (5.0, 10.0, 0.0)):
         control = {"tip_friction": 0.25, "object_load": load, "grip_raise_max": more}
         assert "slips out" in Envelope(settings(0.040, **control)).warning(force)
     held = settings(0.040, tip_friction=0.25, object_load=4.8)
     assert Envelope(held).warning(10.0) == ""
-    # The map is not valid for another hand or control law.
+    # The map does not apply to another hand or control law.
     assert Envelope(settings(0.002, law="upright")).warning(10.0) == ""
     other = Settings.model_validate({"tip": {"radius": 0.015}, "object": {"width": 0.002}})
     assert Envelope(other).warning(10.0) == ""
@@ -58,11 +58,11 @@ def test_a_map_is_computed_printed_drawn_and_read(tmp_path, capsys):
     assert rows == [["r", "l"], ["r", "h"]]
     assert picture.stat().st_size > 1000
     own = str(kept)
-    assert "is not gripped" in Envelope(settings(0.002, envelope=own)).warning(10.0)
+    assert "the hand cannot grip it" in Envelope(settings(0.002, envelope=own)).warning(10.0)
     slippery = settings(0.04, envelope=own, tip_friction=0.2)
     assert "slips out" in Envelope(slippery).warning(10.0)
     assert Envelope(settings(0.04, envelope=own)).warning(10.0) == ""
     with pytest.raises(SettingsError, match=r"another hand: control\.law: found energy, expected"):
         Envelope(settings(envelope=own, law="upright"))
-    with pytest.raises(SettingsError, match=r"control.envelope: .*none.toml: can't read a map"):
+    with pytest.raises(SettingsError, match=r"control.envelope: .*none.toml: can't read this map"):
         Envelope(settings(envelope=str(tmp_path / "none.toml")))

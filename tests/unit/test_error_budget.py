@@ -1,4 +1,4 @@
-"""The covariance includes errors that are not visible in frames, and matches the actual errors."""
+"""Test that the covariance includes errors invisible in frames and matches the actual errors."""
 
 import itertools
 import math
@@ -46,7 +46,7 @@ def test_correlated_noise_increases_the_covariance(physics, d, theta):
     tip, truth = Fingertip(0.020, physics), (d, theta, -0.5 * theta)
     frame, rng = GRID.pressure(tip, LINEAR, *truth), np.random.default_rng(12)
     frames = [frame + correlated_noise(rng) for _ in range(400)]
-    n = 4 if tip == TIP else 3  # includes the gain
+    n = 4 if tip == TIP else 3  # the fourth value is the gain
 
     def nees(known: Uncertainty | None) -> tuple[float, float]:
         estimator, squares = ContactEstimator(tip, LINEAR, GRID, NOISE, known=known), []
@@ -57,7 +57,7 @@ def test_correlated_noise_increases_the_covariance(physics, d, theta):
         return float(np.mean(squares)), len(squares) / len(frames)
 
     score, valid = nees(KNOWN)
-    assert 0.8 < score < 1.3  # 400 frames with three or four values: ± 0.04
+    assert 0.8 < score < 1.3  # 400 frames with three or four values each: ± 0.04
     assert valid > 0.9
     assert tip != TIP or nees(None)[0] > 5.0
 
@@ -69,7 +69,7 @@ def test_systematic_errors_are_reported_separately_and_default_to_zero():
     shifted = ContactEstimator(TIP, LINEAR, GRID, NOISE, known=Uncertainty(centre=5e-4))(frame)
     assert (shifted.d, shifted.tilt_x, shifted.gain) == (plain.d, plain.tilt_x, plain.gain)
     np.testing.assert_allclose(shifted.covariance - shifted.systematic, plain.covariance, rtol=1e-3)
-    # An offset of the tip is interpreted as a rotation about the tip's centre.
+    # The model interprets an offset of the tip as a rotation about the tip's centre.
     assert math.sqrt(shifted.systematic[2, 2]) == pytest.approx(5e-4 / 0.019, rel=0.05)
 
 
@@ -108,7 +108,7 @@ def pressed(tip, d, x, y, grid=FLAT):
 
 
 def unloading(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
-    """Return pressures with errors of up to 10 % of each cell's reading at a depth of 1.3 d."""
+    """Return pressures with errors of up to 10 % of each cell's reading at the depth 1.3 d."""
     loaded = np.maximum(pressed(tip, 1.3 * d, x, y), 1e-9)
     strain = np.clip(pressed(tip, d, x, y) / loaded, 0.0, 1.0)
     return pressed(tip, d, x, y) + sign * 0.4 * loaded * strain * (1.0 - strain)
@@ -125,11 +125,11 @@ def power(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarr
 
 
 def misplaced(by):
-    """Return the pressure function of cells with an unknown offset or rotation."""
+    """Return a pressure function whose cells have an unknown offset or rotation."""
     return lambda tip, d, x, y, sign: pressed(tip, d, x, y, replace(FLAT, **by(sign)))
 
 
-# Defects of real cells that the sensor model lacks, with the uncertainty to be declared.
+# Defects of real cells that the sensor model omits, with the uncertainty to declare for each.
 IMPERFECTIONS = {
     "unloading": (Uncertainty(gain=0.1, smooth=0.04), unloading),
     "crosstalk": (Uncertainty(gain=0.02, smooth=0.01), crosstalk),
@@ -159,7 +159,7 @@ HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")  # or 
 
 
 def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
-    """Return the maximum mean NEES of (d, tilts) at 0.5 to 7 mm, without flagged frames."""
+    """Return the maximum mean NEES of (d, tilts) at 0.5 to 7 mm, excluding flagged frames."""
     estimator = ContactEstimator(tip, LINEAR, grid, noise, known=known)
     rng, worst = np.random.default_rng(3), 0.0
     for d in (0.5e-3, 1e-3, 2e-3, 4e-3, 6e-3):
@@ -174,7 +174,7 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
                     if e.contact and e.valid and not e.misfit:
                         error = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
                         squares.append(error @ np.linalg.solve(e.covariance[:3, :3], error) / 3.0)
-        if len(squares) > 16:  # otherwise mostly flagged
+        if len(squares) > 16:  # at other depths most frames are flagged
             worst = max(worst, float(np.mean(squares)))
     return worst
 
@@ -187,8 +187,8 @@ def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
     # 32 frames of three values per depth: ± 0.14. A solid tip's tilt includes the error of its
     # data, but these frames are made from the same data.
     least, most = (0.6, 1.5) if physics == "springs" else (0.2, 1.5)
-    # With springs, an offset of 0.5 mm changes d by more than differences between neighbouring
-    # cells show.
+    # With springs, an offset of 0.5 mm changes d by more than the differences between neighbouring
+    # cells reveal.
     most = 3.0 if (name, physics) == ("centre", "springs") else most
     assert least < worst_nees(known, tip, imperfect) < most
     request.getfixturevalue("exact_solid_data")
@@ -196,7 +196,7 @@ def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
         assert worst_nees(Uncertainty(), tip, imperfect) > 5.0
 
 
-# Each defect that a profile can declare, with its own magnitude, in one hand.
+# Each defect that a profile can declare is present, with its own magnitude, in one hand.
 SECTIONS = {
     "sim": {},
     "velostat": load(Path("velostat")).model_dump(exclude_unset=True),
@@ -217,7 +217,7 @@ SECTIONS = {
 
 
 def smooth_error(pressure, width, kind, rng):
-    """Return a smooth error like cell sensitivities, a different curve or crosstalk."""
+    """Return a smooth error, like that of cell gains, another response curve or crosstalk."""
     if kind == 0:
         x, y = np.indices(pressure.shape) - 0.5 * (len(pressure) - 1)
         waves, phases = rng.normal(0.0, 1.0 / width, (64, 2)), rng.uniform(0.0, 2.0 * math.pi, 64)
@@ -281,14 +281,14 @@ def test_errors_match_the_covariance_with_all_declared_imperfections(profile, ph
             slopes = c.force_theta * np.array([e.tilt_x, e.tilt_y]) / total
             slopes = np.array([c.force_d, *slopes])
             variance = slopes @ covariance @ slopes
-            # For springs, the force also depends on the modulus; a solid tip's frames show the
-            # product.
+            # With springs, the force also depends on the modulus; a solid tip's frames show the
+            # product of both.
             variance += (known.modulus * c.force) ** 2 if physics == "springs" else 0.0
             true_force = modulus_factor * float(table(d, tilt).force)
             forces.append(abs(c.force - true_force) < 1.96 * math.sqrt(variance))
             inside.append(np.abs(error) < 1.96 * np.sqrt(covariance.diagonal()))
     assert len(squares) > 0.6 * frames
-    # Errors shared by a hand's frames are drawn 60 times; other draws give 0.63 to 1.1.
+    # Errors that are common to a hand's frames are drawn 60 times; other draws give 0.63 to 1.1.
     assert (0.55 if physics == "springs" else 0.35) < np.mean(squares) < 1.3
     assert (np.mean(inside, axis=0) > 0.9).all()
     assert np.mean(forces) > 0.9

@@ -1,4 +1,4 @@
-"""The contact estimator reaches the Cramér-Rao bound, and its covariance is consistent."""
+"""Test that the contact estimator reaches the Cramér-Rao bound with a consistent covariance."""
 
 import math
 import re
@@ -28,8 +28,8 @@ from tests.harness.paper_tip import (
 @pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
 @pytest.mark.parametrize("free_gain", [True, False])
 def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain):
-    # Random azimuths and tip positions relative to the cells; the noise level is that of 0.2 %
-    # noise.
+    # Azimuths and tip positions relative to the cells are random. The bias is compared with noise
+    # of 0.2 %.
     rng = np.random.default_rng(7)
     noise = 0.002 * material.reference_modulus
     for _ in range(60):
@@ -51,7 +51,7 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
     ("d", "degrees", "share"), [(0.008, 25.0, 0.35), (0.008, 30.0, 1.0), (0.008, 33.5, 5.0)]
 )
 def test_the_bias_is_small_where_the_footprint_nearly_reaches_the_rim(d, degrees, share, free_gain):
-    # Here 1/√(a² − x² − y²) of the outermost cells has an inverse square root singularity.
+    # Here the outermost cells average 1/√(a² − x² − y²), which has a singularity at the rim.
     rng = np.random.default_rng(1)
     noise = 0.002 * E
     for _ in range(25):
@@ -86,7 +86,7 @@ def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percen
     truth = (d, *tilts(math.radians(degrees), azimuth), 1.0)
     bound = fisher(grid, material, truth, noise, free_gain)
     clean = grid.pressure(TIP, material, *truth[:3])
-    if blur:  # do not use the estimator's own forward model
+    if blur:  # avoid the estimator's own forward model
         clean = dense(grid, material, truth[:3])
     estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
     rng = np.random.default_rng(3)
@@ -104,7 +104,8 @@ def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percen
     # With 800 frames the ratio scatters by 2.5 %; 1.12 allows 4.5 times that.
     assert np.all(ratio < 1.12), ratio
     assert np.all(ratio > 0.85), ratio
-    # Four standard deviations of the mean, plus a bias of a quarter of one frame's deviation.
+    # The tolerance is four standard deviations of the mean, plus a bias of a quarter of one frame's
+    # deviation.
     assert np.all(
         np.abs(miss.mean(axis=0)) < (4.0 / math.sqrt(frames) + 0.25) * np.sqrt(np.diag(bound))
     )
@@ -185,7 +186,7 @@ def test_update_reuses_one_result_and_skips_a_repeated_frame():
     newer = estimator.update(GRID.pressure(TIP, LINEAR, 0.005), seq=5)
     assert newer is first
     assert newer.d == pytest.approx(0.005, rel=1e-4)
-    # A direct call neither reads nor changes the state of update.
+    # A direct call neither reads nor changes the state that `update` keeps.
     covariance = newer.covariance.copy()
     alone = estimator(GRID.pressure(TIP, LINEAR, 0.002))
     assert alone.d == pytest.approx(0.002, rel=1e-4)
@@ -211,7 +212,7 @@ def test_the_frame_path_allocates_almost_nothing():
     finally:
         tracemalloc.stop()
     assert now - before < 1024
-    assert peak - before < 8192  # a frame is 15 kB
+    assert peak - before < 8192  # a frame has 15 kB
 
 
 def test_all_frame_types_and_layouts_give_the_same_estimate():
@@ -337,8 +338,8 @@ def test_an_estimate_says_what_it_found():
     )
     assert re.fullmatch(told, pressed)
     air = repr(estimator(np.zeros(GRID.shape)))
-    assert re.fullmatch(r"ContactEstimate: no contact of more than 0\.\d+ mm", air)
+    assert re.fullmatch(r"ContactEstimate: no contact deeper than 0\.\d+ mm", air)
     assert repr(estimator(np.full(GRID.shape, math.nan))).endswith(
         "not valid: readings are not finite"
     )
-    assert repr(ContactEstimate()) == "ContactEstimate: not valid: no frame yet"
+    assert repr(ContactEstimate()) == "ContactEstimate: not valid: no frame has arrived yet"

@@ -1,4 +1,4 @@
-"""Invalid frames and arguments give a flagged estimate or a clear error, never just a number."""
+"""Test that invalid frames and arguments give a flagged estimate or a clear error."""
 
 import math
 
@@ -86,7 +86,7 @@ def test_one_nan_cell_makes_a_frame_invalid(estimator, bad):
         assert not e.valid
         assert not e.contact
         assert (e.d, e.tilt_x) == (0.0, 0.0)
-    # The next frame is not affected.
+    # The next frame is unaffected.
     assert estimator.update(GRID.pressure(TIP, MEASURED, 0.003, 0.1)).valid
 
 

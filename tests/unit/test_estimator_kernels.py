@@ -1,4 +1,4 @@
-"""The estimator's kernels against plain NumPy; clipped counts, thresholds, misfits."""
+"""Test the estimator's kernels against plain NumPy; clipped counts, thresholds and misfits."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Every kind of event that the sources emit is documented, and no others."""
+"""Test that the documentation lists exactly the kinds of event that the sources emit."""
 
 import ast
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from softfinger.daemon.wire.event_kinds import KINDS
 
 ROOT = Path(softfinger.__file__).parents[1]
 LEVELS = ("info", "warning", "error")
-WARNS = {"_warn": "warning"}  # functions whose first argument is the kind, with their level
+WARNS = {"_warn": "warning"}  # functions whose first argument is the kind, mapped to their level
 
 
 def written(expression: ast.expr) -> str:
@@ -18,7 +18,7 @@ def written(expression: ast.expr) -> str:
 
 
 def emitted(source: str) -> Iterator[tuple[str, str]]:
-    """Yield level and kind of each event written as level, kind, text in the source."""
+    """Yield the level and kind of each event written as (level, kind, text) in the source."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and (level := WARNS.get(getattr(node.func, "attr", ""))):
             yield level, written(node.args[0])
@@ -42,7 +42,7 @@ def test_every_kind_of_event_is_documented_with_its_levels():
     for folder in ("daemon", "tools/processes"):
         for file in (ROOT / folder).rglob("*.py"):
             for level, kind in emitted(file.read_text(encoding="utf-8")):
-                if kind.islower():  # a literal, not a constant's name in `safety.limits`
+                if kind.islower():  # the kind is a literal, not a constant of `safety.limits`
                     levels.setdefault(kind, set()).add(level)
     levels["torque.off"].add("info")  # safety.torque_state uses a constant
     assert {kind: set(each.levels.split(", ")) for kind, each in KINDS.items()} == levels

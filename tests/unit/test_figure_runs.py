@@ -1,4 +1,4 @@
-"""The paper's experiments in simulation: paths, estimation errors, the slow turn."""
+"""Test the paper's experiments in simulation: paths, estimation errors, the slow turn."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Values of the figures against published and derived values, their files, and the plots."""
+"""Test figure values against published and derived values, and the figures' files and plots."""
 
 import argparse
 import csv
@@ -161,7 +161,7 @@ def test_with_shear_the_minimum_is_before_upright(folder: Path) -> None:
     assert felt["least U [deg]"] == pytest.approx(
         minima["least U [deg]"][minima["share [%]"] == 5.0], abs=0.01
     )
-    # The plant's equilibrium includes the rim's springs, which are sheared from first contact on.
+    # The plant's equilibrium includes the rim's springs, which are sheared from the first contact.
     balance = felt["least N cos theta + T sin theta [deg]"]
     assert (balance < minima["least F on the base [deg]"][minima["share [%]"] == 5.0]).all()
     model, plant = read(folder / "fig10_shear.csv"), read(folder / "fig10_shear_plant.csv")
@@ -180,7 +180,7 @@ def test_table_i_values(folder: Path) -> None:
     printed = (0.135, 0.149, 0.182, 0.201, 0.207, 0.255, 0.304)
     assert [float(each) for each in papers] == pytest.approx(printed)
     assert [float(each) for each in laws[:-1]] == pytest.approx(printed[:-1], rel=1e-12)
-    assert strains[-1] == laws[-1] == ""  # beyond the law's range
+    assert strains[-1] == laws[-1] == ""  # the strain exceeds the law's range
     curve = read(folder / "fig3.csv")
     slope = np.gradient(curve["stress [MPa]"], curve["strain [%]"] / 100.0)
     np.testing.assert_allclose(slope[1:-1], curve["modulus [MPa]"][1:-1], rtol=2e-3)
@@ -219,7 +219,7 @@ def test_path_of_rotation_and_rolling(folder: Path) -> None:
         assert np.all(law[theta != 0.0] > ratio[theta != 0.0])
         # Springs that point to the tip's centre give no minimum.
         assert np.ptp(rolling[f"F of radial springs at d = {d} mm [N]"]) == 0.0
-        # The rotation ends where the rolling begins.
+        # The rotation ends at the state where the rolling begins.
         last = rotation[f"F, d up to {d} mm [N]"][-1]
         assert last == pytest.approx(rolling[f"F at d = {d} mm [N]"][0], rel=1e-12)
         assert rotation[f"d up to {d} mm [mm]"][0] == 0.0
@@ -244,7 +244,7 @@ def test_every_plot_is_complete_and_lists_its_errata(drawn: tuple[Path, list[Fig
         page, picture = figures.pages()[name], imread(folder / f"{name}.png")
         height, width = picture.shape[:2]
         assert (width / style.DPI, height / style.DPI) == pytest.approx(page.size, abs=0.01)
-        # Each quarter of the picture contains something.
+        # Every quarter of the picture contains dark pixels.
         dark = picture[..., :3].min(axis=-1) < 0.8
         for rows in (slice(None, height // 2), slice(height // 2, None)):
             for columns in (slice(None, width // 2), slice(width // 2, None)):
@@ -284,7 +284,7 @@ def test_without_matplotlib_only_the_values_are_written(tmp_path, capsys, monkey
 @pytest.fixture(scope="module")
 def rows() -> dict[str, PublishedValue]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(validate, "_TRIALS", 1)  # each one takes a second
+        patch.setattr(validate, "_TRIALS", 1)  # one trial takes a second
         return {each.quantity: each for each in validate.comparisons()}
 
 

@@ -1,4 +1,4 @@
-"""FlexiTac framing, tested on bytes."""
+"""Test the FlexiTac framing on bytes."""
 
 import itertools
 
@@ -23,7 +23,8 @@ nasty = st.lists(
 def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
     """Return the frames decoded when the data are fed byte by byte.
 
-    A late lock may complete several frames at once; only the newest is returned.
+    If the decoder synchronises late, several frames may be completed at once. Only the newest is
+    returned.
     """
     found = []
     for piece in pieces:
@@ -41,7 +42,7 @@ def frame(payload: bytes) -> bytes:
 
 
 def numbered(count: int, cells: int = CELLS, first: int = 0) -> list[bytes]:
-    """Return different images without marker bytes."""
+    """Return different images that contain no marker bytes."""
     return [bytes([(first + k) % 100]) * cells for k in range(count)]
 
 
@@ -79,7 +80,7 @@ def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
         decoded = decoder.feed(frame(images[k]), 0.01 * k)
         assert decoded.data[0, 0] == k
         assert decoded.t == 0.01 * k
-    # Two pieces within the frame time, then two pieces with a gap in between.
+    # Two pieces arrive within the frame time, then two pieces with a gap in between.
     assert decoder.feed(frame(images[5])[:7], 0.05) is None
     assert decoder.feed(frame(images[5])[7:], 0.052) is not None
     assert decoder.feed(frame(images[6])[:7], 0.06) is None
@@ -162,7 +163,7 @@ def test_a_constant_image_that_contains_the_marker_is_ambiguous():
     assert decode(decoder, [stream[5:]]) == []
     assert decoder.counters()["ambiguous"] > 0
     assert "several places" in decoder.diagnosis()
-    # Once the image changes, only one position remains.
+    # Once the image changes, only one position remains possible.
     found = decode(decoder, [frame(image) for image in numbered(3)])
     assert found[-1] == numbered(3)[1]
 

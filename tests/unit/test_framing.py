@@ -1,4 +1,4 @@
-"""Protocol 2.0 framing: published packets byte for byte, and parser properties."""
+"""Test Protocol 2.0 framing: published packets byte for byte, and parser properties."""
 
 import pytest
 from dynamixel_sdk import PacketHandler as sdk_handler
@@ -12,7 +12,7 @@ from softfinger.daemon.simulation.servo_model.framing import (
     frame,
 )
 
-# The header's first bytes are frequent because stuffing applies to them.
+# The header's first bytes are frequent, because stuffing applies to them.
 PIECES = [b"\xff\xff\xfd", b"\xff", b"\xfd", b"\x00", b"\x55", b"\x12"]
 payloads = st.lists(st.sampled_from(PIECES), max_size=40).map(b"".join)
 

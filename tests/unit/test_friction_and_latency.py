@@ -1,4 +1,4 @@
-"""`calibrate friction` and `calibrate latency` on hands that differ from their profile."""
+"""Test `calibrate friction` and `calibrate latency` on hands that differ from their profile."""
 
 import math
 from pathlib import Path
@@ -17,7 +17,7 @@ from tests.harness.recorded_hand import record_hand
 
 Due = dict[int, dict[str, Any]]
 
-EMPTY = "simulation.object_position=[0.0,0.3]"  # out of reach
+EMPTY = "simulation.object_position=[0.0,0.3]"  # the object is out of reach
 CONFIG = Path(__file__).parents[2] / "config"
 SMALL, VELOSTAT = CONFIG / "small.toml", str(CONFIG / "velostat.toml")
 COUNT = 1.78 * 2.69e-3  # N·m per current count of an XM430
@@ -25,7 +25,7 @@ TICK = 2e-3  # s
 
 
 def sweeps(*strokes: tuple[float, float]) -> tuple[Due, float]:
-    """Return sweeps by (angle [rad], velocity [rad/s]), from 0 and back, and their end [s]."""
+    """Return the commands for sweeps (angle [rad], velocity [rad/s]) and the end time [s]."""
     due: Due = {100: {"command": "arm"}}
     tick = 150
     for wide, speed in strokes:
@@ -57,8 +57,8 @@ def test_friction_is_measured_by_a_sweep(tmp_path, capsys, friction, more, expec
     assert calibrate("friction", tmp_path) == 0
     told = capsys.readouterr().out
     found = load(tmp_path / "my.toml").control.joint_friction
-    # The additional static friction decays by a factor e in 0.12 rad/s; at these velocities a tenth
-    # remains.
+    # The additional static friction falls by a factor of e per 0.12 rad/s; at these velocities a
+    # tenth remains.
     assert found == pytest.approx(expected, abs=2 * COUNT)
     assert f"control.joint_friction = {found:g}" in told
     assert ("at break-away" in told) == (at_rest is not None)
@@ -135,7 +135,7 @@ def test_a_sweep_avoids_contact():
     inward = load(None, changes=["hand.open_angle=[-0.4,-0.4]"])
     assert _way(inward, "right") == (-0.4, 0.4)
     narrow = load(None, changes=["hand.q_min=[-0.1,-0.1]", "hand.q_max=[0.15,0.15]"])
-    with pytest.raises(CalibrationError, match=r"found 6° from hand\.open_angle"):
+    with pytest.raises(CalibrationError, match=r"found 6° between hand\.open_angle"):
         _way(narrow, "left")
 
 
@@ -165,8 +165,8 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
     record_hand(tmp_path / "run.mcap", FORCES, 4.4, profile=path, hand=plant)
     assert calibrate("latency", tmp_path) == 0
     told = capsys.readouterr().out
-    # Cells with a response time of 60 ms hide part of the latency; otherwise it is found to within
-    # a few ms.
+    # Cells with a response time of 60 ms hide part of the latency. With other cells, it is found to
+    # within a few ms.
     tolerance = 6e-3 if profile == "velostat" else 3e-3
     assert load(tmp_path / "my.toml").tactile.latency == pytest.approx(latency, abs=tolerance)
     assert float(told.split(" ± ")[1].split(" ms")[0]) < 1e3 * tolerance
@@ -176,7 +176,7 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
 @pytest.mark.parametrize(
     ("profile", "due", "hand", "why"),
     [
-        (None, ARM, (), "found a ramp of 0.0 mm by the joints"),
+        (None, ARM, (), "found a d ramp of 0.0 mm computed from the joints"),
         (None, FORCES, ("simulation.object_angle=0.3",), "neither slides nor tilts"),
         (VELOSTAT, GRASP, (), "found a standard deviation of 1"),
     ],

@@ -1,4 +1,4 @@
-"""Short fuzzing runs of commands, profiles, calibration files and boards."""
+"""Run short fuzz tests with commands, profiles, calibration files and boards."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The gateway's limits for clients, each of which keeps other clients served."""
+"""Test the gateway's limits on clients, which protect the service for other clients."""
 
 from collections.abc import Iterator
 
@@ -59,9 +59,9 @@ def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        # A frame longer than four requests
+        # This frame exceeds the size of four requests.
         (zmq.DEALER, b"x" * (bounds.PART_SIZE_RATIO * 200 + 1)),
-        (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),  # longer than any topic
+        (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),  # exceeds any topic's length
     ],
 )
 def test_a_client_that_sends_an_oversized_message_is_disconnected(
@@ -98,7 +98,7 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
 ):
     """Repeats go to all subscribers, so repeating 50 events each time would be a flood."""
     served.publisher.event(0.0, 0.0, "info", "test", "told again")
-    # Send it before anyone subscribes, so that it cannot reach an unregistered reader later.
+    # Send the event before anyone subscribes, so that it cannot reach an unregistered reader later.
     served.settle()
     reader = connect(context, zmq.SUB, addresses[0])
     reader.subscribe(EVENT)
@@ -120,7 +120,7 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
 
 
 def test_unread_replies_are_dropped(served, context, addresses):
-    """Unread replies neither block the gateway nor fill its memory, as the queue is limited."""
+    """Unread replies neither block the gateway nor fill its memory, as their queue is limited."""
     client = context.socket(zmq.DEALER)
     client.setsockopt(zmq.RCVHWM, 1)
     client.setsockopt(zmq.RCVBUF, 4096)

@@ -1,4 +1,4 @@
-"""Planar geometry against NumPy, and the held object's motion against `Grasp`."""
+"""Test planar geometry against NumPy, and the held object's motion against `Grasp`."""
 
 import math
 
@@ -65,7 +65,7 @@ def test_moment_arms_are_the_equilibrium_torques_per_force(grasp, delta):
 
 
 def faces(q, d, angle: float, taper: float):
-    """Return the faces' n and t, the tips' centres and velocities, and rolling a − d − v·t."""
+    """Return the faces' n and t, the tips' centres and Jacobians, and a − d − v·t for rolling."""
     n, t = [], []
     for side in (-0.5, 0.5):
         at = angle + side * taper
@@ -81,12 +81,12 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
     q, d, angle = (0.12, 0.21), (3e-3, 4e-3), -0.1
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a = HAND.tip_radius
-    middle = tips.mean(axis=0)  # any point of the object
+    middle = tips.mean(axis=0)  # any point of the object will do
     w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
     arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
     for dq in ((1.0, 0.0), (0.0, 1.0), (0.3, -0.8)):
-        # Unknowns (Gx, Gy, φ): d_t of both tips is constant, and both d change equally.
+        # The unknowns are (Gx, Gy, φ): d_t of both tips is constant, and both d change equally.
         left = np.array(
             [
                 [*t[0], -w[0]],
@@ -125,7 +125,7 @@ def test_holding_forces_balance_a_tapered_object(grasp, taper):
     felt = [sheared_gradient(looked_up[i], d[i], theta[i], shear[i]) for i in range(2)]
     for i, each in enumerate((normal1, normal2)):
         assert felt[i][0] - shear[i] * math.tan(theta[i]) == pytest.approx(each, rel=1e-4)
-    # Forces on the object at the contacts, and the tips' moments on it.
+    # Sum the forces on the object at the contacts and the tips' moments on it.
     forces = [pressed[0] * n[0] - shear[0] * t[0], -pressed[1] * n[1] + shear[1] * t[1]]
     assert sum(forces) == pytest.approx([0.0, 0.0], abs=1e-12)
     touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]
@@ -191,7 +191,7 @@ def test_load_from_torques_equals_the_load_on_the_tips(table, load, delta):
     rolled = 0.5 * (shear[0] + shear[1])
     found, slope = found_load(table, state, rolled)
     assert found == pytest.approx(0.5 * load, rel=0.02, abs=0.01)
-    # The slope relates a torque error to a load error.
+    # The slope converts a torque error into a load error.
     more = 1e-5  # N·m
     again, _ = found_load(table, state, rolled, more)
     assert again - found == pytest.approx(more / slope, rel=0.02)
@@ -213,7 +213,7 @@ def test_torques_that_no_load_explains_give_a_finite_load(table):
             at = (table.data, table.data, (1e-6, 1e-3), (q, -0.1), 0.3, motion)
             left1, left2, lever, bow = load_torques(*at, (0.3, 0.3), (torque, 0.5))
             if lever == 0.0:
-                continue  # a load would have no effect on the torques
+                continue  # the torques do not depend on a load here
             load, slope = load_of(0.5 * (left1 + left2), lever, bow)
             assert math.isfinite(load)
             assert slope > 0.0
@@ -244,7 +244,7 @@ def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, tap
     )
     found, _ = load_of(0.5 * (left1 + left2), lever, bow)
     assert found == pytest.approx(load, abs=2e-3)
-    # Both joints must show the load; otherwise it is not a load.
+    # A load must appear in the torques of both joints.
     assert left1 == pytest.approx(left2, abs=1e-9)
 
 

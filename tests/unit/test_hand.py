@@ -1,4 +1,4 @@
-"""The simulated hand: equilibrium, servos, scenes and time."""
+"""Test the simulated hand: equilibrium, servos, scenes and time."""
 
 import math
 
@@ -66,8 +66,8 @@ def test_quasi_static_steering_gain(degrees, gain):
 
 
 def test_load_dependent_friction_equals_the_gear_efficiency():
-    # With friction as a fraction μ of motor and contact torque, (1 − μ)/(1 + μ) arrives; when
-    # backdriven, the inverse.
+    # With friction of a fraction μ of motor and contact torque, the transmitted fraction is (1 −
+    # μ)/(1 + μ); when backdriven, it is the inverse.
     share, rest = 0.25, 0.02  # fraction of the torque; N·m, of which half acts only at standstill
     simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
     simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}
@@ -137,8 +137,8 @@ def test_a_dropped_object_comes_to_rest_on_the_palm():
             energy = later
             if hand.t > 0.15:
                 highest = max(highest, np.abs(hand.object_velocity[1]))
-        # Flat on a face, the weight rests on two corner springs of 1e5 N/m; a tip that touches it
-        # may still creep.
+        # The object lies flat on a face, and two corner springs of 1e5 N/m carry the weight; a tip
+        # that touches it may still creep.
         half = 0.5 * (0.060 if abs(math.sin(hand.object_pose[2])) < 0.5 else 0.040)
         sunk = 0.1 * 9.80665 / 2e5
         assert hand.object_pose[1] == pytest.approx(0.01 + half - sunk, abs=5e-7)
@@ -159,7 +159,7 @@ def test_a_collision_conserves_momentum_and_energy():
     assert hand.force[0] == 0.0
     assert hand.object_velocity[0] > 0.3
     assert 0.05 * (hand.object_velocity[0] + 0.5) == pytest.approx(impulse, rel=1e-3)
-    # The finger receives L N dt while the object's face stays upright.
+    # The finger receives the impulse L N dt while the object's face stays upright.
     assert hand.plant.parameters.joint_inertia * hand.dq[0] == pytest.approx(
         -0.080 * impulse, rel=3e-3
     )
@@ -236,7 +236,7 @@ def test_scripted_compression_indents_each_tip_by_eight_millimetres():
     np.testing.assert_allclose(deepest, 0.008, atol=2e-5)
     np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
     assert both == 0
-    # F = πE d²/cos θ at all times.
+    # F = πE d²/cos θ holds at all times.
     run(hand, 1.7)
     d = hand.d[0]
     assert d > 0.004
@@ -284,7 +284,8 @@ def test_samples_are_interpolated_at_the_frame_times():
     for number in range(hand.sample_count - 5, hand.sample_count):
         sample, exact = hand.sample(number), finer.sample(number)
         assert sample.t == number / 130.0
-        # A tick's motion is 1e-4 rad and 4e-6 m, the error of a sample without interpolation.
+        # A tick's motion is 1e-4 rad and 4e-6 m. This is the error of a sample without
+        # interpolation.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):

@@ -1,4 +1,4 @@
-"""The hand's estimator: against NumPy, at start-up, and with slow cells."""
+"""Test the hand's estimator against NumPy, at start-up, and with slow cells."""
 
 import math
 from dataclasses import replace
@@ -112,10 +112,10 @@ def test_systematic_errors_do_not_average_out():
             first = replace(contacts[0])
     contact = contacts[0]
     assert first.d_std == pytest.approx(math.hypot(5e-5, 2e-5), rel=1e-3)
-    # The error may not decrease, because the zero offset can drift.
+    # The error must not decrease, because the zero offset can drift.
     assert 2e-5 < contact.d_std < 1.2 * first.d_std
     assert 4e-3 < contact.theta_std < first.theta_std
-    # The force error follows from d by ∂F/∂d = 2F/d and from θ by F tan θ; the modulus is known to
+    # The force error follows from d by ∂F/∂d = 2F/d and from θ by F tan θ. The modulus is known to
     # within 20 %.
     by_d, by_theta = 2.0 * contact.force / contact.d * contact.d_std, contact.force * 0.1 * 4e-3
     by_modulus = 0.2 * contact.force
@@ -198,7 +198,7 @@ def test_joint_motion_compensates_for_slow_cells(response):
     estimator = HandEstimator(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     d, q = 0.003, 0.15
-    below = np.linspace(0.0, 0.01, 400)  # Depths below the tip's apex in m, in equal steps of area.
+    below = np.linspace(0.0, 0.01, 400)  # m below the tip's apex, in equal steps of area
     pressure, shown, fitted = np.maximum(d - below, 0.0), q, (d, 1.0)
     follows = -math.expm1(-0.002 / response)
     off = []

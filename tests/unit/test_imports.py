@@ -1,4 +1,4 @@
-"""Import directions and cycles, class names, and the base class of exceptions."""
+"""Test import directions and cycles, class names, and the base class of exceptions."""
 
 import ast
 import re
@@ -11,7 +11,7 @@ from pathlib import Path
 import softfinger
 
 ROOT = Path(softfinger.__file__).parents[1]
-ORDER = ("kinematics", "daemon", "tools")  # each may import itself and those before it
+ORDER = ("kinematics", "daemon", "tools")  # each may import itself and the packages before it
 PAGE = ROOT / "docs" / "architecture.md"
 BUILT_IN = {"Exception", "ValueError", "RuntimeError", "OSError", "TimeoutError"}
 
@@ -32,7 +32,7 @@ def parsed(file: Path) -> ast.Module:
 
 
 def imported(file: Path) -> Iterator[str]:
-    """Return our modules that ``file`` imports, except for types."""
+    """Return the softfinger modules that ``file`` imports, except for type annotations."""
     waiting: list[ast.AST] = [parsed(file)]
     while waiting:
         node = waiting.pop()
@@ -67,7 +67,7 @@ def circle(graph: Mapping[str, set[str]]) -> list[str]:
 
 
 def rooms(top: str) -> dict[str, set[str]]:
-    """Return each room's imports from the other rooms; a module next to them counts as a room."""
+    """Return the imports between the subpackages of ``top``; a top-level module counts as one."""
     graph: dict[str, set[str]] = {}
     for name, others in imports().items():
         if name.startswith(f"{top}."):
@@ -77,7 +77,7 @@ def rooms(top: str) -> dict[str, set[str]]:
 
 
 def table_of_rooms() -> list[str]:
-    """Return the rows of the room table in the architecture page, from top to bottom."""
+    """Return the rows of the architecture page's room table, from top to bottom."""
     _, _, after = PAGE.read_text(encoding="utf-8").partition("| room |")
     return [line for line in after.partition("\n\n")[0].splitlines() if line.startswith("| `")]
 

@@ -1,4 +1,4 @@
-"""Presliding friction of the joints: sticking, break-away and reversal, against a reference."""
+"""Test presliding joint friction against a reference: sticking, break-away and reversal."""
 
 import math
 from collections.abc import Iterable
@@ -65,7 +65,7 @@ def test_very_stiff_bristles_also_stick():
     hand = joint(2.5e-4, joint_presliding=presliding, joint_inertia=inertia)
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
     run(hand, 1.0)
-    # Some slip may occur initially.
+    # The joint may slip initially.
     assert hand.q[0] == pytest.approx(0.6 * presliding, abs=presliding)
     assert abs(hand.dq[0]) < 1e-9
     assert hand.plant.state.bristles[0] == pytest.approx(0.6 * presliding, rel=1e-6)
@@ -103,8 +103,8 @@ def test_friction_reverses_over_twice_the_presliding_distance():
     closing, opening = torque[turn - 200 : turn].mean(), torque[-200:].mean()
     assert closing == pytest.approx(FRICTION, rel=0.01)
     assert closing - opening == pytest.approx(2.0 * FRICTION, rel=0.01)
-    # The transition is a straight line; its slope would reveal half or twice the presliding
-    # distance.
+    # The transition is a straight line, whose slope would reveal a presliding distance that is off
+    # by a factor of two.
     within = slice(turn + 20, turn + 80)
     slope, _ = np.polyfit(angle[within], torque[within], 1)
     assert slope == pytest.approx(FRICTION / PRESLIDING, rel=0.02)
@@ -151,7 +151,7 @@ def test_a_friction_level_that_changes_at_standstill_adds_no_torque():
 
 
 def reference(torque: float, rate: float, stribeck: float, seconds: float) -> np.ndarray:
-    """Return angle, velocity and deflection by the same equations, from 0 with ``rate`` [rad/s]."""
+    """Return angle, velocity and deflection by the same equations, starting at ``rate`` [rad/s]."""
 
     def equations(_t, state):
         _, v, z = state

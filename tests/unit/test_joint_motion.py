@@ -1,4 +1,4 @@
-"""Consistency checks of a joint's angle, velocity and current: detected faults, no false alarms."""
+"""Test consistency checks of joint angle, velocity and current: detections and false alarms."""
 
 import math
 import random
@@ -79,7 +79,7 @@ def test_a_velocity_without_motion_is_detected():
 
 @pytest.mark.parametrize("seconds", [0.03, 0.06, 0.2])
 def test_a_stall_while_a_joint_moves_is_not_a_jump(seconds):
-    """The stall may be before the request or between the reply and its reception."""
+    """The stall may occur before the request, or between the reply and its reception."""
     for at_answer in (False, True):
         joint = Joint()
         for _ in range(100):
@@ -105,7 +105,7 @@ def test_a_jump_during_lost_readings_is_detected():
 
 
 def spoil(daemon: Daemon, how: Callable[[Reading], None]) -> None:
-    """Corrupt readings after they are taken, from now on."""
+    """From now on, corrupt each reading after it is taken."""
     servos = daemon.loop.torque.servos
     really = servos.read
 
@@ -148,7 +148,7 @@ def test_a_joint_fault_ends_a_grip(make, how, name, within):
     "mode", ["current-based position", pytest.param("current", marks=pytest.mark.extended)]
 )
 def test_grips_turns_stops_and_pushes_cause_no_false_alarm(make, mode):
-    """Long holds, at a joint's stop, on an object, and pushed away from the goal."""
+    """Grips last long, and joints are at a stop, on an object, or pushed away from their goals."""
     daemon = make(servos={"mode": mode})
     hand: Any = daemon.hand
     command(daemon, "arm")
@@ -179,6 +179,6 @@ def test_position_mode_moves_without_current_checks(make):
     command(daemon, "move", left=0.05, right=-0.1)
     daemon.loop.advance(1.0)
     assert daemon.loop.state.reading.q == pytest.approx([0.05, -0.1], abs=0.01)
-    command(daemon, "move", left=0.3, right=0.3)  # onto the object
+    command(daemon, "move", left=0.3, right=0.3)  # moves onto the object
     daemon.loop.advance(2.0)
     assert daemon.loop.state.fault_name == ""

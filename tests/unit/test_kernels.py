@@ -1,4 +1,4 @@
-"""Kernel decorators and their records, and the sources that a compiled kernel depends on."""
+"""Test kernel decorators, their records, and the sources that a compiled kernel depends on."""
 
 import importlib
 import math
@@ -101,11 +101,11 @@ def test_an_unknown_field_is_an_error():
     memory = Memory()
     with pytest.raises(AttributeError):
         memory.spred = 1.0
-    with pytest.raises(AttributeError, match="newest is a record: set its fields"):
+    with pytest.raises(AttributeError, match="newest is a record: set its individual fields"):
         memory.newest = Tip()
 
 
 def test_array_aliases_of_every_numpy_version_are_recognised():
-    of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] in that version
+    of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] in NumPy 2.5
     for alias in (NDArray[np.float64], of_2_5):
         assert _kind(Annotated[alias, 3]) == (None, np.float64, (3,))

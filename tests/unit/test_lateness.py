@@ -1,4 +1,4 @@
-"""Delays of the machine: effect on clocks, simulated and real hands, and messages."""
+"""Test machine delays: their effect on clocks, simulated and real hands, and messages."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ Build = Callable[..., tuple[Daemon, LateMachine, list[tuple[str, str, str]]]]
 
 @pytest.fixture
 def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
-    """Return a function that creates daemons on a machine with chosen delays, and their events."""
+    """Return a function that creates daemons on a machine with chosen delays, and event lists."""
 
     def build(clock: str, **sections: Any) -> tuple[Daemon, LateMachine, list[Any]]:
         machine, events = LateMachine(), []
@@ -45,7 +45,7 @@ def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
 
 
 def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
-    """Return the state after these ticks, without values that depend on the machine."""
+    """Return the state after ``count`` ticks, without values that depend on the machine."""
     loop = daemon.loop
 
     def end_in_time(_: float) -> None:
@@ -58,7 +58,7 @@ def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
     return {key: value for key, value in message.items() if key not in MOMENT}
 
 
-TICKS = 1600  # by then, the demo holds the object and turns it
+TICKS = 1600  # long enough for the demo to hold and turn the object
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_a_simulated_hand_waits_for_the_machine_and_reports_it_occasionally(
 ):
     monkeypatch.setattr(timing, "REPORT_INTERVAL", 5.0)
     daemon, machine, events = on_late_machine("auto", task={"name": "demo"})
-    machine.work(60.0)  # the time to build everything does not count as a delay
+    machine.work(60.0)  # the construction time does not count as a delay
     machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.5]
     daemon.loop.advance(4.0)
     state = daemon.loop.state
@@ -95,10 +95,12 @@ def test_a_simulated_hand_waits_for_the_machine_and_reports_it_occasionally(
     assert state.timing.behind_s == pytest.approx(0.9 - 2 * 0.002)
     assert state.timing.late_in_row == 0
     told = [text for level, kind, text in events if kind == "late"]
-    assert told == ["this machine is busy: the simulated hand waited 0.40 s, 0.4 s in total"]
+    assert told == ["this machine is busy: the simulated hand paused for 0.40 s, 0.4 s in total"]
     daemon.loop.advance(2.0)
     told = [text for level, kind, text in events if kind == "late"]
-    assert told[1:] == ["this machine is busy: the simulated hand waited 0.50 s, 0.9 s in total"]
+    assert told[1:] == [
+        "this machine is busy: the simulated hand paused for 0.50 s, 0.9 s in total"
+    ]
 
 
 def test_a_duration_uses_the_time_of_the_machine(on_late_machine):
@@ -171,7 +173,7 @@ METAL = Settings.model_validate({"servos": {"backend": "dynamixel"}})
 
 
 def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
-    """Return the events for a real hand's ticks whose period is too long by ``late``."""
+    """Return the events if each of a real hand's ticks exceeds its period by ``late`` [s]."""
     timing = Timing(tick_s=0.002 + late)
     lateness = Lateness(METAL, timing, waits=False)
     ticks = round(seconds / 0.002)
@@ -181,7 +183,7 @@ def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
 
 def test_a_delay_is_reported_again_after_doubling_intervals():
     told = [event for event in looked(0.06, 17.0 * REPORT_INTERVAL) if event[1] == "late"]
-    assert len(told) == 6  # at 0, 1, 2, 4, 8 and 16 times REPORT_INTERVAL
+    assert len(told) == 6  # reports after 0, 1, 2, 4, 8 and 16 times REPORT_INTERVAL
 
 
 def test_virtual_time_advances_only_by_waiting_and_never_decreases():
@@ -202,7 +204,7 @@ def test_the_time_of_a_hand_is_constant_between_sleeps_and_ends_them_on_time():
     assert clock.sleep_until(100.002) == pytest.approx(0.0015)
     assert clock.now() == 100.002
     assert clock.host() == pytest.approx(100.0035)
-    clock.sleep_until(100.004)  # the remaining period makes up for it
+    clock.sleep_until(100.004)  # the rest of the period makes up for the delay
     assert (clock.now(), clock.host()) == (100.004, 100.004)
     assert clock.behind == 0.0
 

@@ -1,4 +1,4 @@
-"""Each limit, and when limits are reported or latched."""
+"""Test each limit, and the conditions under which it is reported or latched."""
 
 import math
 from copy import copy
@@ -38,10 +38,10 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
     "fast": ({"reading.dq.1": -7.0}, "joint.velocity", "at -7.00 rad/s, above 6 rad/s"),
     "current": ({"reading.current.1": -1.9}, "joint.current", "right joint draws -1.90 A"),
     "stalled": ({"mode": Mode.MOVING} | STALLED, "joint.stall", "17.2° from its goal at 0.39 A"),
-    "dead": (TOWARDS, "joint.dead", "left joint stands still 17.2° from its goal and draws"),
+    "dead": (TOWARDS, "joint.dead", "left joint is stationary 17.2° from its goal and draws"),
     "pulled away": (TOWARDS | {"reading.current.0": -0.4}, "joint.dead", "only -0.40 A of 0.40 A"),
-    "frozen": ({"reading.frozen": 0b01}, "servos.frozen", "servos: readings from left are old"),
-    "deaf": ({"reading.lost": 0b11}, "goal.lost", "not received by left and right"),
+    "frozen": ({"reading.frozen": 0b01}, "servos.frozen", "servos: the readings are old (left)"),
+    "deaf": ({"reading.lost": 0b11}, "goal.lost", "goals are not being received (left and right)"),
     "hot": ({"reading.temperature.0": 71.0}, "servos.temperature", "left servo is at 71 °C"),
     "brown-out": ({"reading.voltage.1": 9.2}, "servos.voltage", "9.2 V, expected 9.5 to 16.0 V"),
     "no frames": (
@@ -118,7 +118,7 @@ def test_a_short_spike_of_a_condition_that_must_last_is_not_a_fault():
     [THINNER, *(FAULTS[each][0] for each in ("current", "stalled", "dead", "brown-out"))],
 )
 def test_checking_for_a_cause_does_not_change_the_result(changes):
-    """A condition that must last is detected on the same tick, regardless of refused commands."""
+    """A persistent condition is detected on the same tick, regardless of refused commands."""
     asked, alone, state = safety(), safety(), sound()
     for k in range(1500):
         if k == 100:
@@ -176,7 +176,7 @@ def test_a_change_of_width_of_a_held_object_is_a_fault():
     name, text = judged(judge, state, 0.5)
     assert name == "hand.width"
     assert "changed by -4.5 mm" in text
-    state.mode = Mode.ARMED  # the object was released; the next one may have any width
+    state.mode = Mode.ARMED  # the object is released; the next object may have any width
     assert judged(judge, state) == ("", "")
     state.mode = Mode.HOLDING
     assert judged(judge, state, 0.5) == ("", "")
@@ -185,7 +185,7 @@ def test_a_change_of_width_of_a_held_object_is_a_fault():
 STRONG = {"contacts.0.force": 27.5, "contacts.1.force": 27.5}
 WARNINGS: dict[str, tuple[Changes, str]] = {
     "hand.force": ({"contacts.0.force": 12.0}, "left 12.0 N, right 5.0 N"),
-    "joint.strained": ({"reading.current": [1.19, 0.3]}, "needs the highest current, 1.2 A"),
+    "joint.strained": ({"reading.current": [1.19, 0.3]}, "requires the maximum current of 1.2 A"),
     "tactile.misfit": ({"contacts.0.misfit": True}, "left sensor's frames do not fit"),
     "servos.heat": ({"heat.1.time_to_limit": 42.0}, "right servo will reach 70 °C in 42 s"),
     "tip.force": (STRONG, "left tip force is 27.5 N, above 27 N"),
@@ -215,7 +215,7 @@ def test_a_warning_is_reported_once_until_it_has_ended(name):
 
 @pytest.mark.parametrize(("good", "told"), [(1000, True), (20, True), (3, False)])
 def test_readings_that_fail_for_a_second_are_reported_even_while_disarmed(good, told):
-    """One in ``good`` readings is valid."""
+    """Every reading is invalid except one in ``good``."""
     watch, state = safety(), sound(Mode.DISARMED)
     state.torque = False
     first = math.inf
@@ -229,7 +229,7 @@ def test_readings_that_fail_for_a_second_are_reported_even_while_disarmed(good, 
     assert len(warnings) == told
     if told:
         assert "of the readings in the last second failed: no valid reply within" in warnings[0]
-        assert "servos.reply_timeout = 4 ms; `softfinger doctor`" in warnings[0]
+        assert "servos.reply_timeout = 4 ms; run `softfinger doctor`" in warnings[0]
         assert 0.9 < first < 1.5
 
 
@@ -268,7 +268,7 @@ def test_each_faulty_channel_is_named():
         "left sensor reports a jump of 11° in the object's angle"
     )
     assert told["consistency.right_sensor"].startswith("right sensor reads 50% of the pressure")
-    assert "current is 0.10 A, its goal 0.20 A" in told["consistency.right_current"]
+    assert "current is 0.10 A, but its goal is 0.20 A" in told["consistency.right_current"]
 
 
 def test_a_force_that_does_not_increase_as_commanded_is_a_fault():
@@ -283,7 +283,7 @@ def test_a_force_that_does_not_increase_as_commanded_is_a_fault():
         found = judged(judge, state, 0.5)
         assert (found[0] == "consistency.force") is fault
         state.contacts[0].force = state.contacts[1].force = felt
-    assert "rose to 20.0 N, measured force stayed at 6.5 N" in found[1]
+    assert "rose to 20.0 N, but the measured force stayed at 6.5 N" in found[1]
 
 
 def test_shear_near_friction_is_reported():
@@ -309,7 +309,7 @@ def test_a_frozen_sensor_is_a_fault_during_contact():
         assert (found is not None) is fault
     assert found.name == "tactile.frozen"
     assert "right sensor is frozen" in found.text
-    state.contacts[1].contact = False  # without contact, repeated readings are normal
+    state.contacts[1].contact = False  # without contact, repeated frames are normal
     assert judged(judge, state) == ("", "")
 
 
@@ -323,7 +323,7 @@ def test_saturated_cells_are_reported():
     ]
 
 
-# Values that may reach a fraction of their limit; ages are relative to now.
+# Values that may reach a fraction of their limit; ages are relative to the current time.
 PUSHES: dict[str, tuple[str, float]] = {
     "joint.angle": ("reading.q.{}", SETTINGS.hand.q_max[0] + 0.1),
     "joint.velocity": ("reading.dq.{}", BOUNDS.velocity_max),
@@ -369,8 +369,8 @@ def test_a_sensor_without_valid_estimates_is_reported_with_reason_and_noise():
     state.contacts[0].t_valid = OLD
     sensor.noise = 1.2 * SETTINGS.tactile.noise
     _, text = judged(judge, state)
-    assert text.endswith("s: the frame does not fit the tip's model")
+    assert text.endswith("s: the frame does not match the tip's contact model")
     sensor.noise = 2.6 * SETTINGS.tactile.noise
     judge = safety(sensors=[sensor])
     _, text = judged(judge, state)
-    assert text.endswith("the noise of its cells is 3952 Pa, tactile.noise is 1520 Pa")
+    assert text.endswith("the measured cell noise is 3952 Pa, expected tactile.noise = 1520 Pa")

@@ -1,4 +1,4 @@
-"""The complete pipeline on the virtual clock: commands and limits."""
+"""Test the complete pipeline on the virtual clock: commands and limits."""
 
 import math
 import re
@@ -84,7 +84,7 @@ def test_setting_the_wall_clock_only_affects_timestamps(make, monkeypatch, step)
 
 
 def test_a_grasp_without_an_object_ends_armed_with_a_warning(make: Make) -> None:
-    # The fingers reach their limits before the tips meet.
+    # The fingers reach their joint limits before the tips meet.
     daemon = make(simulation={"object_shape": "none"}, hand={"q_max": (0.3, 0.3)})
     events = heard(daemon)
     command(daemon, "arm")
@@ -178,7 +178,7 @@ def test_the_state_contains_the_goals_of_the_grip(make):
     daemon.loop.advance(0.01)
     message = state_message(daemon.loop.state, parts(daemon.settings))
     assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
-    # Higher than requested, because the load would make the tips slip.
+    # The force exceeds the requested one, because the load would make the tips slip.
     for k in range(1, 101):
         daemon.hand.apply_load(0.0, 0.12 * k, 0.0)
         daemon.loop.advance(0.02)
@@ -235,12 +235,14 @@ def test_a_tare_reports_the_change_of_the_zero(make):
 
     pascal = daemon.settings.tactile.pascal_per_count
     found = tared(0, 0)
-    assert found.startswith(f"left sensor's zero moved by +100.0 counts ({100 * pascal:+.0f} Pa)")
-    assert tared(30, 50) == (
-        f"left sensor's zero moved by +30.0 counts ({30 * pascal:+.0f} Pa), "
-        "one cell by +80.0 counts"
+    assert found.startswith(
+        f"left sensor's zero offsets changed by +100.0 counts ({100 * pascal:+.0f} Pa)"
     )
-    # The change is that from the last zero, not from the first.
+    assert tared(30, 50) == (
+        f"left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa), "
+        "in one cell by +80.0 counts"
+    )
+    # The warning compares with the last zero offset, not with the first.
     assert tared(-10, -60).endswith("one cell by -150.0 counts")
 
 
@@ -326,7 +328,7 @@ def test_stopping_the_opening_hand_leaves_no_later_fault(make):
 def test_a_blocked_joint_is_a_fault_that_can_be_cleared(make):
     daemon = make(tactile={"backend": "none"})
     command(daemon, "arm")
-    command(daemon, "move", left=0.9, right=0.9)  # onto the object
+    command(daemon, "move", left=0.9, right=0.9)  # moves onto the object
     advance_to(daemon, "fault", 8.0)
     assert daemon.loop.state.fault_name == "joint.stall"
     assert "joint has stalled" in daemon.loop.state.fault

@@ -1,4 +1,4 @@
-"""Recordings with malformed messages, which are reported and omitted without a traceback."""
+"""Test that malformed messages in recordings are reported and omitted without a traceback."""
 
 import copy
 from pathlib import Path
@@ -91,7 +91,7 @@ def test_settings_without_text_are_reported(tmp_path, name):
     del message[name]
     writer.add(schema.SETTINGS, message)
     writer.close()
-    with pytest.raises(RecordingError, match="its hand/settings lacks"):
+    with pytest.raises(RecordingError, match="its hand/settings message lacks"):
         recorded_settings(Recording(path))
 
 

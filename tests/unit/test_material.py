@@ -1,4 +1,4 @@
-"""Stress-strain laws: Table I, measured points, refusals, and tables for the kernels."""
+"""Test stress-strain laws: Table I, measured points, rejected laws, and tables for the kernels."""
 
 import math
 from fractions import Fraction
@@ -145,7 +145,7 @@ def test_any_increasing_points_give_an_increasing_law_or_a_reason(steps, scale):
     try:
         material = Material.from_points(x, y)
     except MaterialError as error:
-        assert "no smooth monotone law" in str(error)  # noqa: PT017
+        assert "no smooth monotonic law" in str(error)  # noqa: PT017
         return
     assert np.all(np.diff(material.stress(STRAIN)) > 0)
     assert np.max(np.abs(material.stress(x) - y)) <= material.fit_error * (1 + 1e-6) + 1e-9 * y[-1]
@@ -169,19 +169,23 @@ def test_the_force_error_equals_the_effect_of_the_misfit_on_the_force():
 @pytest.mark.parametrize(
     ("strain", "stress", "words"),
     [
-        ([0, 0.5, 1], [0, 1, 2], "too few points: 3"),
-        ([0, 0.2, 0.4, 0.6], [0, 2, 1, 3], "not monotone.*point 3 has 1 Pa after 2 Pa"),
-        ([0, 0.2, 0.4, 0.6], [0, 2, 2, 3], "not monotone"),
-        ([0, 0.4, 0.2, 0.6], [0, 1, 2, 3], "strain must rise: point 3"),
-        ([0, 0.2, 0.4, 0.6], [1, 2, 3, 4], "starts off zero: 1 Pa"),
-        ([0.1, 0.2, 0.4, 0.6], [-1, 2, 3, 4], "starts off zero"),
-        ([-0.1, 0.2, 0.4, 0.6], [-1, 2, 3, 4], "below zero"),
-        ([0, 0.2, math.nan, 0.6], [0, 2, 3, 4], "point 3 is not a number"),
-        ([0, 0.2, 0.4, 0.6], [0, 2, math.inf, 4], "point 3 is not a number"),
-        ([0, 20, 40, 100], [0, 2, 3, 4], "not per cent"),
+        ([0, 0.5, 1], [0, 1, 2], "too few points: found 3"),
+        ([0, 0.2, 0.4, 0.6], [0, 2, 1, 3], "not monotonic.*point 3 has 1 Pa after 2 Pa"),
+        ([0, 0.2, 0.4, 0.6], [0, 2, 2, 3], "not monotonic"),
+        ([0, 0.4, 0.2, 0.6], [0, 1, 2, 3], "strain must increase, but point 3"),
+        (
+            [0, 0.2, 0.4, 0.6],
+            [1, 2, 3, 4],
+            "must start at zero stress, but its first point has 1 Pa",
+        ),
+        ([0.1, 0.2, 0.4, 0.6], [-1, 2, 3, 4], "must start at zero"),
+        ([-0.1, 0.2, 0.4, 0.6], [-1, 2, 3, 4], "must not be negative"),
+        ([0, 0.2, math.nan, 0.6], [0, 2, 3, 4], "point 3 is not finite"),
+        ([0, 0.2, 0.4, 0.6], [0, 2, math.inf, 4], "point 3 is not finite"),
+        ([0, 20, 40, 100], [0, 2, 3, 4], "not a percentage"),
         ([0, 0.2, 0.4], [0, 2, 3, 4], "equal length"),
         ([0, 0.5, 1.2, 1.4], [0, 2, 3, 4], "too few points between"),
-        ([0, 0.1, 0.2, 0.3, 0.31, 0.9], [0, 1, 2, 3, 90, 91], "no smooth monotone law"),
+        ([0, 0.1, 0.2, 0.3, 0.31, 0.9], [0, 1, 2, 3, 90, 91], "no smooth monotonic law"),
     ],
 )
 def test_refusals_name_the_problem(strain, stress, words):
@@ -192,7 +196,7 @@ def test_refusals_name_the_problem(strain, stress, words):
 def test_all_problems_are_in_one_report():
     with pytest.raises(MaterialError) as error:
         Material.from_points([0, 0.4, 0.2], [5, 2, 1])
-    for words in ("too few", "strain must rise", "not monotone", "starts off zero"):
+    for words in ("too few", "strain must increase", "not monotonic", "must start at zero"):
         assert words in str(error.value)
 
 

@@ -1,4 +1,4 @@
-"""MCAP recordings written by other programs: merged, filtered, without an index."""
+"""Test MCAP recordings written by other programs: merged, filtered, without an index."""
 
 import json
 from collections.abc import Iterator
@@ -96,7 +96,7 @@ def test_all_variants_of_the_format_give_the_same_recording(tmp_path, options):
     assert recording.total == SHORT
     assert recording.count(schema.STATE) == sum(topic == schema.STATE for topic, _ in wanted)
     times = [message.log_time * 1e-9 for _, _, message in golden()]
-    assert recording.start == pytest.approx(min(times) + 1e4)  # not the time of another channel
+    assert recording.start == pytest.approx(min(times) + 1e4)  # the camera's start does not count
     assert recording.duration == pytest.approx(max(times) - min(times))
     late = list(recording.messages([schema.STATE], start=0.1))
     assert 0 < len(late) < recording.count(schema.STATE)
@@ -105,7 +105,7 @@ def test_all_variants_of_the_format_give_the_same_recording(tmp_path, options):
     assert sum(recording.others.values()) == 2 * others
     assert len(told) == bool(others)
     if told:
-        assert f"{2 * others} messages of 2 channels of other programs are left out" in told[0]
+        assert f"{2 * others} messages on 2 channels from other programs were skipped" in told[0]
     assert [each.name for each in export(recording, tmp_path, CsvTable, [schema.STATE])]
 
 
@@ -118,7 +118,7 @@ def test_a_truncated_file_with_other_channels_is_read_up_to_the_cut_and_not_rewr
     assert recording.truncated
     assert read == list(islice(Recording(GOLDEN).messages(), len(read)))
     assert len(read) > 50
-    with pytest.raises(RecordingError, match="channels of other programs, which would be lost"):
+    with pytest.raises(RecordingError, match="channels from other programs, which would be lost"):
         recover(path)
     assert path.read_bytes() == whole[: len(whole) // 2]
 
@@ -176,7 +176,7 @@ def test_view_and_replay_tolerate_malformed_messages(tmp_path, inline):
         ("/hand/state", "json", state),
     )
     done = inline("view", path, "--no-browser", "--duration", "0.5", "--port", "0")
-    assert (done.returncode, "1 states seen" in done.stderr) == (0, True)
+    assert (done.returncode, "1 states received" in done.stderr) == (0, True)
     assert "Traceback" not in done.stderr
     address = f"ipc://{tmp_path}/stream"
     done = inline("replay", path, "--no-wait", "--address", address)

@@ -1,4 +1,4 @@
-"""A tip that fits no model: curves through measured contacts, with table and estimator."""
+"""Test a tip that no model fits: interpolated measurements, the table and the estimator."""
 
 import json
 import math
@@ -36,11 +36,11 @@ TRUE = replace(GRID, centre=(0.7e-3, -0.4e-3), rotation=0.2)  # true position of
 NOISE = 600.0
 D = 1e-3 * np.array([0.7, 1.5, 3, 5, 6, 2, 4, 5, 3, 6, 4])
 THETA = np.radians([0, 0, 0, 0, 0, 10, -10, 10, 20, -25, 25])
-WEIRD = 1e6  # N/m², of a force that no model has: F = WEIRD d^1.8 A^0.2 cos θ
+WEIRD = 1e6  # N/m²; no model predicts this force: F = WEIRD d^1.8 A^0.2 cos θ
 
 
 def weird(d: float, theta: float) -> np.ndarray:
-    """Return a blunt peak with the required force that moves half as far as for springs."""
+    """Return a blunt pressure peak with the given force that moves half as far as for springs."""
     x, y = np.meshgrid(*(pitch * (np.arange(32) - 15.5) for pitch in TRUE.pitches))
     x, y = x - TRUE.centre[0], y - TRUE.centre[1]
     c, s = math.cos(TRUE.rotation), math.sin(TRUE.rotation)
@@ -93,7 +93,7 @@ def test_declared_cell_uncertainties_are_part_of_the_errors(law, name, d):
         assert found.valid
         off = np.array([found.d - d, found.tilt_x - theta, found.tilt_y])
         off_by.append(np.abs(off) / np.sqrt(found.covariance.diagonal()[:3]))
-    # Curves through other noise give 1.1 to 1.65 at the smallest depths.
+    # Curves fitted with other noise give 1.1 to 1.65 at the smallest depths.
     assert 0.5 < np.max(off_by) < 2.0
 
 
@@ -187,10 +187,12 @@ def test_a_finger_uses_the_curves_of_its_file(law, tmp_path):
         make_models(load(HIL, tmp_path, profile(other)))
     with pytest.raises(SettingsError, match=r'tactile.calibration: found "" for left'):
         load(HIL, tmp_path, ["tip.physics=measured", "safety.d_max=0.006"])
-    with pytest.raises(SettingsError, match="measured curves need the frames of a real board"):
+    with pytest.raises(
+        SettingsError, match="measured curves require the frames of a physical board"
+    ):
         load(None, tmp_path, ["tip.physics=measured"])
     falling = asdict(law) | {"push": [[-value for value in row] for row in law.push]}
     text = json.loads(file.read_text()) | {"law": falling}
     other.write_text(json.dumps(text))
-    with pytest.raises(CalibrationFileError, match="push must rise with d"):
+    with pytest.raises(CalibrationFileError, match="push must increase with d"):
         load_calibration(other)

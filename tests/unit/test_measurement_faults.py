@@ -1,4 +1,4 @@
-"""Measurement faults: their text form, and their effect on sensors of an unchanged hand."""
+"""Test measurement faults: their text form, and their effect on an unchanged hand's sensors."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ class Press:
         return found
 
     def pressed(self, count: int) -> list[np.ndarray]:
-        """Return this number of frames after 1.4 s of compression."""
+        """Return the given number of frames, after 1.4 s of compression."""
         self.clock.sleep_until(1.4)
         self.sensor.latest()
         return self.frames(count)
@@ -92,7 +92,7 @@ def test_faults_develop_linearly_over_their_duration_and_end():
     assert [faults("gain", t) for t in (0.0, 3.0, 4.0, 4.5, 5.0, 9.0)] == [
         *(1.0, 1.0, 0.75, 0.625, 0.5, 0.5)
     ]
-    faults.begin("gain", 2.625, 4.5, 4.0)  # starts from the current value
+    faults.begin("gain", 2.625, 4.5, 4.0)  # the ramp starts from the current value
     assert [faults("gain", t) for t in (4.5, 6.5, 8.5)] == [0.625, 1.625, 2.625]
     faults.begin("drift", 0.1, 7.0)
     assert [faults("drift", t) for t in (6.999, 7.0)] == [0.0, 0.1]
@@ -122,7 +122,7 @@ def test_frames_are_repeated_with_new_numbers():
     assert len({each.tobytes() for each in kept}) == 20
     press.faults.begin("replay", 0.06, press.clock.now())
     again = press.frames(18)
-    # The sensor's delay is one frame, so the first frame was sampled before the fault.
+    # The sensor delays frames by one, so the first frame was sampled before the fault.
     last = [*kept, again[0]][-6:]
     assert [each.tobytes() for each in again[1:]] == [
         last[k % 6].tobytes() for k in range(len(again) - 1)
@@ -160,7 +160,7 @@ def test_a_servo_reports_a_current_other_than_the_actual_one():
         for servo, sign in zip((1, 2), signs, strict=True)
     ]
     assert counts == [round(hand.current[0] / unit), round(0.5 * hand.current[1] / unit)]
-    # The goal is reached as without the fault.
+    # The goal is reached despite the fault.
     np.testing.assert_allclose(hand.current, flows, rtol=0.02)
 
 
@@ -210,17 +210,17 @@ def test_faults_are_parsed():
         ("gain=-1", "0 to 100"),
         ("drift=1.5", "-1 to 1"),
         ("replay=4", "0 to 3"),
-        ("gain=2@3..1", "end '1' is not a time of at least 3 s"),
-        ("gain=2@3..", "end '' is not a time of at least 3 s"),
-        ("mirror=1@1..2", "mirror changes at once; give one start time such as @1"),
-        ("push=3@1..2", "push changes at once; give one start time such as @1"),
+        ("gain=2@3..1", "end '1' is not a valid time, expected at least 3 s"),
+        ("gain=2@3..", "end '' is not a valid time, expected at least 3 s"),
+        ("mirror=1@1..2", "mirror does not change gradually; give a single start time such as @1"),
+        ("push=3@1..2", "push does not change gradually; give a single start time such as @1"),
         ("torn=2", "0 to 1"),
         ("left:silent=2", "0 to 1"),
         ("drop=7", "0 to 1"),
         ("torn=much", "not a number"),
-        ("torn@never", "not a time of at least 0 s"),
-        ("torn@-1", "not a time of at least 0 s"),
-        ("drop=0.1@inf", "not a time of at least 0 s"),
+        ("torn@never", "not a valid time, expected at least 0 s"),
+        ("torn@-1", "not a valid time, expected at least 0 s"),
+        ("drop=0.1@inf", "not a valid time, expected at least 0 s"),
         ("silent=9", "no servo has this ID"),
         ("reboot=1.5", "no servo has this ID"),
     ],

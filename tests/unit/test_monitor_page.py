@@ -1,4 +1,4 @@
-"""The monitor page as text, without a terminal: sizes, malformed streams, states, keys, maps."""
+"""Test the monitor page as text: sizes, malformed streams, states, keys, maps."""
 
 import json
 import math
@@ -178,7 +178,7 @@ TEXTS = ["first", "second", "third"]
 
 def test_repeated_events_are_shown_once_and_in_order():
     feed = StreamState()
-    # This event arrives between the subscription and the repetition.
+    # This event arrives after the subscription and before the repeated events.
     give(feed, b"hand/event", told(3, 103.0, "third"))
     for seq in (1, 2, 3):
         give(
@@ -200,11 +200,11 @@ def test_the_commander_is_shown_during_its_lease():
     give(feed, b"hand/command", carried_out, 0.0)
     assert "note book commands the hand" in shown(feed, 4.9)
     assert "commands the hand" not in shown(feed, 5.1)
-    # Stop requires and takes no lease.
+    # A stop neither requires nor takes a lease.
     give(feed, b"hand/command", carried_out | {"command": "stop"}, 6.0)
     assert "commands the hand" not in shown(feed, 6.1)
     give(feed, b"hand/command", carried_out | {"client": ""}, 7.0)
-    assert "commands the hand" not in shown(feed, 7.1)  # an unnamed client may be this page
+    assert "commands the hand" not in shown(feed, 7.1)  # the unnamed client may be this page
     refused = carried_out | {"ok": False, "error": "grasp: arm first", "timestamp": 5.0}
     give(feed, b"hand/command", refused, 8.0)
     assert "refused   grasp: arm first (to note book)" in shown(feed, 8.0)
@@ -285,7 +285,7 @@ def test_key_sequences():
     ]
     assert keys.decode(b"\x1b") == []
     assert keys.decode(b"[") == []
-    assert keys.decode(b"D") == ["left"]  # one sequence in three reads
+    assert keys.decode(b"D") == ["left"]  # three reads complete one sequence
     keys.decode(b"\x1b")
     keys.settle()
     assert keys.decode(b"g") == ["g"]  # a lone Escape does not affect the next key
@@ -299,7 +299,7 @@ def test_resampling_equals_the_area_average():
     blocks = grid.reshape(22, 2, 11, 4).mean(axis=(1, 3))
     assert resample(grid, 22, 11) == pytest.approx(blocks, abs=1e-12)
     assert resample(grid, 88, 132) == pytest.approx(np.kron(grid, np.ones((2, 3))), abs=1e-12)
-    # For sizes that do not divide, the reference uses a common refinement.
+    # If the sizes do not divide evenly, the reference uses a common refinement.
     fine = np.kron(grid, np.ones((17, 9)))
     twin = fine.reshape(17, 44, 9, 44).mean(axis=(1, 3))
     assert resample(grid, 17, 9) == pytest.approx(twin, abs=1e-12)

@@ -1,4 +1,4 @@
-"""Soft tips in MuJoCo against the contact table, and a grip compared with our own plant."""
+"""Test soft tips in MuJoCo against the contact table, and a grip against our own plant."""
 
 import math
 import re
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.extended
 PAGE = Path(__file__).parents[2] / "docs" / "mujoco.md"
 SETTINGS = checked({"loop": {"clock": "virtual"}})
 RADIUS, FRICTION = SETTINGS.tip.radius, SETTINGS.simulation.tip_friction
-# A tip along x in front of a wall whose face is tilted about z.
+# This tip points along x at a wall whose face is tilted about z.
 SCENE = """<mujoco><option timestep="0.002" gravity="0 0 0" integrator="{integrator}"/>
 <default><geom contype="0" conaffinity="0"/><joint type="slide" damping="5"/></default><worldbody>
 <body><joint axis="1 0 0"/>{joints}
@@ -34,7 +34,7 @@ FREE = '<joint axis="0 1 0"/><joint axis="0 0 1"/>'
 def scene(
     tilt: float = 0.0, joints: str = "", integrator: str = "implicitfast", radius: float = RADIUS
 ) -> tuple[Any, Any]:
-    """Return a model and data with the tip just touching a face tilted by this angle [rad]."""
+    """Return a model and data with the tip just touching a face tilted by ``tilt`` [rad]."""
     away = RADIUS + 0.05
     place = {"x": away * math.cos(tilt), "y": away * math.sin(tilt), "degrees": math.degrees(tilt)}
     text = SCENE.format(joints=joints, integrator=integrator, radius=radius, **place)
@@ -73,7 +73,7 @@ def test_friction_is_a_cone_including_the_lateral_direction(used):
         bears = 2.0 * float(tips.table(d, 0.0).force) / d
         assert slid == pytest.approx(push / bears, rel=1e-3)
         assert data.qpos[2] / data.qpos[1] == pytest.approx(4.0 / 3.0, rel=1e-3)
-    else:  # the push in excess of friction moves it against a damping of 5 N·s/m
+    else:  # the excess push moves the face against a damping of 5 N·s/m
         speed = (push - FRICTION * press) / 5.0
         assert math.hypot(*data.qvel[1:]) == pytest.approx(speed, rel=0.01)
 

@@ -1,4 +1,4 @@
-"""The daemon with objects other than blocks: wedges, discs, a sheet, no object."""
+"""Test the daemon with objects other than blocks: wedges, discs, a sheet, no object."""
 
 import math
 from typing import Any
@@ -15,7 +15,7 @@ SLOW: dict[str, Any] = {"rate": 25.0}
 
 
 class Rig(SimulatedDaemon):
-    """A hand that is observed while holding."""
+    """A hand that is observed while it holds an object."""
 
     def grasp(self, force: float, seconds: float = 2.5) -> None:
         super().grasp(force)
@@ -100,7 +100,7 @@ def test_without_an_object_between_the_tips_the_hand_opens(force, frames):
         assert rig.state.reading.q == pytest.approx(rig.settings.hand.open_angle, abs=0.03)
         assert rig.warnings() == ["grasp"]
         assert 0.5 < worst < 4.0
-        assert "nothing between the tips" in next(
+        assert "no object between the tips" in next(
             text for *_, text in rig.events if "between" in text
         )
 
@@ -114,7 +114,7 @@ def test_a_declared_sheet_is_not_mistaken_for_a_missing_object():
 
 
 def test_a_small_disc_is_not_mistaken_for_another_tip():
-    """Its misfit hides more than half of d, although no declared uncertainty explains it."""
+    """The disc's misfit hides more than half of d, although no declared uncertainty covers it."""
     with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
         rig.grasp(8.0)
         assert rig.state.mode == "holding"

@@ -1,4 +1,4 @@
-"""Files of other users in place of this user's files are neither followed nor overwritten."""
+"""Test that another user's files in place of this user's are neither followed nor overwritten."""
 
 import os
 from collections.abc import Callable
@@ -54,7 +54,7 @@ def test_foreign_links_and_files_in_a_shared_folder_are_not_used(shared, strange
         named.symlink_to(victim)
     strangers(named)
     with pytest.raises(
-        PermissionError, match="a link that belongs" if linked else "to another user"
+        PermissionError, match="a link owned by" if linked else "owned by another user"
     ):
         write(named)
     assert victim.read_text() == "precious"
@@ -90,8 +90,8 @@ def test_a_file_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("mode", "told"),
     [
-        (0o777, "other users may write to it"),
-        (0o1777, "other users may write to it"),
+        (0o777, "other users can write to it"),
+        (0o1777, "other users can write to it"),
         (0o700, "belongs to user"),
         (None, "found a link"),
     ],
@@ -149,7 +149,7 @@ def test_a_runtime_folder_writable_by_others_is_refused_with_a_remedy(
     assert check_runtime_folder().fix == cure
     for words in (["emulate"], ["run", "--config", "hil"]):
         assert main(words) == 2
-        assert f"{folder}: other users may write to it (0777): {cure}" in capsys.readouterr().err
+        assert f"{folder}: other users can write to it (0777): {cure}" in capsys.readouterr().err
 
 
 def test_the_local_stop_falls_back_to_the_home_folder_and_reports_it(shared, monkeypatch, request):

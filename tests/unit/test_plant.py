@@ -1,4 +1,4 @@
-"""The plant's kernel: energy that no step increases, robustness, and relaxation of shear."""
+"""Test the plant's kernel: monotonic energy decay, robustness, and shear relaxation."""
 
 import math
 
@@ -116,8 +116,8 @@ def test_bristles_carry_shear_at_any_tilt_with_the_normal_force_of_the_springs(t
 
 @pytest.mark.parametrize("trial", range(24))
 def test_energy_never_increases_without_input(trial):
-    # Random scenes, masses, moduli and friction, with fingers thrown at the object, also beyond the
-    # rim; one trial in three uses a step ten times too long.
+    # The test uses random scenes, masses, moduli and friction, with fingers thrown at the object,
+    # also beyond the rim. One trial in three uses a step ten times too long.
     generator = np.random.default_rng(trial)
     hand = random_hand(generator, trial % 3 == 0)
     held = hand.plant.parameters.object_held
@@ -145,7 +145,7 @@ def test_energy_never_increases_without_input(trial):
 
 @pytest.mark.extended
 def test_the_state_stays_finite_for_random_commands_and_extreme_parameters():
-    # Uses the plant's own steps and, one time in three, steps ten times too long.
+    # The steps are the plant's own two times in three, and otherwise ten times too long.
     assert [wrong for wrong in map(abuse, range(12)) if wrong] == []
 
 
@@ -186,8 +186,9 @@ def test_creep_relaxes_a_stuck_shear_exponentially():
 
 
 def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
-    # Integrals of the springs' own friction: initially 1 − (1 − u/μd)², after each reversal twice
-    # that of half the distance, and after a closed loop the earlier value.
+    # The expected values are integrals of the springs' own friction. They follow 1 − (1 − u/μd)²
+    # initially, and twice this for half the distance after each reversal. A closed loop returns to
+    # the earlier value.
     def virgin(u: float) -> float:
         return 1.0 - (1.0 - min(u / (MU * DEPTH), 1.0)) ** 2
 

@@ -1,6 +1,6 @@
-"""The plant against SciPy's adaptive solver, and its order, for every kind of contact.
+"""Test the plant and its order of convergence against SciPy's adaptive solver.
 
-The smooth equations of motion are implemented again in plain NumPy: for a constant modulus,
+The smooth equations of motion are implemented independently in plain NumPy: for a constant modulus,
 sticking tips, and no damping except that of the tips and the palm. Contacts are geometric functions
 of the coordinates (q1, q2, x, y, φ), differentiated by complex steps; forces come from the closed
 form of the tips' energy.
@@ -64,7 +64,7 @@ class Contact:
         return np.array(columns).T
 
     def slide(self, x):
-        """Return the row of the touched body's velocity relative to the tip, along t."""
+        """Return the Jacobian row for the touched body's velocity relative to the tip, along t."""
         m = self.normal(x)
         t = np.array([-m[1], m[0]])
         point = tips(x)[self.finger] + self.way(x)
@@ -102,9 +102,9 @@ def on_face(finger, point, angle):
 
 
 def wedge(width, taper=0.0, height=0.060):
-    """Return a wedge's contacts; its width is at half the height, off the centre of mass."""
+    """Return a wedge's contacts; the width refers to half the height, not the centre of mass."""
     lean = 0.5 * taper
-    slope = height * math.tan(lean)  # half the length difference of the two parallel faces
+    slope = height * math.tan(lean)  # half the difference in length between the parallel faces
     middle = height * slope / (6.0 * width)
     return [
         on_face(0, np.array([-0.5 * width, middle]), -lean),
@@ -141,16 +141,16 @@ def each_other():
 
 @dataclass
 class Equations:
-    """Equations of five coordinates, their velocities, and a shear per contact and palm point."""
+    """Equations of motion for five coordinates, with a shear for each contact and palm point."""
 
     contacts: list
     inertias: np.ndarray
     currents: np.ndarray
     loss: float
     weight: np.ndarray
-    corners: np.ndarray | None = None  # in the object's frame; they rest on a palm at y = ``palm``
+    corners: np.ndarray | None = None  # in the object's frame, resting on a palm at y = ``palm``
     palm: float = 0.0
-    coupling: float = 1.0  # of a shear with d and θ; 0 for bristles
+    coupling: float = 1.0  # coupling of a shear with d and θ; 0 for bristles
 
     def __call__(self, _t, y):
         x, v = y[:5], y[5:10]

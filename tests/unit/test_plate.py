@@ -1,4 +1,4 @@
-"""The plate that presses an emulated tip: its text form, its motion, and refusals."""
+"""Test the plate that presses an emulated tip: text form, motion, and invalid input."""
 
 import math
 
@@ -10,7 +10,7 @@ from softfinger.daemon.simulation.sensor.simulated_tactile import StageTouch
 from tests.harness.paper_tip import TIP
 
 TABLE = ContactTable.build(TIP, Material.constant(0.3e6))
-FORCE = math.pi * 0.3e6 * 0.004**2  # N at 4 mm
+FORCE = math.pi * 0.3e6 * 0.004**2  # N, force at 4 mm
 
 
 def test_presses_are_parsed():
@@ -35,14 +35,14 @@ def test_a_plate_descends_holds_and_lifts_off():
     plate = Plate()
     assert plate(5.0) == (-0.001, 0.0, 0.0)
     plate.go(parse_presses("depth=4mm tilt=-10deg speed=5mm/s hold=1s", TABLE, 1.0)["left"], 10.0)
-    assert plate.arrives == pytest.approx(11.0)  # from 1 mm above the tip
+    assert plate.arrives == pytest.approx(11.0)  # starts 1 mm above the tip
     tilt = -math.radians(10.0)
     assert plate(10.5) == pytest.approx((0.0015, tilt, 0.0))
     assert plate.reached(10.99) is None
     assert plate(11.5) == pytest.approx((0.004, tilt, 0.0))
     reached = plate.reached(11.5)
     assert reached.d == 0.004
-    assert plate.reached(11.9) is None  # already returned
+    assert plate.reached(11.9) is None  # the plate has already returned
     assert plate(12.125) == pytest.approx((0.0015, tilt, 0.0))
     assert plate(12.5).d == -0.001
     assert plate(1e4) == (-0.001, 0.0, 0.0)
@@ -74,7 +74,7 @@ def test_a_plate_lifts_off_before_tilting_and_the_last_press_remains():
         ("depth=40mm", "expected at most 15.00 mm or 212.1 N"),
         ("force=1e5N", "expected at most"),
         ("depth=1mm tilt=90deg", "expected at most 0.00 mm"),
-        ("depth=1mm speed=0mm/s", "expected above 0"),
+        ("depth=1mm speed=0mm/s", "expected a number above 0"),
     ],
 )
 def test_impossible_presses_are_refused(words, told):

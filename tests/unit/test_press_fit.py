@@ -1,4 +1,4 @@
-"""Fitting contacts at known depths and tilts: tip model, modulus, ν and position."""
+"""Test fits of contacts at known depths and tilts: tip model, modulus, ν and position."""
 
 import math
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_the_true_tip_model_fits_best(tip):
     assert best.valid == 1.0
     assert best.d_error < 1e-4
     assert best.theta_error < math.radians(1.5)
-    assert best.force_error < 0.12  # mostly noise of the sum
+    assert best.force_error < 0.12  # mostly the noise of the sum
     if tip.physics == "solid":
         assert (best.tip.base, best.tip.face) == ("bonded", "sticking")
         assert best.tip.poisson == pytest.approx(0.48, abs=0.01)
@@ -117,7 +117,7 @@ def test_calibrate_law_names_the_tip_model(tmp_path, capsys):
     told = capsys.readouterr().out
     assert told.startswith("law: solid, bonded, frictionless, ν 0.4")
     assert "springs: E = " in told
-    assert "E alone at 1.2, 3.2, 4.2 mm: 0.2" in told
+    assert "E fitted separately at 1.2, 3.2, 4.2 mm: 0.2" in told
     assert "drifts" not in told
     assert "first presses read +10" in told
     assert "the rubber softens" in told

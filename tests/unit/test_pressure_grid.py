@@ -1,4 +1,4 @@
-"""The forward model: cell averages against plain integration, sums against closed forms."""
+"""Test the forward model: cell averages against plain integration, sums against closed forms."""
 
 import math
 
@@ -10,7 +10,7 @@ from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, tilts
 
 
 def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
-    """Return a cell's mean σ(ε): midpoint rule in y, Gauss in the angle x = R sin t."""
+    """Return a cell's mean σ(ε): midpoint rule in y, Gauss in the angle t of x = R sin t."""
     n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
     n_z = math.sqrt(1.0 - n_x**2 - n_y**2)
     cells = grid.on(TIP)
@@ -42,7 +42,7 @@ def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
 @pytest.mark.parametrize(
     ("d", "degrees", "azimuth"),
     [
-        (1e-5, 0.0, 0.0),  # a footprint smaller than a cell
+        (1e-5, 0.0, 0.0),  # the footprint is smaller than a cell
         (2e-4, 5.0, 1.0),
         (1e-3, 10.0, 0.3),
         (4e-3, 30.0, 0.7),
@@ -57,7 +57,7 @@ def test_cell_averages_for_all_kinds_of_cells(material, d, degrees, azimuth):
     touched = np.argwhere(p > 0.0)
     order = np.argsort(p[p > 0.0])
     allowed = 1e-5 if degrees < 30.0 else 1e-4 if degrees < 36.0 else 1e-3
-    # The weakest cells, which the outline cuts, and some of the others.
+    # Use the weakest cells, which the outline cuts, and some of the others.
     chosen = np.unique(np.concatenate([order[:25], order[:: max(1, len(order) // 15)]]))
     for row, col in touched[chosen]:
         expected = cell_mean(grid, material, d, tilt_x, tilt_y, row, col)

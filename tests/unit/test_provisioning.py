@@ -1,4 +1,4 @@
-"""Finding, identifying and configuring servos, on a line without a port."""
+"""Test finding, identifying and configuring servos, on an emulated line without a port."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -47,21 +47,21 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
 @pytest.mark.parametrize(
     ("settings", "found", "told"),
     [
-        # All as configured.
+        # Both servos are configured.
         (BOTH, [servo(1), servo(2)], []),
         (BOTH, [servo(1), servo(2), servo(9)], ["stranger 9@2000000"]),
-        # The correct ID at another rate is the expected servo.
+        # A correct ID at another rate identifies the expected servo.
         (
             BOTH,
             [servo(1, 57600), servo(2, 57600)],
             ["0: 57600 → 2000000 baud", "1: 57600 → 2000000 baud"],
         ),
-        # A single unexpected servo is the single missing one.
+        # If one servo is missing and one is unexpected, they are the same servo.
         (BOTH, [servo(1), servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
         (BOTH, [servo(1), servo(7)], ["1: ID 7 → 2"]),
         (OTHER_IDS, [servo(1, 57600)], ["0: ID 1 → 11, 57600 → 2000000 baud"]),
-        # The servo of a finger outside the scene is not the missing one; with factory settings at
-        # another rate it cannot be assigned.
+        # The servo of a finger outside the scene is not the missing one. With factory settings at
+        # another rate, it cannot be assigned.
         (ONLY_LEFT, [servo(2)], ["missing 0", "stranger 2@2000000"]),
         (ONLY_RIGHT, [servo(1)], ["missing 1", "stranger 1@2000000"]),
         (ONLY_RIGHT, [servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
@@ -80,7 +80,7 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         ),
         # An unpaced emulator replies at every rate.
         (BOTH, [servo(servo_id, rate) for servo_id in (1, 2) for rate in RATES], []),
-        # Garbled replies are left alone, and no servo gets an ID with garbled replies.
+        # Servos with garbled replies are not configured, and their IDs are not assigned.
         (BOTH, [servo(1, 57600), Garbled(1, 57600)], ["missing 0", "missing 1"]),
         (
             BOTH,
@@ -131,7 +131,7 @@ class Bus:
 
 @pytest.fixture
 def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Bus]:
-    """Return a function that creates buses for this test's lines."""
+    """Return a function that creates buses for the test's lines."""
 
     def make(**options: Any) -> Bus:
         bus = Bus(**options)
@@ -166,7 +166,9 @@ def test_a_search_recognises_servos_of_protocol_1(wired):
     found = search("line", (57600, HOME))
     assert (found.servos, found.old) == ((), (57600,))
     _, problems = bus.provision()
-    assert problems[0].startswith("a servo at 57600 baud: answers Protocol 1.0, expected 2.0: ")
+    assert problems[0].startswith(
+        "a servo at 57600 baud: replies in Protocol 1.0, expected Protocol 2.0: "
+    )
 
 
 def test_a_port_that_disappears_ends_a_search(wired, monkeypatch):
@@ -184,7 +186,7 @@ def test_two_factory_servos_are_configured_one_after_the_other(wired):
     bus.servos[1].silent = True
     assert bus.provision() == (
         named(LEFT, "57600 → 2000000 baud", *MODE_AND_DELAY),
-        [f"{RIGHT}: no answer at any rate: check its power and cable"],
+        [f"{RIGHT}: no reply at any baud rate: check its power supply and cable"],
     )
     assert bus.addresses() == [(1, HOME), (1, 57600)]
     bus.servos[1].silent = False
@@ -209,7 +211,12 @@ def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):
     ("fault", "register", "value", "done"),
     [
         ("overload=2", None, 0, f"{RIGHT}: rebooted because it had a hardware error: overload"),
-        ("", reg.TORQUE_ENABLE, 1, f"{LEFT}: torque switched off, because it locks the EEPROM"),
+        (
+            "",
+            reg.TORQUE_ENABLE,
+            1,
+            f"{LEFT}: torque switched off, because the EEPROM is locked while torque is on",
+        ),
         ("", reg.DRIVE_MODE, 0b1100, f"{LEFT}: drive mode 12 → 4"),
         ("", reg.STATUS_RETURN_LEVEL, 0, f"{LEFT}: status return level 0 → 2"),
     ],
@@ -229,7 +236,7 @@ def test_configured_registers(wired, fault, register, value, done):
 def test_failed_and_successful_configurations_are_both_reported(wired):
     bus = wired(factory=True)
     put_fault(bus.bus, "silent=2", 0.0)
-    missing = f"{RIGHT}: no answer at any rate: check its power and cable"
+    missing = f"{RIGHT}: no reply at any baud rate: check its power supply and cable"
     assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])
     _, problems = bus.provision(model="XL330-M288")
-    assert f"{LEFT}: is an XM430-W350, not an XL330-M288: set servos.model" in problems
+    assert f"{LEFT}: is an XM430-W350, expected an XL330-M288: set servos.model" in problems

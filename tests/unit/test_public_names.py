@@ -1,4 +1,4 @@
-"""The public names of the package: exported, documented with every field, and found by the site."""
+"""Test that the public names are exported, fully documented, and found by the site."""
 
 import ast
 import dataclasses
@@ -30,7 +30,7 @@ RECORDS = [name for name in NAMES if fields(getattr(softfinger, name)) and name 
 
 
 def listed(text: str) -> dict[str, str]:
-    """Names in the sections Attributes and Parameters of a docstring, and what is said of each."""
+    """Return the names in a docstring's Attributes and Parameters sections, with descriptions."""
     found = {}
     for section in re.findall(
         r"(?ms)^(?:Attributes|Parameters)\n-+\n(.*?)(?=^\w[^\n]*\n---|\Z)", text
@@ -96,7 +96,7 @@ def test_every_public_name_and_method_is_documented(name):
 
 
 def imported() -> list[tuple[str, str]]:
-    """Modules below softfinger that the pages import from, and the names."""
+    """Return the submodules of softfinger that pages import from, with the imported names."""
     pairs = {
         (module, name.strip())
         for path in CODE

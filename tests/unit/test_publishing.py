@@ -1,4 +1,4 @@
-"""Publication rates, and histograms of the loop's times, against NumPy and without allocation."""
+"""Test publication rates and loop-time histograms, against NumPy and without allocation."""
 
 import math
 import tracemalloc
@@ -23,7 +23,7 @@ class Listener:
 
     def __init__(self) -> None:
         self.ticks: dict[str, list[int]] = {"state": [], "stats": []}
-        self.frames: tuple[list[int], list[int]] = ([], [])  # frame numbers per finger
+        self.frames: tuple[list[int], list[int]] = ([], [])  # frame numbers of each finger
         self.rates: list[Rates] = []
         self.seq = 0
 
@@ -61,7 +61,7 @@ def test_each_topic_is_published_on_every_nth_tick_or_frame():
     assert ticks["state"] == list(range(5, 2001, 5))
     assert ticks["stats"] == [3, 503, 1003, 1503]
     assert not set(ticks["state"]) & set(ticks["stats"])
-    for frames in listener.frames:  # every fourth of 100 Hz, i.e. 25 Hz
+    for frames in listener.frames:  # every fourth frame of 100 Hz, i.e. 25 Hz
         assert [seq // 4 for seq in frames] == list(range(len(frames)))
         assert len(frames) == pytest.approx(100, abs=1)
 
@@ -100,7 +100,7 @@ def test_quantiles_match_the_samples_within_one_bin(count):
     for j, name in enumerate(TIMES):
         for share, told in zip(QUANTILES, spreads[name], strict=False):
             true = np.quantile(rows[:, j], share, method="inverted_cdf")
-            if true < 2.0**-30:  # one bin for all times below a nanosecond
+            if true < 2.0**-30:  # all times below a nanosecond share one bin
                 assert told <= 2.0**-29, (name, share)
             else:
                 assert true * (1 - 1e-12) <= told <= true * (1 + 1 / 31), (name, share)

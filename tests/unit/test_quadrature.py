@@ -1,4 +1,4 @@
-"""One tip's closed forms and reference integrals, against NumPy in other coordinates."""
+"""Test a tip's closed forms and reference integrals against NumPy in other coordinates."""
 
 import math
 from fractions import Fraction
@@ -91,7 +91,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
         usual, finer = np.empty((2, 5, 1))
         ratios_at(gauss_rule(), circle_rule(material.degree), parts, *place, usual)
         ratios_at(gauss_rule(40), circle_rule(40), parts, *place, finer)
-        # Scaled by F tan θ because ∂F/∂θ may pass through zero.
+        # Scaled by F tan θ, because ∂F/∂θ may pass through zero.
         scale = np.abs(finer)
         scale[3] = max(scale[3], scale[0])
         assert np.all(np.abs(np.subtract(usual, finer)) <= tolerance * scale)
@@ -104,7 +104,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
 )
 @settings(max_examples=60)
 def test_every_admissible_material_has_its_minimum_energy_upright(slopes, depth, share):
-    """Tangent moduli are arbitrary positive Bernstein polynomials, for laws of all curvatures."""
+    """The tangent moduli are random positive Bernstein polynomials, for laws of all curvatures."""
     n = len(slopes) - 1
     modulus = np.polynomial.Polynomial([0.0])
     for k, slope in enumerate(slopes):
@@ -152,7 +152,8 @@ def test_tilt_limit():
     assert TIP.theta_limit(0.02) == TIP.theta_limit(1.0) == 0.0
     assert math.isnan(TIP.theta_limit(math.nan))
     assert all(isinstance(TIP.theta_limit(d), float) for d in (0, 0.004, np.array(0.03)))
-    # Its cosine is √(2ad − d²)/a, accurate in all digits even if asin((a − d)/a) is not.
+    # The cosine of the limit is √(2ad − d²)/a, accurate in all digits even if asin((a − d)/a) is
+    # not.
     d = 10.0 ** np.arange(-17.0, -2.0)
     np.testing.assert_allclose(
         np.pi / 2 - Fingertip(1.0).theta_limit(d),

@@ -1,4 +1,4 @@
-"""The texts and pictures of the stream's records at a prompt and in a notebook."""
+"""Test the text and pictures of stream records, at a prompt and in a notebook."""
 
 import re
 from typing import Any
@@ -62,7 +62,7 @@ def test_a_frame_is_a_line():
     cells = np.zeros((3, 4))
     cells[1, 2] = 6000
     assert repr(frame(cells)) == "TactileFrame: left, 3 × 4 cells, 12.0 kPa at most"
-    assert repr(frame(cells, valid=False)).endswith("12.0 kPa at most, the board is lost")
+    assert repr(frame(cells, valid=False)).endswith("12.0 kPa at most, the board is disconnected")
 
 
 def test_a_state_is_a_table_in_a_notebook():
@@ -77,7 +77,7 @@ def test_a_state_is_a_table_in_a_notebook():
 
 
 def drawn(found: TactileFrame) -> tuple[ElementTree.Element, np.ndarray]:
-    """The picture, and the opacity of each cell that its paths fill; row 0 is its lowest."""
+    """Return the picture and the opacity of each cell that its paths fill; row 0 is the lowest."""
     picture, _ = ElementTree.fromstring(f"<p>{found._repr_html_()}</p>")
     cells = np.zeros((found.rows, found.cols))
     for path in picture:

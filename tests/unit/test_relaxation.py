@@ -1,4 +1,4 @@
-"""Relaxing tips: the plant against the integrals of its Prony terms, and its energy."""
+"""Test relaxing tips: the plant against the integrals of its Prony terms, and its energy."""
 
 import re
 from pathlib import Path
@@ -99,7 +99,7 @@ def test_relaxing_tips_do_not_generate_energy():
 
 @pytest.mark.parametrize("strengths", [(0.0, 0.15, 0.25), (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)])
 def test_press_and_hold_gives_the_strengths(strengths):
-    """Noisy frames at 100 Hz from a separate ODE; 4 ms are too short for these frames."""
+    """The frames (100 Hz, noisy, from a separate ODE) cannot resolve the shortest time constant."""
     t = np.arange(-1.0, 6.0, 0.01)
     lasting = 12.0 * np.clip(t / 0.1, 0.0, 1.0) ** 1.6
 
@@ -124,7 +124,7 @@ def test_too_short_a_hold_is_refused():
 
 
 def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
-    """Return true force over 8 N after 1 s of a hold and at its end, and the warnings."""
+    """Return the true force divided by 8 N, 1 s into a hold and at its end, and the warnings."""
     sections: dict[str, dict[str, Any]] = {name: dict(values) for name, values in tip.items()}
     sections.setdefault("simulation", {})["tip_relaxation"] = STRENGTHS
     if aware:

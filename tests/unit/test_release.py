@@ -1,4 +1,4 @@
-"""A release: its changelog section, and one version in all files that state it."""
+"""Test a release: its changelog section, and the same version in all files that state it."""
 
 import datetime
 import importlib.util

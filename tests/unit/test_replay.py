@@ -1,4 +1,4 @@
-"""Recording files, and their replay on virtual time."""
+"""Test recording files and their replay in virtual time."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def test_without_repetition_the_replay_ends_with_an_invalid_frame(tmp_path):
 
 def test_a_folder_of_frames_is_read_in_numerical_order(tmp_path):
     for k in range(5):
-        np.save(tmp_path / f"frame{k * 3}.npy", FRAMES[k])  # frame12 after frame9
+        np.save(tmp_path / f"frame{k * 3}.npy", FRAMES[k])  # frame12 follows frame9
     recording = load_recording(tmp_path, 1.0, 50.0)
     assert np.array_equal(recording.counts, FRAMES)
     assert recording.t.tolist() == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])
@@ -90,7 +90,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
     ("held", "told"),
     [
         ({"other": FRAMES[0]}, r"no array 'frames', but other \(4, 6\)"),
-        ({"a": FRAMES, "b": FRAMES}, r"but a \(5, 4, 6\), b \(5, 4, 6\): name the array"),
+        ({"a": FRAMES, "b": FRAMES}, r"but a \(5, 4, 6\), b \(5, 4, 6\); rename the array"),
         ({"other": np.array(["x"])}, "no array 'frames'"),
         ({}, "found no array"),
         ({"frames": FRAMES[0]}, r"expected \[n, rows, cols\]"),
@@ -99,7 +99,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
         ({"frames": -FRAMES.astype(float)}, "outside 0 to 65535"),
         ({"frames": FRAMES * np.nan}, "outside 0 to 65535"),
         ({"frames": FRAMES * 1e305}, "outside 0 to 65535"),
-        ({"frames": FRAMES, "t": np.zeros(5)}, "must increase"),
+        ({"frames": FRAMES, "t": np.zeros(5)}, "expected increasing times"),
         ({"frames": FRAMES, "t": np.arange(4)}, "5 numbers"),
         ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: not finite"),
         ({"frames": FRAMES, "live": np.ones(3)}, "live: found shape"),
@@ -121,5 +121,5 @@ def test_unreadable_files_are_reported(tmp_path):
         load_recording(tmp_path / "bad.npz", 1.0, 1.0)
     with pytest.raises(RecordingError, match=r"no \.npy file"):
         load_recording(tmp_path, 1.0, 1.0)
-    with pytest.raises(TactileError, match="found none for the left finger"):
+    with pytest.raises(TactileError, match="found no file for the left finger"):
         replay("", VirtualClock())

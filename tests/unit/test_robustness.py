@@ -1,4 +1,4 @@
-"""Hands that differ from their settings, measured by the plant's true values."""
+"""Test hands that differ from their settings, evaluated with the plant's true values."""
 
 import math
 
@@ -73,7 +73,7 @@ def test_joint_friction_is_estimated_during_the_approach(friction, stiction):
         grip.loop.advance(0.1)
         grip.command("grasp", force=6.0)
         assert grip.until("holding", 4.0)
-        # Static friction that remains while the joint starts to move, plus its damping.
+        # The static friction that remains while the joint starts to move, plus the joint's damping.
         shown = grip.estimator.grasp.free_torque
         assert (shown > friction + 0.5 * stiction).all()
         assert (shown < friction + stiction + 0.025).all()
@@ -88,7 +88,7 @@ def test_equal_seeds_give_equal_hands():
 
 
 def frames(zero: float, cells: int = 32, pressed: int = 200) -> np.ndarray:
-    """Return counts of a 20 mm tip indented by 3 mm, with a zero offset."""
+    """Return the counts for a 20 mm tip indented by 3 mm, with a zero offset."""
     at = (np.arange(cells) - 0.5 * (cells - 1)) * 0.058 / cells
     inside = np.hypot(*np.meshgrid(at, at)) < 10.5e-3
     return np.where(inside, pressed + zero, zero).astype(np.uint16)

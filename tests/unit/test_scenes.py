@@ -1,4 +1,4 @@
-"""The complete pipeline for each kind of scene, with its servos and sensors."""
+"""Test the complete pipeline for each kind of scene, with its servos and sensors."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ state_message = message_maker(STATE)
 
 
 def holding_demo(daemon: Daemon) -> list[Event]:
-    """Run the demo until it holds; return it with its further events."""
+    """Run the demo until the hand holds the object; return the list of later events."""
     advance_to(daemon, "holding", 5.0)
     return heard(daemon)
 
@@ -28,7 +28,7 @@ def test_the_demo_of_a_simulated_hand_continues_after_a_fault_and_reports_it(mak
     events = holding_demo(daemon)
     daemon.loop._fail("made up")
     daemon.loop.advance(6.0)
-    again = "on a simulated hand the task clears the fault and restarts in 2 s"
+    again = "the simulated hand's task clears the fault and restarts in 2 s"
     assert events[:6] == [
         ("info", "mode", "holding → fault"),
         ("error", "servos.bus", "made up"),
@@ -56,7 +56,9 @@ def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
     daemon.loop.advance(5.0)
     told = [text for _, kind, text in events if kind == "task"]
     assert len(told) == 3
-    assert told[1].startswith("clear: servos: hardware error reported by left; on a simulated hand")
+    assert told[1].startswith(
+        "clear: servos: hardware error reported by left; the simulated hand's task"
+    )
     servos.read = really
     advance_to(daemon, "holding", 6.0)
 
@@ -64,9 +66,9 @@ def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
 def test_a_demo_with_an_endless_step_restarts(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
-    daemon.loop._task._end_mode = "moving"  # a mode that is never reached
+    daemon.loop._task._end_mode = "moving"  # the task never reaches this mode
     advance_to(daemon, "disarmed", 13.0)
-    assert events[0][2].startswith("still holding after 10 s; on a simulated hand the task stops")
+    assert events[0][2].startswith("still holding after 10 s; the simulated hand's task stops")
     advance_to(daemon, "holding", 6.0)
 
 
@@ -115,7 +117,7 @@ def test_one_finger_presses_on_a_fixed_object(make):
     assert daemon.loop.state.contacts[0].force == pytest.approx(6.0, rel=0.05)
     assert daemon.loop.state.contacts[1].force == 0.0
     assert not daemon.loop.state.object.valid
-    with pytest.raises(Refused, match="needs two fingers"):
+    with pytest.raises(Refused, match="requires two fingers"):
         command(daemon, "rotate", angle=0.1)
 
 
@@ -135,7 +137,7 @@ def test_servos_without_sensors_move_but_do_not_grasp(make):
     command(daemon, "arm")
     command(daemon, "move", left=-0.1)
     advance_to(daemon, "armed", 3.0)
-    with pytest.raises(Refused, match="needs a tactile sensor"):
+    with pytest.raises(Refused, match="requires a tactile sensor"):
         command(daemon, "grasp")
 
 
@@ -166,4 +168,4 @@ def test_a_demo_ended_by_a_command_restarts(make):
     assert daemon.loop.state.mode == "disarmed"
     command(daemon, "demo")
     advance_to(daemon, "rotating", 8.0)
-    assert "defines no task" in refusal(make(), "demo")
+    assert "does not define a task" in refusal(make(), "demo")

@@ -1,4 +1,4 @@
-"""The stream's schema: sent messages match it, byte for byte, and its page is up to date."""
+"""Test that sent messages match the schema byte for byte, and that the schema page is current."""
 
 import dataclasses
 import json

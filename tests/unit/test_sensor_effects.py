@@ -1,4 +1,4 @@
-"""Effects of the simulated sensor on the pressure: each operator against plain NumPy."""
+"""Test the simulated sensor's effects on the pressure, each against plain NumPy."""
 
 import math
 from dataclasses import replace
@@ -28,8 +28,8 @@ def counts(model, contact, t=0.0):
 def test_without_defects_the_forward_model_is_rounded():
     model = sensor()
     for contact in CONTACTS:
-        # Cells between two counts may be rounded either way. The model has fewer points, which
-        # gives 1e-4 of the modulus at the outline.
+        # A cell between two counts may be rounded either way. The model has fewer points, which
+        # gives an error of 1e-4 of the modulus at the outline.
         signal = 0.2 * model.grid.pressure(TIP, LINEAR, *contact)
         np.testing.assert_allclose(counts(model, contact), signal, rtol=0, atol=0.5 + 6.0)
     assert not counts(model, (0.0, 0.2, -0.1)).any()
@@ -64,7 +64,7 @@ def test_each_cell_has_its_own_gain_and_dead_cells_read_zero():
 
 @pytest.mark.parametrize("width", [1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
 def test_blur_is_the_continuous_convolution(width):
-    # A grid smaller than the footprint: pressure beyond its edge also spreads onto it.
+    # The grid is smaller than the footprint: pressure beyond the grid's edge also spreads onto it.
     blurred = SensorGrid(16, 20, PITCH, (3e-4, 5.3e-3), blur=width)
     model = sensor(replace(blurred, blur=0.0), blur=width)
     for contact in CONTACTS:
@@ -89,7 +89,7 @@ def test_hysteresis_affects_only_unloading_and_loops_close():
     assert force(0.0038) > 1.03
     assert force(0.002) == pytest.approx(1.1, abs=0.005)
     assert 1.0 < force(0.0021) < 1.07  # reloading within the loop
-    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # the loop is closed
+    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # the hysteresis loop is closed
     assert force(0.006) == pytest.approx(1.0, abs=1e-9)
     assert not counts(model, (0.0, 0.0, 0.0)).any()
 
@@ -201,7 +201,7 @@ def test_offset_drift_has_the_configured_deviation_and_time_constant():
     offset = np.zeros((60, 60))
     rng = np.random.default_rng(2)
     sensor_model.drift(offset, 50.0, 60.0, 0.01, rng.standard_normal(offset.shape))
-    # Initially a random walk: deviation · √(2 t / time).
+    # The drift is initially a random walk with deviation · √(2 t / time).
     assert offset.std() == pytest.approx(50.0 * math.sqrt(2 * 0.01 / 60.0), rel=0.05)
     for _ in range(40):
         sensor_model.drift(offset, 50.0, 60.0, 20.0, rng.standard_normal(offset.shape))
@@ -217,7 +217,7 @@ def test_crosstalk_is_a_fraction_of_both_line_means():
     signal = counts(sensor(), CONTACTS[1])
     expected = signal + 0.3 * (signal.mean(axis=0) + signal.mean(axis=1)[:, None])
     np.testing.assert_allclose(counts(model, CONTACTS[1]), expected, atol=1.01)
-    assert expected[0].max() > 100.0  # a ghost away from the contact
+    assert expected[0].max() > 100.0  # the ghost image away from the contact
 
 
 @pytest.mark.parametrize("least", [0, 3])
@@ -279,7 +279,7 @@ def frame(grid: SensorGrid, d: float, tilt: float, curvature: float) -> np.ndarr
 
 
 def literal(d: float, tilt: float, radius: float, rotation: float, parts: int = 24) -> np.ndarray:
-    """Return mean pressure on 44 × 44 cells of ``parts``² points, with a rotated sensor."""
+    """Return the mean pressure on 44 × 44 rotated cells, each sampled at ``parts``² points."""
     at = (np.arange(44 * parts) + 0.5) * PITCH / parts - 0.029
     sensor_x, sensor_y = np.meshgrid(at, at)
     x = math.cos(rotation) * sensor_x - math.sin(rotation) * sensor_y

@@ -1,4 +1,4 @@
-"""Measurement faults during a grip are named and rejected, and have no effect on the true force."""
+"""Test that measurement faults during a grip are rejected and do not affect the true force."""
 
 import math
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def test_a_measurement_fault_is_named_and_has_no_effect(lie: str) -> None:
         assert hand.mode == mode
         if mode == "holding":
             assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.1)
-        if mode == "fault":  # like missing frames, because no sensor is valid
+        if mode == "fault":  # as for missing frames, because no sensor is valid
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 

@@ -1,4 +1,4 @@
-"""The emulated servo bus: published exchanges byte for byte, reply rules, faults on the line."""
+"""Test the emulated servo bus: published exchanges byte for byte, reply rules, line faults."""
 
 import struct
 from typing import Any

@@ -1,6 +1,6 @@
-"""Requirements for every servo backend in each operating mode, simulated and Dynamixel.
+"""Test requirements for every servo backend in each operating mode, simulated and Dynamixel.
 
-The same tests run for both; to test another backend, add it to ``RIGS``.
+The same tests run for both backends; to test another one, add it to ``RIGS``.
 """
 
 import math
@@ -38,7 +38,7 @@ class Rig(Protocol):
     clock: Clock
 
     def torque(self) -> list[bool]:
-        """Return whether each motor is driven, according to the servos themselves."""
+        """Return True for each motor that is driven, as reported by the servos themselves."""
 
     def close(self) -> None:
         """Close the backend."""
@@ -65,7 +65,7 @@ class SimulatedRig:
 class DynamixelRig:
     """The Dynamixel backend with the SDK and an emulated bus on the same clock.
 
-    Bytes are transferred immediately, without a pty, so the load of the machine has no effect.
+    Bytes are transferred immediately, without a pty, so the machine's load has no effect.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ def test_torque_off_and_close_release_the_joints(make, mode):
 def test_a_finger_outside_the_scene_stays_zero(make, mode):
     rig = make(mode, scene={"fingers": ("right",)})
     if isinstance(rig, DynamixelRig):
-        put_fault(rig.bus, "silent=1", 0.0)  # this servo is not addressed
+        put_fault(rig.bus, "silent=1", 0.0)  # the test does not address this servo
     armed(rig)
     reading = ticks(rig, Goal(q=[0.1, -0.1], current=[0.4, 0.4]), 0.4)[-1]
     assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0
@@ -225,14 +225,14 @@ def test_a_finger_outside_the_scene_stays_zero(make, mode):
 def test_a_model_without_current_sensing_only_supports_position_mode(make, mode):
     rig = make(mode, servos={"model": "XL430-W250"})
     if mode != "position":
-        with pytest.raises(ServoError, match=f"XL430-W250 has no {mode} mode"):
+        with pytest.raises(ServoError, match=f"XL430-W250 does not support {mode} mode"):
             rig.servos.connect()
         return
     armed(rig)
     assert ticks(rig, Goal(q=[0.08, -0.1]), 0.5)[-1].q == pytest.approx([0.08, -0.1], abs=0.01)
 
 
-# The control loop of current mode, and the checks of position mode.
+# Current mode has its own control loop, and position mode has its own checks.
 
 
 def test_the_control_loop_of_current_mode():
@@ -247,12 +247,14 @@ def test_position_limits_that_exclude_the_joint_range_are_reported(monkeypatch):
     rig = DynamixelRig(monkeypatch, servos={"mode": "position"})
     table = rig.bus.servos[1].table
     table.set(reg.MAX_POSITION_LIMIT, 2100)
-    with pytest.raises(ServoError, match=r"servo 2 .*max position limit is 2100, the joint needs"):
+    with pytest.raises(
+        ServoError, match=r"servo 2 .*max position limit is 2100, the joint requires"
+    ):
         rig.servos.connect()
     table.set(reg.MAX_POSITION_LIMIT, 4095)
     rig.servos.connect()
     notices = [each.text for each in rig.servos.notices]
-    assert notices.count("position mode does not limit its current") == 2
+    assert notices.count('servos.mode = "position" does not limit the current of the servo') == 2
     rig.close()
 
 

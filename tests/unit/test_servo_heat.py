@@ -1,4 +1,4 @@
-"""Servo temperature: prediction against an ODE solver, and reactions with unknown constants."""
+"""Test servo temperature: prediction against an ODE solver, reactions with unknown constants."""
 
 from typing import Any
 
@@ -141,7 +141,7 @@ def test_servo_constants_are_identified_from_a_hold(tmp_path, monkeypatch, capsy
     assert told == pytest.approx(t, rel=0.05)
     follow(law(state).array, 1.0, 0.5, 25.0)
     state.x[:3] = 25.0
-    # This prediction uses the constants of the model.
+    # This prediction uses the model's constants.
     assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2
 
 
@@ -149,11 +149,11 @@ def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
     profile = tmp_path / "my.toml"
     profile.write_text("")
     assert main(["calibrate", "heat", str(profile), "--recording", str(RECORDING)]) == 1
-    assert "found 0 °C of warming, expected at least 8 °C" in capsys.readouterr().err
+    assert "found 0 °C of temperature rise, expected at least 8 °C" in capsys.readouterr().err
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
-    """Grip with servos that soon overheat, at half the usual frame rate."""
+    """Grip with servos that quickly overheat, at half the usual frame rate."""
     sections |= {"simulation": {"servo_heat": FAST, "ambient": 35.0}, "tactile": {"rate": 50.0}}
     hand = SimulatedDaemon(sections)
     hand.grasp(force)
@@ -193,7 +193,7 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
     ],
 )
 def test_if_the_load_needs_the_force_the_configured_action_is_reported_and_taken(action, mode):
-    # Friction at 24 N just carries this load, so a smaller force would drop it.
+    # At 24 N, friction can just carry this load, so a smaller force would drop the object.
     control = {"object_load": 23.5}
     with hot(24.0, 0.0, control=control, safety={"heat_action": action}) as hand:
         for _ in range(90):
@@ -203,6 +203,8 @@ def test_if_the_load_needs_the_force_the_configured_action_is_reported_and_taken
         hand.run(2.0)
         assert hand.mode == mode
         (text,) = [text for level, text in heat_events(hand) if level == "error"]
-        assert text.endswith(f"and the load does not allow a weaker grip: {action}")
+        assert text.endswith(
+            f"and the load does not allow a lower grip force; safety.heat_action = {action}"
+        )
         if action == "hold":
             assert hand.state.fault_name == "servos.temperature"

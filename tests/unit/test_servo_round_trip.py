@@ -1,4 +1,4 @@
-"""Any instruction through our packet handler and the emulated bus equals direct table access."""
+"""Test instructions through our packet handler and the bus against direct table access."""
 
 import dynamixel_sdk as sdk
 import numpy as np
@@ -15,7 +15,7 @@ ADDRESSES = st.one_of(
     st.integers(0, 663),
     st.integers(640, 663),  # reads extend beyond the end here
 )
-# FF and FD are frequent, to require stuffing; small numbers are frequent, to be valid.
+# FF and FD are frequent so that stuffing is needed, and small numbers because they are valid.
 DATA = st.one_of(
     st.lists(st.sampled_from([0xFF, 0xFD, 0, 1, 5, 100]), min_size=1, max_size=20).map(bytes),
     st.binary(min_size=1, max_size=20),
@@ -33,15 +33,15 @@ STEPS = st.one_of(
 
 
 def placed(angles: tuple[float, float]) -> ServoBus:
-    # The status and ID registers are protected by the check below, so the servos stay reachable.
+    # The check below protects the status and ID registers, so the servos stay reachable.
     return make_bus("XM430-W210", for_daemon=True, counts=[angle / RADIAN for angle in angles])
 
 
 def out_of_reach(address: int, data: bytes) -> bool:
-    """Return True if a write would change which servo replies to which ID, unlike direct access."""
+    """Return True if a write could change which servos reply; such writes are not compared."""
     span = range(address, address + len(data))
     kept = (reg.ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
-    # indirect addresses could refer to them
+    # Indirect addresses could refer to these registers.
     return any(a in span for a in kept) or address >= 168
 
 

@@ -1,4 +1,4 @@
-"""Settings: profiles are loaded, and all their errors are in one report."""
+"""Test settings: profiles are loaded, and all their errors are in one report."""
 
 import json
 import tomllib
@@ -94,7 +94,7 @@ def test_an_unknown_name_is_reported_with_the_known_ones():
     with pytest.raises(SettingsError) as caught:
         load(Path("hill"))
     assert str(caught.value) == (
-        f"hill: no such profile; expected a file or one of {', '.join(names())}"
+        f"hill: profile not found; expected a file or one of {', '.join(names())}"
     )
 
 
@@ -159,7 +159,7 @@ def test_wrong_values_do_not_hide_contradictions_between_other_keys(tmp_path):
         "hand.open_angle.1",
         "tip.radius",
         "hand.q_max",
-        "servos.ids",  # and not safety.d_max, which was compared with another radius
+        "servos.ids",  # without safety.d_max, which was compared with another radius
     ]
 
 
@@ -217,7 +217,9 @@ def test_a_missing_or_binary_file_is_reported(tmp_path):
         load(path)
     with pytest.raises(SettingsError, match=r"absent\.toml: can't be read"):
         load(tmp_path / "absent.toml")
-    with pytest.raises(SettingsError, match=r"No such file .*; `hil` alone selects"):
+    with pytest.raises(
+        SettingsError, match=r"No such file .*; `hil` without path and suffix selects"
+    ):
         load(tmp_path / "config" / "hil.toml")
 
 
@@ -274,7 +276,10 @@ def test_an_unknown_model_is_reported_with_all_other_errors(tmp_path):
         ("[tactile]\nrate = 1e300", "tactile.rate: found 1e+300, expected less than or equal to"),
         ("[loop]\nrate = 1979-05-27", "loop.rate: found 1979-05-27, expected a valid number"),
         ('"\\u001b[31m" = 1', "?[31m: unknown key"),
-        ("[safety]\nframe_age_hold = 20.0", "safety.frame_age_hold: found 20, expected below"),
+        (
+            "[safety]\nframe_age_hold = 20.0",
+            "safety.frame_age_hold: found 20, expected a value below",
+        ),
         (
             '[control]\nlaw = "upright"\ndither_torque = 3.0',
             "control.dither_torque: found 3 N·m, expected at most 2.136 N·m",
@@ -351,11 +356,11 @@ def test_addresses_outside_this_machine_require_keys(tmp_path):
     [
         ([], ""),
         (["control.force_default=24", "safety.d_max=0.007"], "control.force_default: found 24 N, "
-         "which displaces the tip by 7.27 mm"),
+         "which compresses the tip by 7.27 mm"),
         (["task.name=demo", "task.force=26", "safety.current_max=1"], "task.force: found 26 N, "
-         "expected at most 22.2 N, the force of safety.current_max = 1 A on this finger"),
+         "expected at most 22.2 N, the force at safety.current_max = 1 A on this finger"),
         (["servos.model=XL330-M288"], "safety.force_max: found 30 N, which allows grips of 27 N, "
-         "expected at most the 6.5 N at which XL330-M288 stalls on this finger"),
+         "expected at most 6.5 N (stall force of XL330-M288 on this finger)"),
         (["servos.model=XL330-M288", "servos.backend=none"], ""),
     ],
 )  # fmt: skip

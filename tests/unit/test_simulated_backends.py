@@ -1,4 +1,4 @@
-"""Servos and sensors of the simulated hand on a virtual clock, and arrival times of frames."""
+"""Test the simulated hand's servos and sensors on a virtual clock, and frame arrival times."""
 
 import math
 from itertools import pairwise
@@ -63,7 +63,7 @@ def test_goals_are_whole_counts():
 
     goal_q, bound = bench.hand.plant.goals.q, bench.hand.plant.goals.current
     np.testing.assert_allclose(goal_q / COUNT, np.round(0.1003 / COUNT), rtol=1e-12)
-    # A limit is rounded down so that it is never exceeded.
+    # A limit is rounded down, so that the servo never exceeds it.
     np.testing.assert_allclose(bound / CURRENT_UNIT, math.floor(0.3 / CURRENT_UNIT), rtol=1e-12)
 
 

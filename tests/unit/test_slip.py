@@ -1,4 +1,4 @@
-"""The grip: reactions to external loads, missing frames, and a single finger."""
+"""Test the grip's reactions to external loads, missing frames, and a single finger."""
 
 import math
 
@@ -22,7 +22,7 @@ FRICTION = 0.05 / 0.03  # N, load that joint friction can hide at a moment arm o
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
 def test_a_push_beyond_the_margin_is_held_with_more_force(sections):
-    """The push is away from the palm; towards it the object wedges and torques hardly change."""
+    """The push is away from the palm; a push towards it would hardly change the torques."""
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
         with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
@@ -49,7 +49,8 @@ def test_the_grip_force_decreases_after_the_load_is_removed():
         hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
-        # If the load is removed while the joints close, part of it is attributed to a stiffer tip.
+        # If the load is removed while the joints close, part of the change is attributed to a
+        # stiffer tip.
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.1)
 
 
@@ -123,7 +124,7 @@ class GripUnderLoad:
 
 
 def test_a_load_is_detected_only_beyond_joint_friction():
-    watched = GripUnderLoad(friction_speed=1e6)  # no correction for the friction of closing joints
+    watched = GripUnderLoad(friction_speed=1e6)  # no correction for friction while closing
     watched.run(1.5, 500, holding=False)
     watched.grip.begin_holding()
     assert watched.run(1.5, 500) == FORCE
@@ -150,7 +151,7 @@ GIVES_WAY = -0.024  # rad/s, one count
 
 def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     watched = at_rest()
-    # Without joint motion it is a frame error, and a load within friction is harmless.
+    # Without joint motion, a jump is a frame error, and a load within the friction is harmless.
     assert watched.run(3.0 * FRICTION, 1) == FORCE
     watched = at_rest()
     assert watched.run(0.8 * FRICTION, 1, speed=GIVES_WAY) == FORCE
@@ -158,7 +159,7 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
     assert state.grip_force > 1.15 * (FORCE + 10.0), "must take effect on the same tick"
-    # At most the sum of torque constant error, friction and load.
+    # The limit is the sum of torque constant error, friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9
     # The measured force rises, so the controller now holds the force set by the reflex.
@@ -194,7 +195,7 @@ def test_shear_of_solid_tips_reveals_a_load(kind):
 
 
 def test_a_load_on_one_joint_alone_is_not_a_sudden_load():
-    """It is caused by a current measurement fault or a failed joint."""
+    """Only a current measurement fault or a failed joint causes a load on one joint alone."""
     watched = at_rest()
     for torque in (0.3, -0.3, 0.3):
         watched.held.torque_residual = [0.0, torque]
@@ -207,7 +208,7 @@ def test_a_load_on_one_joint_alone_is_not_a_sudden_load():
     ("shown", "raised"), [((0.3, 0.3), True), ((0.6, 0.0), False), ((0.6, -0.2), False)]
 )
 def test_a_turn_seen_by_one_tip_alone_is_ignored(shown, raised):
-    """The image of this tip is mirrored or shifted."""
+    """One tip's image is mirrored or shifted."""
     watched = at_rest()
     watched.held.unexplained_rotation = list(shown)
     assert (watched.run(0.0, 1) > FORCE) == raised
@@ -215,7 +216,7 @@ def test_a_turn_seen_by_one_tip_alone_is_ignored(shown, raised):
 
 @pytest.mark.parametrize("force", [5.0, 10.0])
 def test_current_noise_is_not_a_load_but_does_not_hide_one(force):
-    """30 mA on each joint for a minute; a load towards the palm is the hardest to detect."""
+    """The noise is 30 mA on each joint, and a load towards the palm is the hardest to detect."""
     rng = np.random.default_rng(1)
     watched = at_rest(force)
     watched.held.load_arm, watched.held.load_curvature = 0.025, 0.02 / force

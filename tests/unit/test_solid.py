@@ -1,4 +1,4 @@
-"""Solid rubber tips: table, frames, estimation, and a hand with such tips."""
+"""Test solid rubber tips: table, frames, estimation, and a hand with such tips."""
 
 import json
 import math
@@ -124,7 +124,7 @@ def test_the_estimate_reaches_its_bound_for_any_shear(tip, counts):
                 assert [found.shear_x, found.shear_y] == pytest.approx(shear, rel=0.01, abs=0.1)
                 error = [found.d - d, found.tilt_x - tilt_x, found.tilt_y - tilt_y]
                 squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
-    # 96 frames of three values: 1 ± 0.08, more where cells in tension carry no information.
+    # 96 frames of three values each: 1 ± 0.08, more where cells in tension carry no information.
     assert 0.7 < np.mean(squares) < 1.4
 
 
@@ -149,7 +149,8 @@ def test_frames_of_other_elements_are_estimated_correctly():
             error = [found.d - d, found.tilt_x - theta, found.tilt_y]
             squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
             upright += [squares[-1]] if theta == 0.0 else []
-            # Within the aims, or within the noise if it dominates, at 0.5 and 1 mm.
+            # The errors at 0.5 and 1 mm are within the targets, or within the noise where it
+            # dominates.
             turned = math.radians(1.5) + 3.0 * found.tilt_x_std
             assert found.d == pytest.approx(d, rel=0.05, abs=3.0 * found.d_std)
             assert math.hypot(*error[1:]) < turned
@@ -190,7 +191,7 @@ def test_dead_saturated_and_isolated_cells_are_excluded():
     truth = (0.005, 0.2, -0.1)
     frame = GRID.pressure(TIPS[0], RUBBER, *truth) + NOISE * rng.standard_normal(GRID.shape)
     frame[~active] = 0.0
-    frame[active & (frame > 45e3)] = 45e3  # 60 cells
+    frame[active & (frame > 45e3)] = 45e3  # clips 60 cells
     frame[8, 20] = 200e3
     readings = Readings(saturation=45e3)
     found = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE, active=active, readings=readings)(frame)
@@ -237,7 +238,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
             assert contact.d == pytest.approx(hand.d[finger], abs=5.0 * contact.d_std)
             assert contact.theta == pytest.approx(hand.theta[finger], abs=math.radians(0.3))
             assert contact.force == pytest.approx(hand.force[finger], rel=0.06)
-            # Shear on the face; the base measures its moment over the height a.
+            # The face is sheared; the base measures the moment of this shear over the height a.
             shear = hand.tangential[finger] * (1.0 - hand.d[finger] / 0.020)
             assert abs(shear) > 0.2
             assert contact.shear_x == pytest.approx(shear, abs=0.15)
@@ -251,7 +252,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
 
 @pytest.mark.extended
 def test_turning_back_and_forth_does_not_change_the_force_of_a_solid_tip(make):
-    """Rolling changes d in a way that joints hardly show; it must not be attributed to the gain."""
+    """Rolling changes d with hardly any joint motion; the gain must not absorb this change."""
     daemon = make(**load(Path("solid")).model_dump(exclude={"loop"}))
     grasped(daemon, 10.0)
     daemon.loop.advance(1.0)

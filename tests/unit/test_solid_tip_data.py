@@ -1,4 +1,4 @@
-"""The solid tip's data file and finite elements, against another finite element method."""
+"""Test the solid tip's data file and finite elements against another finite element method."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0  # in tip radii
 
 
 def centroid_and_extent(frame: NDArray[np.float64], pitch: float) -> tuple[float, float, float]:
-    """Return a frame's centroid along x and its extents σ_x and σ_y, as measured."""
+    """Return the measured centroid of a frame along x, and its extents σ_x and σ_y."""
     place = (np.arange(len(frame)) - (len(frame) - 1) / 2) * pitch
     total = frame.sum()
     x, y2 = (frame.sum(axis=0) @ place) / total, (frame.sum(axis=1) @ place**2) / total
@@ -67,7 +67,7 @@ def test_the_extent_hardly_depends_on_the_depth(arrays, d):
 
 @pytest.mark.extended
 def test_frames_match_three_dimensional_elements(arrays):
-    """The frames are from tests/harness/solid_reference.py, with other meshes and without a fit."""
+    """The frames come from tests/harness/solid_reference.py, which uses other meshes and no fit."""
     with np.load(REFERENCE) as data:
         names = ("base", "nu", "d", "theta", "push", "energy", "force", "frame")
         rows = list(zip(*(data[name] for name in names), strict=True))

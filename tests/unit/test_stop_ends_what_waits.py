@@ -1,8 +1,9 @@
-"""A stop cancels all requests that arrived before it, in any order of events and clients.
+"""Test that a stop cancels all earlier requests, in any order of events and clients.
 
-Clients, gateway and loop act one at a time in an order that hypothesis chooses. Requests received
-by libzmq are in a list from which the gateway reads few at a time. When a stop is executed, a
-request may therefore wait in its connection, in the gateway, on the link, or in the loop.
+Clients, gateway and loop act one at a time in an order that hypothesis chooses. Requests that
+libzmq has received are kept in a list, from which the gateway reads only a few at a time. When a
+stop is executed, a request may therefore wait in its connection, in the gateway, on the link, or in
+the loop.
 """
 
 from collections import deque
@@ -37,7 +38,7 @@ class Scene:
         self.arrived: deque[list[zmq.Frame]] = deque()
         self.replies: list[dict[str, Any]] = []
         self.served = Served(commands=f"ipc://{folder}/c", per_second=1e6, clock=self.clock)
-        self.reading = 0.4 * bounds.TURN_TIME  # s to read a message, so only few are read per step
+        self.reading = 0.4 * bounds.TURN_TIME  # s per message read, so few are read per step
         self.now = 0
         self.stopped_at = 0
         self.asked = 0
@@ -127,7 +128,7 @@ def test_no_request_from_before_a_stop_is_executed(actions):
 
 
 def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
-    """At times no request is waiting, although most of the earlier ones are yet to be delivered."""
+    """The queue is empty at times, although most earlier requests have not been delivered yet."""
     with played() as scene:
         scene.reading = 1e-5
         scene.stopped_at = 2
@@ -151,7 +152,7 @@ def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
 
 
 def test_a_flood_does_not_count_as_old_forever():
-    """Connections limit how many requests can have waited, even if the socket is never empty."""
+    """The number of connections limits the backlog, even if the socket is never empty."""
     with (
         patch.object(bounds, "CLIENT_COUNT_MAX", 1),
         patch.object(bounds, "SOCKET_QUEUE_LENGTH", 20),

@@ -1,4 +1,4 @@
-"""The publisher on a real socket: wire format, and all kinds of subscribers."""
+"""Test the publisher on a real socket: wire format, and all kinds of subscribers."""
 
 import json
 from collections.abc import Iterator
@@ -110,7 +110,7 @@ def test_a_stuck_subscriber_blocks_no_others_and_its_queue_is_bounded(context, a
         for seq in range(10_000):
             state.seq = seq
             publisher.send(STATE, state, BOTH)
-            served.service.step(0.0)  # would never return if it waited for the stuck subscriber
+            served.service.step(0.0)  # never returns if it waits for the stuck subscriber
             while reading.poll(0):
                 reading.recv_multipart()
         kept = 0
@@ -154,7 +154,7 @@ def test_late_subscribers_receive_settings_and_events_again(context, addresses, 
     publisher.settings(98.0, 0.5, HandInfo("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
-    served.settle()  # before the first subscription, which may be faster
+    served.settle()  # otherwise the first subscription could arrive earlier
     early = subscribe(context, addresses[0])
     told: list[tuple[bytes, dict[str, Any]]] = []
 
@@ -169,14 +169,14 @@ def test_late_subscribers_receive_settings_and_events_again(context, addresses, 
     assert told[0][1]["version"] == "0.1.0"
     assert [message["seq"] for _, message in told[1:]] == list(range(11, 61))
     assert all(message["again"] for _, message in told)
-    last = told[-1][1]  # original times
+    last = told[-1][1]  # the message keeps its original times
     assert (last["timestamp"], last["mono_ns"]) == (158.0, 60_000_000_000)
     assert (last["level"], last["kind"], last["text"]) == ("info", "mode", "event 60")
     told.clear()
     publisher.event(200.0, 100.0, "info", "mode", "new")
     until(lambda: tick(early) == 1)
     assert not told[0][1]["again"]
-    # A second subscriber to a single topic receives only that topic again.
+    # If a second client subscribes to a single topic, only that topic is sent again.
     told.clear()
     late = subscribe(context, addresses[0], b"hand/event")
     until(lambda: tick(late) == 50)
@@ -188,7 +188,7 @@ def test_a_long_message_is_sent_in_pieces_and_received_whole(context, addresses,
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorInfo(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     served.publisher.settings(98.0, 0.5, facts)
-    served.settle()  # before the first subscription; otherwise it is received twice
+    served.settle()  # without this, the first subscriber would receive it twice
     socket = subscribe(context, addresses[0])
     assert receive(socket, served)[1]["settings"] == facts.settings
     served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)

@@ -1,4 +1,4 @@
-"""Contact tables: accuracy over the entire domain, error bound, forms, files, special input."""
+"""Test contact tables: accuracy over the domain, error bound, forms, files, special input."""
 
 import functools
 import math
@@ -43,7 +43,7 @@ def table() -> ContactTable:
     return ContactTable.build(TIP, TABLE_I, 1e-9)
 
 
-# A law and a tolerance for each number of pieces.
+# Each number of pieces has a law and a tolerance.
 SPLITS = {
     1: (TABLE_I, 1e-6),
     2: (TABLE_I, 1e-9),
@@ -74,7 +74,7 @@ def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndar
 def hard_points(
     radius: float, points: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return random d [m] and θ [rad], dense at edges and corners; the domain's end comes first."""
+    """Return random d [m] and θ [rad], dense at edges and corners, starting at the domain's end."""
     which = rng.integers(0, 9, points)
     small = 10.0 ** rng.uniform(-9.0, -0.3, points)
     least = 10.0 ** rng.uniform(-16.0, -0.3, points)
@@ -150,7 +150,7 @@ def test_symmetry_sign_and_monotonicity(table, depth, share):
 @pytest.mark.parametrize("modulus", [1.0, 1e9])
 @pytest.mark.parametrize("radius", [1e-4, 1.0])
 def test_scaling_with_radius_and_modulus(table, radius, modulus):
-    """From 0.1 mm to 1 m, and from 1 Pa to 1 GPa at zero strain."""
+    """The scales range from 0.1 mm to 1 m, and from 1 Pa to 1 GPa at zero strain."""
     scale, share = radius / TIP.radius, Fraction(modulus) / TABLE_I.coefficients[0]
     other = Material(tuple(value * share for value in TABLE_I.coefficients))
     large = ContactTable.build(Fingertip(radius), other, 1e-9)
@@ -179,7 +179,7 @@ def test_lookups_outside_the_domain_cause_a_warning(table):
         table(d, theta)
     assert [each.filename for each in caught] == [__file__]
     assert table(d, theta, edge=True).inside.sum() == 3
-    table(d[:3], theta[:3])  # a warning would be an error
+    table(d[:3], theta[:3])  # a warning would raise an error
     table(0.008, -float(TIP.theta_limit(0.008)) * (1.0 + 1e-15))
 
 
@@ -270,14 +270,14 @@ def test_scalar_lookups_equal_array_lookups(forms):
 
 
 def test_a_law_far_from_its_points_causes_a_warning():
-    with pytest.warns(RuntimeWarning, match=r"11\.0% of F; expected at most 5%"):
+    with pytest.warns(RuntimeWarning, match=r"11\.0% of the force; expected at most 5%"):
         ContactTable.build(Fingertip(0.02), HARD["root"], 1e-6)
 
 
 def test_invalid_tables_are_refused():
-    with pytest.raises(TableError, match="reaches 1e-17; the best reached"):
+    with pytest.raises(TableError, match="meets 1e-17; the lowest error is"):
         ContactTable.build(TIP, CONSTANT, 1e-17)
-    with pytest.raises(TableError, match="the best reached") as error:
+    with pytest.raises(TableError, match="the lowest error is") as error:
         ContactTable.build(TIP, STIFFENING, 1e-15)
     best = float(str(error.value).split()[-1])
     assert ContactTable.build(TIP, STIFFENING, 1.01 * best).max_error <= 1.01 * best

@@ -1,4 +1,4 @@
-"""Tekscan-style exports: supported variants, and messages for other files."""
+"""Test Tekscan-style exports: supported variants, and messages for other files."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Torque on and off for any servo replies, and the commands allowed to change it."""
+"""Test torque switching under arbitrary servo replies, and commands that may change torque."""
 
 import math
 
@@ -40,7 +40,7 @@ def test_joints_are_held_at_their_positions_once_torque_is_on(make):
 
 
 def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
-    """Writes are lost but readings arrive, which keep resetting the servos' watchdogs."""
+    """The writes are lost, but readings still arrive and keep resetting the servos' watchdogs."""
     daemon = make()
     events = heard(daemon)
     command(daemon, "arm")
@@ -61,7 +61,7 @@ def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
     assert not daemon.loop.state.torque
     told = [text for _, kind, text in events if kind == "torque.off"]
     assert len(told) == 2, "must be reported once at the beginning and once at the end"
-    assert "the bus is kept silent" in told[0]
+    assert "keeps the bus silent" in told[0]
     assert "confirmed torque off" in told[1]
     command(daemon, "clear")
     assert command(daemon, "stop")["torque_off"] == "confirmed"
@@ -93,7 +93,7 @@ def test_torque_off_is_tried_repeatedly_at_exit(make):
 
 
 class Deaf:
-    """Servos that reply but ignore writes, for a number of attempts or until mended."""
+    """Servos that reply but ignore writes, for a number of attempts or until repaired."""
 
     def __init__(self, daemon: Daemon, tries: float = math.inf) -> None:
         self._servos = daemon.loop.torque.servos
@@ -147,7 +147,7 @@ def test_a_stall_that_trips_the_servo_watchdog_is_a_fault(make):
 def test_stop_and_disarm_always_turn_torque_off(make):
     daemon = make()
     for name, more in (("stop", {}), ("disarm", {}), ("stop", {"client": 5, "why": "smoke"})):
-        daemon.loop.torque.servos.torque_on()  # as another program might have done
+        daemon.loop.torque.servos.torque_on()  # another program might do this
         assert command(daemon, name, **more)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
         assert not torque_of(daemon).any()

@@ -1,4 +1,4 @@
-"""Untrusted files are rejected in one line, quickly and with limited memory."""
+"""Test that untrusted files are rejected in one line, quickly and with limited memory."""
 
 import base64
 import json
@@ -97,7 +97,7 @@ def test_a_malformed_profile_is_reported_quickly_and_briefly(tmp_path, text):
 
 
 def begin(file: IO[bytes], frames: int) -> None:
-    """Write the header of an array with this number of frames."""
+    """Write the header of an array with the given number of frames."""
     shape = {"descr": "<u2", "fortran_order": False, "shape": (frames, 44, 44)}
     np.lib.format.write_array_header_1_0(file, shape)
 
@@ -199,7 +199,7 @@ def chunks_of_holes(path: Path) -> None:
     with path.open("wb") as file:
         file.write(head())
         for _ in range(256):
-            empty = record(7, bytes(9 << 20))  # skipped by readers
+            empty = record(7, bytes(9 << 20))  # readers skip this record
             packed = chunk("", empty, len(empty))
             file.write(packed[:100])
             file.seek(len(packed) - 100, os.SEEK_CUR)
@@ -207,7 +207,7 @@ def chunks_of_holes(path: Path) -> None:
 
 
 SMALL, LARGE = message(b"{}") * 100_000, bytes(70 << 20)
-# Content after the header, or a function that writes the whole file.
+# Each value returns the content after the header, or writes the whole file.
 BOMBS: dict[str, Callable[[], bytes] | Callable[[Path], None]] = {
     "zstd": lambda: squeezed(LARGE),
     "zstd that claims little": lambda: squeezed(LARGE, 1000),

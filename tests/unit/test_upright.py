@@ -1,4 +1,4 @@
-"""Bringing a held object upright without measuring its angle: closed form and control law."""
+"""Test bringing a held object upright without measuring its angle: closed form, control law."""
 
 import math
 from pathlib import Path

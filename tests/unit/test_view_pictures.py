@@ -1,4 +1,4 @@
-"""The viewer's drawings: footprints on frames, the planar hand, the landscape, by the model."""
+"""Test viewer drawings against the model: footprints on frames, planar hand, landscape."""
 
 import json
 import math
@@ -48,7 +48,8 @@ def test_the_footprint_matches_the_forward_model(grid, contact):
     centroid = (pressure * cols).sum(), (pressure * rows).sum()
     outline, middle = shown
     assert middle == pytest.approx(np.array(centroid) / pressure.sum(), abs=0.05)
-    # Every loaded cell has a corner inside the outline, and the outline's ends are loaded.
+    # Every loaded cell has a corner inside the outline, and the cells at the outline's ends are
+    # loaded.
     pressed = np.column_stack((cols[pressure > 0.0], rows[pressure > 0.0]))
     low, high = outline.min(axis=0), outline.max(axis=0)
     assert (pressed >= low - 0.5).all()
@@ -114,7 +115,7 @@ def test_an_indented_tip_ends_at_the_face_of_the_object(finger: int) -> None:
     centre = HAND.tips(Q)[finger]
     assert -outwards @ out == pytest.approx(math.cos(theta[finger]))
     assert (middle - centre) @ outwards == pytest.approx(-(0.02 - d[finger]))
-    # The force is drawn where the axis through the centroid of pressure meets the face.
+    # The drawn force starts where the axis through the pressure's centroid meets the face.
     along = (lines.base[1] - lines.base[0]) / 0.04
     assert -outwards @ along == pytest.approx(math.sin(theta[finger]))
     foot = (lines.push[0] - centre) @ along

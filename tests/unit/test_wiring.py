@@ -1,4 +1,4 @@
-"""Servos on the wrong finger or with the wrong direction are detected before they do harm."""
+"""Test that miswired servos (wrong finger or direction) are detected before they do harm."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -24,7 +24,7 @@ JOINTS = {
 
 
 class Miswired:
-    """A simulated hand whose servos move the other finger or in the wrong direction."""
+    """A simulated hand whose servos drive the wrong finger or turn in the wrong direction."""
 
     def __init__(self, hand: Any, wiring: str) -> None:
         self._hand, self._swapped = hand, wiring == "swapped"
@@ -78,7 +78,7 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
 
 def greatest_force(daemon: Daemon, seconds: float) -> float:
-    """Return the maximum true tip force during this time, or until a fault."""
+    """Return the maximum true tip force within ``seconds``, or until a fault."""
     greatest = 0.0
     for _ in range(round(seconds / 0.02)):
         daemon.loop.advance(0.02)
@@ -99,19 +99,22 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
     command(daemon, "grasp", force=6.0)
     assert greatest_force(daemon, 3.0) < 4.0
     assert daemon.loop.state.fault_name == "joint.swapped"
-    assert "stands still: are servos.ids swapped?" in daemon.loop.state.fault
+    assert "is stationary: check whether servos.ids are swapped" in daemon.loop.state.fault
     assert not daemon.hand.torque_on.any()
 
 
 def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
-    daemon = make("swapped")  # with a centred object, the approach is the same for both wirings
+    daemon = make("swapped")  # the approach of a centred object is the same for both
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 2.0)
     assert daemon.loop.state.mode == "holding"
     command(daemon, "rotate", angle=0.2)
     assert greatest_force(daemon, 1.0) < 10.0
     assert daemon.loop.state.fault_name == "joint.swapped"
-    assert "against the commanded direction: are servos.ids swapped?" in daemon.loop.state.fault
+    assert (
+        "opposite to the commanded direction: check whether servos.ids are swapped"
+        in daemon.loop.state.fault
+    )
 
 
 @pytest.mark.parametrize("off", [0.0, *OFF])
@@ -143,7 +146,7 @@ def test_fingers_that_open_are_reported_before_they_reach_their_stop(make, wirin
     daemon = make(wiring, **simulation)
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q.min() > -0.54:  # the stop is at -0.55
+    while daemon.hand.q.min() > -0.54:  # the joint's stop is at -0.55
         daemon.loop.advance(0.02)
     (text,) = texts(events, "joint.opens")
     assert "neither tip has contact: if a finger opens" in text
@@ -165,14 +168,14 @@ def test_tips_that_meet_have_nothing_to_grasp(make, wiring):
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 3.0)
     assert texts(events, "joint.opens") == []
-    assert texts(events, "grasp")[0].startswith("nothing between the tips")
+    assert texts(events, "grasp")[0].startswith("no object between the tips")
 
 
 def test_fingers_that_stand_in_the_approach_are_reported(make):
     daemon = make("reversed")
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q[0] > -0.54:  # until it reaches its stop
+    while daemon.hand.q[0] > -0.54:  # until the joint reaches its stop
         daemon.loop.advance(0.02)
     daemon.loop.advance(1.0)
     (told,) = [text for level, kind, text in events if kind == "joint.blocked"]

@@ -1,7 +1,7 @@
 """Run ``softfinger analyse FILE``: compute d, θ, force and energy versus time from frames.
 
 The frames are processed with the daemon's perception code. A stream recording (.mcap) contains its
-own settings and calibrations. A file that contains only frames (.npz, .npy, a folder of these, or a
+own settings and calibrations. A source with only frames (.npz, .npy, a folder of such files, or a
 Tekscan-style export) is analysed with the profile's left sensor. The number of cells, and the pitch
 if given, are taken from the file.
 """
@@ -46,8 +46,8 @@ or a Tekscan-style ASCII export. A recording contains its settings. For the othe
 profile with --config, or set the missing values, for example
   --set tip.radius=0.02 --set tactile.pitch=0.0013 --set tactile.pascal_per_count=4
   --set tactile.noise=500 --set material.law=constant --set material.modulus=3e5
-The results are written to FILE.contacts.csv in the same folder, which PlotJuggler can draw. Several
-files are analysed in parallel, one on each processor."""
+The results are written to FILE.contacts.csv in the same folder, which PlotJuggler can plot. Several
+files are analysed in parallel, one per processor."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(_analysed(arguments, settings, files[0]), end="")
         return 0
     if arguments.csv:
-        print("analyse: --csv needs exactly one FILE", file=sys.stderr)
+        print("analyse: --csv requires exactly one FILE", file=sys.stderr)
         return 2
     status = 0
     _compile(settings)
@@ -110,35 +110,35 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 
 _EIGHT_BITS = 255
-_NOISE_RATIO = 1.5  # times tactile.noise; more noise is named
+_NOISE_RATIO = 1.5  # multiple of tactile.noise above which the noise is reported
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
-    """Explain why no frame contains a contact: maximum reading, threshold and likely cause."""
+    """Explain a lack of contacts by the maximum reading, the threshold and the likely cause."""
     from softfinger.kinematics.estimation.estimator import PEAK_LEVEL
 
     scale = tactile.pascal_per_count if recording.whole else 1.0
     pressure, level = recording.largest * scale, PEAK_LEVEL * tactile.noise
     found = f"{recording.largest:.4g} counts, " if recording.whole else ""
     if pressure == 0.0:
-        cause = "no cell read more than 0: check the sensor's cable"
+        cause = "all cells read 0: check the sensor's cable"
     elif not recording.whole and recording.largest <= 1.0:
         cause = (
-            "floats of 0 to 1 are shares of the sensor's range, not Pa: multiply them by its "
-            "largest pressure"
+            "floats between 0 and 1 are probably fractions of the sensor's range, not Pa: "
+            "multiply them by the sensor's maximum pressure"
         )
     elif pressure < level and not recording.whole:
-        cause = "floats are read as Pa: convert kPa, and save counts as integers"
+        cause = "floats are interpreted as Pa: convert kPa to Pa, and save counts as integers"
     elif pressure < level:
-        cause = "nothing pressed, or tactile.pascal_per_count belongs to another sensor"
+        cause = "the tip was not loaded, or tactile.pascal_per_count is wrong for this sensor"
         if recording.largest <= _EIGHT_BITS < tactile.full_count:
-            cause = "counts of 8 bits need a larger tactile.pascal_per_count"
+            cause = "the counts have 8 bits, so set a larger tactile.pascal_per_count"
     else:
         counts = recording.counts[:, recording.live].astype(np.float64)
         noise = tactile.pascal_per_count * math.sqrt(np.mean(counts[counts > 0.0] ** 2))
-        cause = "no adjacent cells above the threshold: single cells count as outliers"
+        cause = "no adjacent cells are above the threshold, and single cells count as outliers"
         if noise > _NOISE_RATIO * tactile.noise:
-            cause = f"the noise of the cells is {noise:.0f} Pa: set tactile.noise"
+            cause = f"the measured cell noise is {noise:.0f} Pa: set tactile.noise to this value"
     return (
         f"  no contact in any frame: largest reading {found}{pressure:.4g} Pa, threshold "
         f"{level:.4g} Pa ({PEAK_LEVEL:g} times tactile.noise); {cause}\n"
@@ -176,7 +176,7 @@ class Source:
 
     @property
     def truths(self) -> dict[str, NDArray[np.float64]]:
-        """True contact per frame, by name, if a single-sensor file contains it."""
+        """True contact for each frame, by quantity, if a single-sensor file contains it."""
         return {} if self.recording is None else self.recording.truths
 
 
@@ -186,8 +186,8 @@ def open_source(path: Path, settings: Settings, own: bool) -> Source:
     Parameters
     ----------
     own
-        For stream recordings, use the recorded settings instead of ``settings``. Files with only
-        frames always use ``settings``, including the pitch unless the file contains one.
+        If True, use the settings in a stream recording instead of ``settings``. For files with only
+        frames, ``settings`` are always used, including the pitch unless the file contains a pitch.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def open_source(path: Path, settings: Settings, own: bool) -> Source:
 def _stream(path: Path, settings: Settings, own: bool) -> Source:
     recording = Recording(path, to_stderr("analyse"))
     if not recording.count(schema.TACTILE):
-        raise RecordingError(f"{path}: contains no tactile frames")
+        raise RecordingError(f"{path}: the file does not contain any tactile frames")
     models = partial(recorded_models, recording) if own else partial(_models_of, settings)
     if own:
         settings, _ = recorded_settings(recording)
@@ -228,8 +228,8 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
     )
     if own:
         raise SettingsError(
-            f"{path}: contains no settings: describe the tip and the sensor with --config "
-            "PROFILE, such as --config paper, or with --set"
+            f"{path}: the file does not contain settings: describe the tip and the sensor with "
+            "--config PROFILE, for example --config paper, or with --set"
         )
     count, rows, cols = recording.counts.shape
     for note in (*recording.notes, pitch_difference(recording, (tactile.pitch, tactile.pitch_y))):
@@ -297,7 +297,7 @@ class Contacts:
 
 
 class _Pass:
-    """Perception for one sensor, with the rows computed so far."""
+    """Perception code for one sensor, with the rows computed so far."""
 
     def __init__(
         self, source: Source, models: tuple[FingerModel, FingerModel], finger: int

@@ -1,4 +1,4 @@
-"""Run ``softfinger plot FILE.mcap``: compare a recording with the model versus θ and in U(d, θ).
+"""Run ``softfinger plot FILE.mcap``: plot recorded and modelled forces and energies versus θ.
 
 The model uses the recorded settings and calibrations. Force and energy are taken from the recorded
 states, which include the modulus factor estimated in grips. To plot values versus time, open the
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 pages:
-  angle      force and energy against θ, with the model's curves
-  landscape  the path over U(d, θ), with its local minimum
+  angle      force and energy versus θ, with the model's curves
+  landscape  the path on the energy landscape U(d, θ), with its local minimum
 
-Needs the extra 'plot'. To draw any field over time, open the file in Foxglove or PlotJuggler."""
+Requires the extra 'plot'. To plot a field over time, open the file in Foxglove or PlotJuggler."""
 
 
 FloatArray = NDArray[np.float64]
@@ -51,7 +51,7 @@ LINES: dict[str, dict[str, Any]] = {
     "left": {"color": style.KINDS[0], "linestyle": "-"},
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
-_POINTS = 700  # points per finger and panel; more would overlap
+_POINTS = 700  # maximum number of points per finger and panel; more points would overlap
 _CURVES = 5
 _GRID = 241  # landscape nodes per axis
 
@@ -74,10 +74,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Plot a recording; may raise RecordingError, Missing, MissingExtra or OSError."""
-    require("plot")  # fail before reading a long recording
+    require("plot")  # fail early, before reading a long recording
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
-    # Reject other files before loading kernels.
+    # Reject files that are not recordings before loading the kernels.
     recording = Recording(path, to_stderr("plot"))
     from softfinger.daemon.loop.warm_up import FRAMES
     from softfinger.tools.processes.compile import build_kernels, print_event
@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Missing(SoftfingerError):
-    """The recording lacks data for a figure; the message says which."""
+    """Error raised if the recording lacks data for a figure; the message names the data."""
 
 
 @dataclass(frozen=True)
@@ -132,10 +132,10 @@ class RecordedRun:
     def contacts(self) -> dict[str, ContactTable]:
         """Return the contact table of each finger that touched; raise Missing if none did."""
         if not self.t.size:
-            raise Missing("contains no hand/state")
+            raise Missing("the recording does not contain hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
         if not touched:
-            raise Missing("contains no contact")
+            raise Missing("the recording does not contain a contact")
         if self.models is None:
             raise Missing(self.why_no_model)
         return {name: self.models[FINGERS.index(name)].table for name in touched}
@@ -160,7 +160,7 @@ def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None
     except RecordingError as error:
         return None, str(error).removeprefix(f"{recording.path}: ")
     except (SettingsError, TactileError, ValueError) as error:
-        return None, f"can't build its model: {error}"
+        return None, f"can't build the contact model of its settings: {error}"
 
 
 def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
@@ -169,7 +169,7 @@ def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
 
 
 def draw_angle(run: RecordedRun) -> Figure:
-    """Plot F and U versus θ with curves of constant d, and measured over model pressure."""
+    """Plot F and U versus θ with curves of constant d, and ratios of measured to model values."""
     tables = run.contacts()
     rows = len(tables)
     figure = style.new_figure(7.2, 1.9 + 3.0 * rows)
@@ -198,14 +198,14 @@ def draw_angle(run: RecordedRun) -> Figure:
     reach = max(1.6 * float(np.quantile(np.abs(np.concatenate(gains) - 1.0), 0.98)), 0.01)
     gain.set_ylim(1.0 - reach, 1.0 + reach)
     gain.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.1)
-    _titled(figure, run, "force and energy against θ")
+    _titled(figure, run, "force and energy versus θ")
     return figure
 
 
 def _against_angle(
     panel: Axes, seen: dict[str, FloatArray], table: ContactTable, field: str, factor: float
 ) -> Any:
-    """Draw points coloured by d and the model curves; return the mappable for the colour bar."""
+    """Draw model curves, and points coloured by d; return the mappable for the colour bar."""
     from matplotlib.colors import Normalize
 
     depths = _depths(seen["d"])
@@ -262,14 +262,14 @@ def draw_landscape(run: RecordedRun) -> Figure:
         above.plot(run.t, over, label=name, **LINES[name])
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
     above.axhline(0.0, color=style.GREY, linewidth=0.6)
-    above.set_ylabel("U less that at θ = 0\nand the same d [mJ]")
+    above.set_ylabel("U minus its value at θ = 0\nand the same d [mJ]")
     above.set_xlabel("time [s]")
     _titled(figure, run, "path on the energy landscape")
     return figure
 
 
 def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) -> None:
-    """Draw U(d, θ) [mJ] up to ``deepest`` [m] and ±``widest`` [rad], with its minimum over θ."""
+    """Draw U(d, θ) [mJ] up to ``deepest`` [m] and ±``widest`` [rad], and its minimum over θ."""
     from matplotlib.colors import PowerNorm
 
     d = np.linspace(0.0, deepest, _GRID)[1:]

@@ -1,4 +1,4 @@
 """The ``softfinger bench`` command, with one module for each measurement.
 
-`measuring`, `rigs` and `virtual_grip` are shared by several measurements.
+Several measurements share the modules `measuring`, `rigs` and `virtual_grip`.
 """

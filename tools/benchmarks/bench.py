@@ -22,12 +22,15 @@ if TYPE_CHECKING:
     from softfinger.tools.benchmarks.measuring import Report, Row
 
 MEASUREMENTS = {
-    "estimator": "lookup of force and energy, pressure grid to d and tilt: run time and error",
-    "tick": "the tick back to back, in place and over ptys",
-    "control": "error of an object's angle that remains with each grip law",
-    "reflex": "sudden larger loads on a grip: held or lost, slide, reaction time",
+    "estimator": (
+        "run time and error of force and energy lookups and of the estimate of d and tilt from "
+        "frames"
+    ),
+    "tick": "run time of ticks, in one process and over ptys",
+    "control": "remaining error of the object's angle with each grip law",
+    "reflex": "sudden load increases on a grip: success, slip distance and reaction time",
     "faults": "true force of grips with faulty measurements (15 minutes)",
-    "robustness": "true force of grips by hands that differ from their settings",
+    "robustness": "true grip force of hands that differ from their settings",
 }
 # These benchmarks run on virtual time, so other load on the machine does not affect them.
 SWEPT = ("reflex", "faults", "robustness")
@@ -45,22 +48,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"what to measure: {known}; without a name, one page of the main results in "
-        "about a minute",
+        help=f"what to measure: {known}; if omitted, print one page with the main results, which "
+        "takes about a minute",
     )
     parser.add_argument(
-        "--trials", type=_trials, metavar="N", help=f"trials of each case of {' and '.join(_CASES)}"
+        "--trials",
+        type=_trials,
+        metavar="N",
+        help=f"number of trials per case of {' and '.join(_CASES)}",
     )
     parser.add_argument(
-        "--only", default="", metavar="TEXT", help="only cases with this text in their name"
+        "--only",
+        default="",
+        metavar="TEXT",
+        help="run only the cases whose name contains this text",
     )
-    parser.add_argument("--brief", action="store_true", help="fewer cases for each NAME")
-    parser.add_argument("--full", action="store_true", help="all loads of 'reflex', not a few")
+    parser.add_argument("--brief", action="store_true", help="run fewer cases of each NAME")
+    parser.add_argument(
+        "--full", action="store_true", help="apply all loads of 'reflex', not only a few"
+    )
     parser.add_argument(
         "--json",
         type=Path,
         metavar="FILE",
-        help=f"write results as JSON; after Ctrl-C, the same call continues ({', '.join(SWEPT)})",
+        help="write the results as JSON; after Ctrl-C, the same command continues "
+        f"({', '.join(SWEPT)})",
     )
     add_sweep(parser)
 
@@ -120,7 +132,8 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
         more["sweep"] = sweep
     try:
         tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
-    except (RuntimeError, SoftfingerError) as error:  # for example, a grip lost on a busy machine
+    # For example, because a grip was lost on a busy machine.
+    except (RuntimeError, SoftfingerError) as error:
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
         for note in table.notes if table.failed else ():
@@ -147,7 +160,7 @@ def _page(tables: list[Report]) -> list[Row]:
 
 
 def _processor() -> str:
-    """Return the processor name from Linux, or else the machine type."""
+    """Return the processor name reported by Linux, or the machine type on other systems."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
@@ -167,7 +180,7 @@ def _check(names: list[str], arguments: argparse.Namespace) -> None:
     """Raise ValueError if the arguments are invalid."""
     for key, of in _OWN.items():
         if getattr(arguments, key) and (len(names) != 1 or names[0] not in of):
-            raise ValueError(f"--{key}: only for {' or '.join(of)}")
+            raise ValueError(f"--{key}: valid only for {' or '.join(of)}")
     for name in names:
         if name not in MEASUREMENTS:
             raise ValueError(f"found {name!r}, expected one of {', '.join(MEASUREMENTS)}")

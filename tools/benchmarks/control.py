@@ -1,15 +1,15 @@
 """Measure the residual object angle error for each grip control law.
 
 An object is placed askew between the fingers and grasped. The error is computed from the simulated
-hand's true angle, not from the daemon's estimate. The plants differ from the settings, and the
-sensor is either ideal or has defects. All runs use virtual time, so the results do not depend on
-the machine's speed.
+hand's true angle, not from the daemon's estimate. The simulated plants differ from the settings,
+and the sensor is either ideal or has defects. All runs use virtual time, so the results do not
+depend on the machine's speed.
 
 The daemon's control laws are compared with two laws from the literature. *Equal torques* is the
 `upright` law without its spring and dither. *Two-phased* is the serial two-phased controller for
-soft-fingered manipulation, :class:`TwoPhased`. It was published with a camera that measures the
-object angle with a delay. Both this controller and the daemon's law are therefore also tested with
-angles that are up to 0.3 s old.
+soft-fingered manipulation, :class:`TwoPhased`. The two-phased controller was published with a
+camera that measures the object angle with a delay. The two-phased controller and the daemon's law
+are therefore also tested with angles that are up to 0.3 s old.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _FORCE = 10.0  # N
 _ANGLE_STD = math.radians(5.0)
 _DRAW_COUNT = 12
 _READ_TIME = 5.0  # s, from the grasp command to the final angle measurement
-_STEERING_TIME = 2.0  # s, final part of this time, with the angle controlled to 0
+_STEERING_TIME = 2.0  # s, final part of this time, in which the angle is controlled to 0
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
-# Hz, bandwidths of the angle integral. The slow one is stable for all these delays, because
-# ω × delay < π/2. The fast one is the default of `control.rotate_bandwidth`.
+# Hz, bandwidths of the angle integral. The slow bandwidth is stable for all these delays, because ω
+# × delay < π/2. The fast bandwidth is the default of `control.rotate_bandwidth`.
 _SLOW_BANDWIDTH, _FAST_BANDWIDTH = 0.5, 4.0
 
 
@@ -67,9 +67,8 @@ class TwoPhased(Altered):
     """Serial two-phased controller from the literature.
 
     Phase one integrates the object angle error with ``bandwidth`` [Hz] into an antisymmetric joint
-    goal. Phase two is a PD law that moves the joints to this goal, in addition to equal bias
-    torques for the grip. The measured force is not used: the bias is computed from the requested
-    force.
+    goal. Phase two is a PD law that moves the joints to this goal; equal bias torques for the grip
+    are added. The measured force is not used: the bias is computed from the requested force.
     """
 
     def __init__(
@@ -103,7 +102,8 @@ class Way(NamedTuple):
     is_steered: bool = False  # the measured angle is controlled to 0
     law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's control law
     force: float = _FORCE
-    weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, applied to the established grip
+    # N, load along x and y, applied after the grip is established.
+    weight: tuple[float, float] = (0.0, 0.0)
 
 
 EQUAL_TORQUES = {"law": "upright", "dither_time": 0.0, "joint_stiffness": 1e-9}
@@ -234,7 +234,7 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float:
             hand.run(hand.loop.period)
         hand.plant.apply_load(*way.weight)
         hand.run(begun + _READ_TIME - _STEERING_TIME - hand.now)
-        if way.is_steered:  # do not wait for a force: not every law measures it
+        if way.is_steered:  # do not wait for a force, because not every law measures it
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERING_TIME)
         is_held = min(hand.plant.force) > 0.0

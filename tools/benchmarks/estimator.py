@@ -1,13 +1,14 @@
 """Measure run time and error of contact table lookups and frame estimates.
 
-All subjects take turns in one run. All lookups use the same points: |θ| up to 30° and d up to 8 mm.
-Half of the displacements are evenly spaced, and half are logarithmically spaced down to 1 µm. The
-reported error is the maximum relative error compared with integrals that use many nodes.
+All measured functions take turns in one run. All lookups use the same points: |θ| up to 30° and d
+up to 8 mm. Half of the displacements are evenly spaced, and half are logarithmically spaced down to
+1 µm. The reported error is the maximum relative deviation from integrals with many nodes.
 
-Each frame has 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15° and noise of 0.2 % of the modulus.
-The estimator is called from Python as in the control loop, for spring tips and solid tips in turn.
-RMS errors over these frames are listed next to the Cramér-Rao bound. The "sensor" rows show the
-errors for a profile's sensor that has been pressed in the same way for one second.
+Each frame has 44 × 44 cells on 58 mm and shows a contact with d = 4 mm and a tilt of 15°. The noise
+is 0.2 % of the modulus. As in the control loop, the estimator is called from Python, for spring
+tips and solid tips in turn. RMS errors over these frames are listed next to the Cramér-Rao bound.
+The "sensor" rows show the errors for a profile's sensor that has been pressed in the same way for
+one second.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
 _D_MAX, _TILT_MAX = 0.008, math.radians(30.0)  # m, rad
 _SINGLE_POINT_COUNT = 16  # points used in turn by calls with floats
-_CALL_AIM_NS = 800.0  # ns, aim for one call
+_CALL_AIM_NS = 800.0  # ns, target time of one call
 
 
 def rms_errors(found: FloatArray, truth: Truth) -> dict[str, float]:
@@ -83,7 +84,7 @@ def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
 
 
 def lookups(rounds: int, count: int = 512) -> Report:
-    """Return the time per point [ns] for ``count`` points, all at once and one by one."""
+    """Return the time per point [ns] for ``count`` points, in one call and in separate calls."""
     rng = np.random.default_rng(3)
     even = rng.uniform(0.0, _D_MAX, count)
     spread = 10.0 ** rng.uniform(-6.0, np.log10(_D_MAX), count)
@@ -116,7 +117,7 @@ def lookups(rounds: int, count: int = 512) -> Report:
 
 
 def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) -> dict[str, Any]:
-    """Return time per point and error of SciPy's bicubic spline for F alone."""
+    """Return the time per point and the error of SciPy's bicubic spline for F only."""
     interpolate: Any = import_module("scipy.interpolate")
     at = np.linspace(0.0, _D_MAX, 129), np.linspace(-_TILT_MAX, _TILT_MAX, 65)
     spline = interpolate.RectBivariateSpline(*at, integrate(TIP, _LAW, *np.meshgrid(*at)).force.T)
@@ -149,7 +150,7 @@ def frames_to_contacts(rounds: int) -> Report:
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
     times = {name: taken / _FRAME_COUNT for name, taken in interleave(subjects, rounds).items()}
-    # Use the minimum, which other load affects least.
+    # Use the minimum, because other load on the machine affects it least.
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
     for name, (run, truth, aim) in cases.items():
@@ -170,7 +171,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
 
     For a constant modulus, the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance is
     d (4a − d)/6 − sin² θ d (12a − 5d)/36. The initial footprint contains all cells above a
-    threshold. It is then recomputed from the last d and tilts.
+    threshold. The footprint is then recomputed from the last d and tilts.
     """
     cells, a = GRID.on(TIP), TIP.radius
     x = cells.x + cells.pitch_x * (np.arange(SIZE) + 0.5)
@@ -200,7 +201,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
 
 
 def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> FloatArray:
-    """Return d and tilts [count, 3] from a profile's sensor after it has been pressed for 1 s."""
+    """Return d and tilts [count, 3] from a profile's sensor that has been pressed for 1 s."""
     model = make_sensor_model(settings, 0)
     estimator = make_estimator(settings, make_material(settings.material))
     counts = np.zeros(model.grid.shape, np.uint16)

@@ -27,14 +27,14 @@ from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIAL_COUNT = 20
 _FORCES = (6.0, 12.0)  # N, requested forces
-_EVENT_PREFIX = "consistency."  # prefix of the kinds of events that name a faulty measurement
+_EVENT_PREFIX = "consistency."  # prefix of the event kinds that report a faulty measurement
 
-# Aims: forces relative to the requested force; times in s.
+# Criteria: forces relative to the requested force, times in s.
 SETTLES = "settles at 0.8 to 1.2 without a force increase"
 BOUNDED = "≤ 50 ms above 1.3, reported within 0.3 s"
 _SETTLED_RANGE = (0.8, 1.2)
 _EXCESS_TIME_MAX = 0.05  # s above 1.3
-_REPORT_TIME_MAX = 0.3  # s after the error reached half of its final value
+_REPORT_TIME_MAX = 0.3  # s, time after the error reached half of its final value
 _SLIDE_MAX = 0.010  # m
 
 # Phases of a trial.
@@ -50,10 +50,11 @@ _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 @dataclass(frozen=True)
 class FaultCase:
-    """One kind of grip, and its fault.
+    """Kind of grip, with its fault.
 
     ``words`` are faults in the syntax of `softfinger emulate --fault`, with ``{side}`` as a
-    placeholder for the finger. They start during the hold, or before the grasp if ``before``.
+    placeholder for the finger. The faults start during the hold or, if ``before`` is True, before
+    the grasp.
     """
 
     name: str
@@ -114,7 +115,7 @@ NAMES = tuple(case.name for case in CASES)
 
 @dataclass
 class GripTrial:
-    """Outcome of a trial: relative forces, and times [s] since the grasp or the fault."""
+    """Outcome of a trial: relative forces, and times [s] measured from the grasp or the fault."""
 
     false: tuple[str, ...]  # channels that may be reported as faulty
     held: bool = True  # the hold was established
@@ -126,13 +127,13 @@ class GripTrial:
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
-        """Record the results of the watch and the final state."""
+        """Record the results from the watch and the final state."""
         self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
-        """Return (time, channel) for each correct or, if not ``rightly``, each wrong diagnosis."""
+        """Return (time, channel) of all correct or, if not ``rightly``, all wrong diagnoses."""
         names = [
             (t, k.removeprefix(_EVENT_PREFIX))
             for t, k in self.events
@@ -161,7 +162,7 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return one table per aim with the cases whose name contains ``only``.
+    """Return one table per criterion with the cases whose name contains ``only``.
 
     ``brief`` runs one trial per case. ``sweep`` maps trials to outcomes in one or more processes.
     """
@@ -246,7 +247,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Summarise, for each kind, the number of trials and the median first time [s]."""
+    """Summarise the number of trials and the median first time [s] for each event kind."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

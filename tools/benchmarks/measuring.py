@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.terminal.text_layout import plain_table, table_text
 
-# Result of one measurement. Each key is a column heading; "name" is the first.
+# Result of one measurement. Each key is a column heading; "name" is the first column.
 Row = dict[str, Any]
 
-# s per repetition: short enough to avoid most interruptions, long compared with clock resolution.
+# s per repetition; short enough to avoid most interruptions, but long compared with the clock
+# resolution.
 _SLICE = 4e-4
 
 
@@ -47,7 +48,7 @@ class Report:
 def attempt(title: str, part: Callable[[], Report]) -> Report:
     """Run one part of a measurement; after an error, return a failed report with the reason.
 
-    The other parts can then continue, e.g. if a hand loses its grip on a busy machine.
+    The other parts then still run, e.g. if a hand loses its grip on a busy machine.
     """
     try:
         return part()

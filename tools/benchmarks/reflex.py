@@ -1,12 +1,12 @@
 """Measure how a grip reacts to a sudden load increase.
 
-A 10 N grip carries a standing load along the object faces, away from the palm. Then a larger load
-is applied and maintained: either a push, or a twist with the same force at the faces. Trials run on
-virtual time, and the results are computed from the simulated hand's true state. *Lost*: the object
-is no longer between the tips. *Slid*: object displacement along its faces relative to the midpoint
-of both tips, so that leaning fingers do not count. *Answer*: time from slip onset until the goal
-currents have increased by a quarter. *Said*: time from object loss until the hand leaves the grip
-modes.
+A 10 N grip carries a standing load along the object faces, away from the palm. A larger load is
+then applied and maintained: either a push, or a twist with the same force at the faces. Trials run
+on virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
+object is no longer between the tips. *Slid*: object displacement along its faces. The displacement
+is measured from the midpoint of both tips, so that leaning fingers do not affect it. *Answer*: time
+from the onset of slip until the goal currents have increased by a quarter. *Said*: time from object
+loss until the hand leaves the grip modes.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ TIPS: dict[str, Sections] = {
 }
 MASSES = (0.1, 0.5, 2.0)  # kg
 STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
-OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; friction holds 12 N in a 10 N grip
+OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; in a 10 N grip, friction can hold 12 N
 REDUCED_LOADS = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # N, used without `--full`
 _FORCE = 10.0  # N
 _TRIAL_COUNT = 3  # trials per case
 _RESPONSE_AIM, _REPORT_AIM = 22.0, 200.0  # ms
 _GRIP_TIMEOUT = 5.0  # s, time limit for establishing the hold
-# s, ramp of the standing load; s, time for which it is then constant.
+# s, duration of the standing load's ramp, and of the constant standing load after the ramp.
 _LOAD_TIME, _STANDING_TIME = 1.0, 1.5
 _LOAD_STEP_COUNT = 50  # steps in this ramp
-_OBSERVATION_TIME = 1.0  # s, duration of the larger load, and time limit for reporting a loss
+_OBSERVATION_TIME = 1.0  # s, duration of the larger load and time limit for reporting a loss
 
 
 class Overload(NamedTuple):
     """Outcome of one trial."""
 
     answer: float  # s; NaN without slip, infinity without reaction
-    slid: float  # m, while the object was between the tips
+    slid: float  # m, maximum while the object was between the tips
     lost: bool
-    said: float = math.nan  # s, from loss to report
+    said: float = math.nan  # s, time from loss to report
 
 
 def measure(
@@ -98,7 +98,7 @@ def _table(
         rows.append(told | {"trials": trials, "no grip": trials - len(found)})
     said = [each["reported ms"] for each in rows if each["held %"] < 100.0]
     slowest = max(said, default=0.0)
-    note = f"  loss reported within {slowest:.0f} ms, aim ≤ {_REPORT_AIM:g}"
+    note = f"  loss reported within {slowest:.0f} ms, target ≤ {_REPORT_AIM:g}"
     return Report(f"{name}, answer", rows, notes=(note,) if said else ())
 
 
@@ -130,7 +130,7 @@ def overloaded(
         loop.advance(0.1)
         grip.command("grasp", force=_FORCE)
         if not grip.until("holding", _GRIP_TIMEOUT):
-            raise RigError(f"the hand did not grip the object: {state.mode} {state.fault}")
+            raise RigError(f"the hand failed to grip the object: {state.mode} {state.fault}")
         loop.advance(1.0 + chance.uniform(0.0, 0.02))
         for k in range(_LOAD_STEP_COUNT):
             grip.plant.load(push=standing * (k + 1) / _LOAD_STEP_COUNT)

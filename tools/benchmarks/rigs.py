@@ -1,4 +1,4 @@
-"""Test rigs for several benchmarks: holding daemons, canned backends and an emulated hand."""
+"""Test rigs for several benchmarks: daemons with a held object, canned backends, emulated hands."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _FRAME_COUNT = 16  # frames used in turn
 
 
 class RigError(SoftfingerError):
-    """The test rig does not work, so the measurement is not possible."""
+    """The measurement is not possible, because the test rig does not work."""
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
@@ -87,7 +87,7 @@ def must_hold(daemon: Daemon) -> None:
     """Raise RigError unless the hand is holding."""
     state = daemon.loop.state
     if state.mode != "holding":
-        raise RigError(f"the hand did not grip the object: {state.mode} {state.fault}")
+        raise RigError(f"the hand failed to grip the object: {state.mode} {state.fault}")
 
 
 class _Canned:
@@ -150,8 +150,8 @@ class CannedSensor(_Canned):
 def can(daemon: Daemon) -> None:
     """Replace a daemon's backends with canned ones, so that only the tick itself is timed.
 
-    The canned backends repeat the next frames and the last reading. They use several frames,
-    because the daemon would detect one repeated frame as a frozen sensor.
+    The canned backends repeat the next frames and the last reading. Several frames are used,
+    because the daemon would detect a single repeated frame as a frozen sensor.
     """
     loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate
     fingers = loop.perception.fingers

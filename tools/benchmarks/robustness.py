@@ -24,15 +24,16 @@ from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
-# s: time limit for establishing the hold, undisturbed hold, observation.
+# s, time limit for establishing the hold, duration of the undisturbed hold, observation time.
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
 _ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01  # 1, 1, m
 _REPORT_TIME_MAX = 2.0  # s, time limit for reporting a force error above `_ERROR_MAX`
-# Without a load: ratio to the requested force, and maximum time above it [s].
+# Without a load: ratio to the requested force, and maximum time above this ratio [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
 _EVENT_PREFIX = "consistency."
-_GAIN_ERROR_MIN = math.log(1.3)  # log of the gain error above which naming a sensor is correct
-_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which no load should be lost
+# Logarithm of the gain error above which reporting a sensor as faulty is correct.
+_GAIN_ERROR_MIN = math.log(1.3)
+_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which objects should not be lost
 
 # Full scale of 127.5 kPa, as on real tactile boards. The simulated sensor's default is 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
@@ -45,7 +46,8 @@ class HandCase:
 
     name: str
     force: float
-    hand: Sections = field(default_factory=dict)  # differences from the daemon's settings
+    # Hand settings that differ from the daemon's settings.
+    hand: Sections = field(default_factory=dict)
     daemon: Sections = field(default_factory=dict)
     torque: float = 1.0  # true torque constant divided by the one in the settings
     words: str = ""  # faults in `softfinger emulate --fault` syntax, started in the hold
@@ -103,7 +105,7 @@ NAMES = (
 
 
 def drawn(seed: int) -> HandCase:
-    """Draw a hand for the ensemble; all its parameters differ from the settings."""
+    """Draw a random hand for the ensemble; all its parameters differ from the settings."""
     chance = random.Random(f"{_ENSEMBLE}{seed}")
 
     def span(low: float, high: float) -> float:
@@ -156,7 +158,7 @@ def drawn(seed: int) -> HandCase:
         * pushed,
         within=chance.choice((0.0, 0.3, 2.0)),
         turn=span(-0.14, 0.14) * turned,
-        # Zero drift is also a sensor fault.
+        # Drift of the zero offset is also a sensor fault.
         false=tuple(
             f"{side}_sensor"
             for side, wrong in zip(FINGERS, off, strict=True)
@@ -181,7 +183,7 @@ class Outcome:
     end: str = ""  # final fault or mode
 
     def well(self) -> bool:
-        """Return True if the force error is within `_ERROR_MAX` or was reported in time."""
+        """Return True if the force error is below `_ERROR_MAX` or was reported in time."""
         near = self.held and abs(self.settled - 1.0) <= _ERROR_MAX and self.above == 0.0
         is_reported = self.named - self.first_off <= _REPORT_TIME_MAX and not self.raised
         return near or (self.first_off < math.inf and is_reported)

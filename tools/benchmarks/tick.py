@@ -1,9 +1,10 @@
 """Measure tick times: back to back, in place, and with emulated servos over a pty.
 
-Back-to-back ticks follow each other without a pause. In-place ticks each wake from a sleep, as in a
-running daemon. Both take turns, with the same hand and canned readings. With hardware in the loop,
-another process emulates the servos, either unpaced or with the transmission times at a given baud
-rate. The whole simulated hand is also timed for one second of virtual time.
+Back-to-back ticks follow each other without a pause. Each in-place tick starts after a sleep, as in
+a running daemon. Both kinds of ticks are measured in turn, with the same hand and canned readings.
+In the measurement with emulated servos, another process emulates the servos, either unpaced or with
+the transmission times of a given baud rate. The whole simulated hand is also timed for one second
+of virtual time.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def _simulated(title: str, seconds: int) -> Report:
-    """Time the complete daemon with the simulated hand, per virtual second and per tick."""
+    """Measure the complete daemon with the simulated hand, per virtual second and per tick."""
     with virtual_daemon() as daemon:
         hold(daemon)
         second = timed(partial(daemon.loop.advance, 1.0), seconds)
@@ -59,7 +60,7 @@ def _simulated(title: str, seconds: int) -> Report:
 
 
 def _in_turns(title: str, rounds: int) -> Report:
-    """Time only the pipeline: back to back with and without subscribers, in place at three rates.
+    """Measure only the pipeline: back to back, with and without subscribers; in place, at 3 rates.
 
     SCHED_FIFO is used if permitted.
     """
@@ -118,10 +119,10 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
 
 
 def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Time ticks over ptys during a hold, alternating with the servo exchanges alone.
+    """Measure ticks over ptys during a hold, and the servo exchanges separately, alternately.
 
-    ``baud`` 0 is unpaced, and ``changes`` override the profile. Raises RigError if the hand loses
-    its grip, e.g. on a busy machine.
+    A ``baud`` of 0 disables pacing, and ``changes`` override the profile. Raises RigError if the
+    hand loses its grip, e.g. on a busy machine.
     """
     in_place: list[float] = []
     back_to_back: list[float] = []

@@ -19,11 +19,12 @@ from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 EXCESS_RATIO = 1.3  # 1, force relative to the requested force
-LOST_SLIDE = 0.1  # m, slide above which the object counts as lost
+LOST_SLIDE = 0.1  # m, displacement along the faces above which the object counts as lost
 _TORQUE_ERROR = 0.1  # 1, maximum relative torque constant error
-_INCREASED_RATIO = 1.25  # 1, goal current relative to the hold that counts as a reaction
+# 1, goal current that counts as a reaction, relative to the current during the hold.
+_INCREASED_RATIO = 1.25
 _AVERAGING_TIME = 0.5  # s, final part of the hold for averaging the force
-_SLIP_FRACTION = 0.999  # 1, fraction of the friction limit that counts as slip
+_SLIP_FRACTION = 0.999  # 1, fraction of the friction limit above which the tip counts as slipping
 
 
 class Watch:
@@ -98,7 +99,7 @@ class VirtualGrip(SimulatedDaemon):
 
     def __exit__(self, *ended: object) -> None:
         super().__exit__(*ended)
-        gc.collect()  # reference cycles in a daemon hold megabytes of frames
+        gc.collect()  # reference cycles in a daemon keep megabytes of frames alive
 
     def command(self, name: str, **numbers: float) -> dict[str, Any]:
         """Send a command and ignore refusals."""
@@ -107,7 +108,7 @@ class VirtualGrip(SimulatedDaemon):
         return {}
 
     def until(self, mode: str, seconds: float) -> bool:
-        """Advance until the hand is in ``mode``; return False after ``seconds``."""
+        """Advance until the hand is in ``mode``; return False after a timeout of ``seconds``."""
         end = self.state.t + seconds
         while self.state.mode != mode and self.state.t < end:
             self.loop.advance(self.loop.period)
@@ -119,7 +120,7 @@ class VirtualGrip(SimulatedDaemon):
             self.plant.apply_fault(event._replace(after=self.state.t + event.after))
 
     def watched(self, asked: float) -> Watch:
-        """Start recording each tick and return the `Watch`."""
+        """Start to record each tick, and return the `Watch`."""
         watch, hand, state = Watch(asked), self.plant, self.state
         self.look = lambda: watch.see(
             state.t, hand.force.tolist(), hand.object_pose[:2].tolist(), state.torque
@@ -146,7 +147,7 @@ class VirtualGrip(SimulatedDaemon):
         return answered - onset if onset < math.inf else math.nan
 
     def along(self) -> list[float]:
-        """Return each tip position [m] along the object faces, relative to the object's centre."""
+        """Return the tip positions [m] along the object faces, relative to the object's centre."""
         x, y, angle = self.plant.object_pose.tolist()
         sine, cosine = math.sin(angle), math.cos(angle)
         tips = (self.plant.plant.fingers[k] for k in range(2))

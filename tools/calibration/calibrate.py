@@ -33,51 +33,56 @@ STEPS = (
     "scales",
 )
 _OF_PROFILE = STEPS[: STEPS.index("tare")]  # all other steps calibrate a tip
-# Fraction of the prior standard deviation of a sensor's gain. Above it, the gain has not been
-# measured in a grip.
+# Fraction of the prior standard deviation of a sensor's gain. If the standard deviation is above
+# this fraction, the gain has not been measured in a grip.
 _LEARNT = 0.8
-# Minimum relative standard deviation per factor, because rubber and joints vary day by day.
+# Minimum relative standard deviation of each factor, because rubber and joints vary from day to
+# day.
 _LEAST = 0.02
 _EPILOG = """\
-steps of a hand; FILE is a profile, copied from --config's if absent:
-  joints       with torque off, close, open and straighten each finger by hand; determines servo,
-               direction, zero and range of both fingers
-  heat         from the recording of a grip of some minutes that starts cold: temperature rise and
-               time constants of the servo of --finger
-  friction     friction of each joint in air: the running daemon sweeps the joint back and forth; or
-               from a recording of such motion
-  latency      latency of frames: the running daemon grasps an object with several forces (--force:
-               the first); or from a recording of such a grip
+steps of a hand; FILE is a profile, copied from that of --config if it does not exist:
+  joints       you close, open and straighten each finger by hand, with torque off; determines the
+               servo, direction, zero and range of each finger
+  heat         temperature rise and time constants of the servo of --finger, from the recording of a
+               grip of some minutes that starts with a cold servo
+  friction     friction of each joint without contact; the running daemon sweeps the joint back and
+               forth, or use a recording of such a motion
+  latency      latency of the frames; the running daemon grasps an object with several forces
+               (--force: the first), or use a recording of such a grip
 
-steps of a tip, in this order; each is written into FILE, which keeps the others:
-  tare         without load: zero of each cell, noise with its correlation, drift
-  equilibrate  several uniform pressures: gain of each cell, dead cells
-  curve        known weights upright on the tip (--force), or a run of known displacement (--d)
-  centre       presses upright or at known tilt (--theta): position and rotation of the tip
-  modulus      a run of known displacement (--d): E; the zero of d is fitted
-  law          presses at known depths and tilts (--d, --theta): compares springs and solid rubber
-               by E, ν, fit to the frames and remaining error; or --compression with CSV files of a
-               testing machine: E, or E over d, by force alone
-  relaxation   a press held for some seconds at a known d (--d, --frames 500): initial stiffness of
-               the rubber relative to its final stiffness, for the profile
-  scales       factors of the tip's modulus, the sensor's gain and the joint's torque, as estimated
-               in grips of a running daemon or a recording; the daemon starts with them
+steps of a tip, in this order; each step adds its result to FILE:
+  tare         zero offset of each cell, noise and its correlation, drift; without load
+  equilibrate  gain of each cell, dead cells; several uniform pressures
+  curve        pressure versus count; known weights placed upright on the tip (--force), or a run
+               with known displacement (--d)
+  centre       position and rotation of the tip; upright presses, or presses at known tilt (--theta)
+  modulus      E; a run with known displacement (--d), whose zero offset is fitted
+  law          comparison of springs and solid rubber: E, ν, goodness of fit and remaining error;
+               presses at known depths and tilts (--d, --theta), or CSV files of a testing machine
+               (--compression), which give E, or E versus d, from the force alone
+  relaxation   initial stiffness of the rubber relative to its final stiffness, for the profile; a
+               press held for some seconds at a known d (--d, --frames 500)
+  scales       correction factors for the tip's modulus, the sensor's gain and the joint's torque,
+               estimated during grips of a running daemon or in a recording; the daemon starts with
+               these factors
 
-Frames come live from the profile's sensor, one load after the other, or from recordings: one file
-for each load, or one .npz of the whole run with d [m], theta [rad] and force [N] of each frame.
-Without a stage, try the steps on `softfinger emulate`:
+Frames are read from the profile's sensor, one load after the other, or from recordings: one file
+per load, or one .npz file of the whole run with d [m], theta [rad] and force [N] of each frame.
+If you have no test stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
-Each step except law draws its result and residuals to FILE.STEP.png if matplotlib is installed.
-A new equilibrate removes curve and modulus, a new curve removes modulus, and each of these removes
-scales, because these steps depend on it.
+Each step except law plots its result and residuals in FILE.STEP.png if matplotlib is installed.
+Steps depend on earlier steps: repeating equilibrate removes the results of curve, modulus and
+scales; repeating curve removes those of modulus and scales; repeating modulus removes scales.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("step", choices=STEPS)
-    parser.add_argument("file", type=Path, metavar="FILE", help="output file, made if absent")
+    parser.add_argument(
+        "file", type=Path, metavar="FILE", help="output file, created if it does not exist"
+    )
     parser.add_argument("--finger", choices=("left", "right"), default="left")
     add_profile(parser)
     parser.add_argument(
@@ -94,14 +99,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="CSV",
-        help="law: files with d and F, or strain and stress, with units in the header; --theta "
-        "gives the tilt of each file that has no column for it",
+        help="law: files with d and F, or with strain and stress, and units in the header; for "
+        "files without a tilt column, --theta gives the tilt",
     )
     parser.add_argument(
-        "--frames", type=_frames, default=64, help="live frames for each load (default 64)"
+        "--frames", type=_frames, default=64, help="number of live frames per load (default 64)"
     )
     parser.add_argument(
-        "--loads", type=int, default=0, help="equilibrate, live: the number of pressures"
+        "--loads", type=int, default=0, help="equilibrate, live: number of pressures"
     )
     for name, unit in (("force", "N"), ("d", "mm"), ("theta", "degrees")):
         parser.add_argument(
@@ -121,11 +126,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--move",
         metavar="COMMAND",
-        help="live: instead of Enter, run a program that applies each load and exits when done; "
-        "{force}, {d} and {theta} are replaced by the load's values, {finger} and {pose} "
-        "(closed, open, zero) by those of a joint",
+        help="live: run a program that applies each load and exits when done, instead of waiting "
+        "for Enter; {force}, {d} and {theta} are replaced by the load's values; for joints, "
+        "{finger} and {pose} are replaced (pose: closed, open or zero)",
     )
-    parser.add_argument("--no-plot", action="store_true", help="draw no picture")
+    parser.add_argument("--no-plot", action="store_true", help="do not plot the result")
     add_daemon(parser, addresses)  # used by friction, latency and scales
 
 
@@ -191,7 +196,7 @@ def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
         try:
             draw(arguments.step, panels, file.with_name(f"{file.stem}.{arguments.step}.png"))
         except MissingExtra as error:
-            print(f"calibrate: no picture was drawn: {error}", file=sys.stderr)
+            print(f"calibrate: the result was not plotted: {error}", file=sys.stderr)
     return line
 
 
@@ -203,8 +208,8 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write a finger's calibration factors to its file and return a summary line.
 
     The sensor gain changes whenever the sensor is remounted, and the tip modulus may be known only
-    roughly. Both are estimated during a grip (`daemon.perception.hand_state`). A daemon that starts
-    with these factors reaches the correct force in its first grip.
+    roughly. Gain and modulus are estimated during a grip (`daemon.perception.hand_state`). A daemon
+    that starts with these factors reaches the correct force in its first grip.
 
     Raises
     ------
@@ -224,7 +229,8 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     if not contact.sensor_gain_std < _LEARNT * settings.tactile.gain_error * contact.sensor_gain:
         raise CalibrationError(
             f"scales: found a gain uncertainty of {contact.sensor_gain_std:.2f}, expected less "
-            f"than {_LEARNT * settings.tactile.gain_error:.2f}: grasp an object firmly first"
+            f"than {_LEARNT * settings.tactile.gain_error:.2f}: first grasp an object with a high "
+            "force"
         )
     step = ScalesStep(
         date=now(),

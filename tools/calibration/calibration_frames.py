@@ -32,7 +32,7 @@ from softfinger.tools.arguments import to_stderr
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
 _PATIENCE = 10.0  # s, maximum interval without a new frame
 _WAIT = 60.0  # s, time limit for --move
-_BEFORE = 4000  # maximum number of frames stored before a hold
+_BEFORE = 4000  # maximum number of stored frames from before a hold
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
                 raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
-            # If there is one recording of the whole run, each frame with contact is a load.
+            # If a single recording contains the whole run, each frame with a contact is a load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
             frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
             return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
@@ -104,7 +104,10 @@ def _spread(given: dict[str, Any], count: int) -> dict[str, Any]:
     """Expand each list to one value per load; a single value applies to all loads."""
     for name, values in given.items():
         if len(values) not in (1, count):
-            raise CalibrationError(f"--{name}: found {len(values)} values for {count} loads")
+            raise CalibrationError(
+                f"--{name}: found {len(values)} values for {count} loads, expected one value or "
+                "one per load"
+            )
     return {name: np.broadcast_to(given[name], count).copy() for name in TRUTHS if name in given}
 
 
@@ -122,12 +125,12 @@ def _live(
             if count > 1 or truths:
                 load = {name: values[k] / _UNITS[name] for name, values in truths.items()}
                 words = ", ".join(f"{name} {value:g}" for name, value in load.items())
-                told = f"load {k + 1} of {count}: {words or 'uniform pressure'}"
+                told = f"apply load {k + 1} of {count}: {words or 'uniform pressure'}"
                 if arguments.step == "relaxation":
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
                 bring(arguments, told, {"load": k + 1, **load})
-            # Frames scanned earlier may still show the previous load.
+            # Frames that were scanned earlier may still show the previous load.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads
@@ -157,7 +160,7 @@ def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | s
     if arguments.move:
         _move(arguments.move, load)
     elif not sys.stdin.readline():
-        raise CalibrationError("ended before all loads were applied")
+        raise CalibrationError("the input ended before all loads were applied")
 
 
 def _move(command: str, load: Mapping[str, float | str]) -> None:
@@ -171,12 +174,12 @@ def _move(command: str, load: Mapping[str, float | str]) -> None:
     except (LookupError, ValueError, OSError, subprocess.TimeoutExpired) as error:
         raise CalibrationError(f"--move: {command}: {error}") from None
     if done != 0:
-        raise CalibrationError(f"--move: {command}: ended with status {done}")
+        raise CalibrationError(f"--move: {command}: the program exited with status {done}")
 
 
 @contextlib.contextmanager
 def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[TactileSensor]:
-    """Yield the finger's sensor, opened for this context; may raise TactileError."""
+    """Open the finger's sensor for the duration of this context; may raise TactileError."""
     hand = None
     if settings.tactile.backend == "simulated":
         from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
@@ -202,11 +205,11 @@ def _fresh(backend: TactileSensor, clock: RealClock, since: float) -> Iterator[F
         if frame is not last and frame is not None:
             last, waited = frame, clock.now()
             if not frame.valid:
-                raise TactileError(f"the sensor stopped: {getattr(backend, 'error', '')}")
+                raise TactileError(f"the sensor stopped sending: {getattr(backend, 'error', '')}")
             if frame.t_sample >= since:
                 yield frame
         elif clock.now() - waited > _PATIENCE:
-            raise TactileError(f"no new frame within {_PATIENCE:g} s")
+            raise TactileError(f"no new frame from the sensor within {_PATIENCE:g} s")
 
 
 def _say(text: str) -> None:

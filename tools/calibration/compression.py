@@ -65,10 +65,10 @@ _QUANTITIES = {
 _EXAMPLE = "`d [mm],F [N],tilt [deg]` or `strain [%],stress [kPa]`"
 _NAMED = re.compile(r"^(.*?)\s*(?:[\[(]\s*(.*?)\s*[\])]|[/_]\s*([^\s/_]+))?$")
 _SAME_TILT = 2e-4  # rad, maximum tilt difference within a run
-_POINTS = 10  # points of a fitted law
+_POINTS = 10  # number of points that represent a fitted law
 _BINS = 20  # maximum number of points of a measured stress-strain law
 _TOE = 2.0  # ratio of slopes that indicates a toe region or an offset
-# Difference in the information criterion that is strong evidence (Kass & Raftery, 1995).
+# Difference in the information criterion that counts as strong evidence (Kass & Raftery, 1995).
 _BETTER = 6.0
 
 
@@ -76,8 +76,8 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     """Read the known columns of a file in SI units.
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
-    semicolon. Units follow the column names in the header, or are in a separate row below. Other
-    columns, empty lines and lines that begin with # are ignored.
+    semicolon. Units follow the column names in the header, or are in a separate row below the
+    header. Other columns, empty lines and lines that begin with # are ignored.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1)
              if line.strip(" \t;,") and not line.startswith("#")]  # fmt: skip
     if not lines:
-        raise CalibrationError(f"{path}: found no line, expected {_EXAMPLE}")
+        raise CalibrationError(f"{path}: the file is empty, expected {_EXAMPLE}")
     separator = next((each for each in "\t;" if each in lines[0][1]), ",")
     rows = csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True)
     header, *cells = ([cell.strip() for cell in row] for row in rows)
@@ -178,8 +178,8 @@ def fit_files(
     """
     if settings.tip.physics == "measured":
         raise CalibrationError(
-            'law: found tip.physics = "measured", whose curves need frames; expected "springs" or '
-            '"solid"'
+            'law: found tip.physics = "measured", whose curves require frames; expected '
+            '"springs" or "solid"'
         )
     if theta and len(theta) != len(paths):
         raise CalibrationError(f"--theta: found {len(theta)} values for {len(paths)} files")
@@ -202,7 +202,7 @@ def _tests(path: Path, file: dict[str, FloatArray], theta: float) -> list[_Test]
     tests = []
     for rows in np.split(np.arange(len(tilt)), edges):
         if not len(rows):
-            raise CalibrationError(f"{path}: found no row of numbers below the header")
+            raise CalibrationError(f"{path}: found no rows of numbers below the header")
         name = f"{path.name} at {math.degrees(tilt[rows[0]]):.3g}°"
         try:
             run = loading(file["displacement"][rows], file["force"][rows], float(tilt[rows[0]]))
@@ -222,7 +222,7 @@ def _force_law(
         raise CalibrationError(f"law: {'; '.join(notes)}")
     best, deepest = ours[0], max(run.depth for run in runs)
     force = max(float(np.ptp(run.force)) for run in runs)
-    # Residuals beyond the noise are attributed to the material law.
+    # Residuals in excess of the noise are attributed to the material law.
     misfit = best.residual * math.sqrt(max(1.0 - 1.0 / best.chi2, 0.0)) / force
     count = 0 if _is_constant(best) else _POINTS
     strain = np.linspace(0.0, deepest / tip.radius, count + 1)[1:]
@@ -244,8 +244,8 @@ def _force_law(
     lines += notes
     if fits[0].score < best.score - _BETTER:
         lines.append(
-            f"{_name(fits[0])} fits better; F alone does not identify a model: compare frames of "
-            "the sensor with `calibrate law --d`, then set tip.physics"
+            f"{_name(fits[0])} fits better, but F alone does not identify a model: compare the "
+            "models on frames of the sensor with `calibrate law --d`, then set tip.physics"
         )
     lines += [_run_line(test, zeros) for test, zeros in zip(tests, best.zeros, strict=True)]
     lines.append(f"for the profile: {_profile_line(wants, step)}")
@@ -269,7 +269,7 @@ def _fit_line(fit: CompressionFit, deepest: float) -> str:
     if len(fit.factors) > 1:
         mean = float(fit.stress(deepest / fit.tip.radius)) * fit.tip.radius / deepest
         told = (
-            f"E = {fit.modulus / 1e6:.4f} MPa at d = 0, {mean / 1e6:.4f} MPa on average to "
+            f"E = {fit.modulus / 1e6:.4f} MPa at d = 0, {mean / 1e6:.4f} MPa on average up to "
             f"{deepest * 1e3:.1f} mm"
         )
     else:
@@ -285,15 +285,17 @@ def _run_line(test: _Test, zeros: FloatArray) -> str:
     run = test.run
     before, pressed = np.count_nonzero(run.before), np.count_nonzero(run.pressed)
     told = (
-        f"{test.name}: zero of d {zeros[0] * 1e3:.3f} ± {zeros[2] * 1e3:.3f} mm, of F "
+        f"{test.name}: zero offset of d {zeros[0] * 1e3:.3f} ± {zeros[2] * 1e3:.3f} mm, of F "
         f"{zeros[1]:.3f} ± {zeros[3]:.3f} N; fitted {pressed} rows to d = "
-        f"{(run.d.max() - zeros[0]) * 1e3:.2f} mm and {before} before the contact; left out "
-        f"{len(run.d) - before - pressed} of the toe"
+        f"{(run.d.max() - zeros[0]) * 1e3:.2f} mm and {before} before the contact; excluded "
+        f"{len(run.d) - before - pressed} rows of the toe region"
     )
     if run.dropped:
         told += f", {run.dropped} of the unloading"
         told += f" and of {run.cycles - 1} earlier cycles" * (run.cycles > 1)
-    return told + "; no zero of F was measured: begin above the tip" * (not before)
+    return told + "; the zero offset of F was not measured: start the run above the tip" * (
+        not before
+    )
 
 
 def _profile_line(wants: dict[str, Any], step: ModulusStep) -> str:
@@ -342,8 +344,8 @@ def _stress_strain(
     line = (
         f"springs, law of {len(x)} points to a strain of {x[-1]:.2f}: E = "
         f"{material.reference_modulus / 1e6:.4f} MPa at zero strain; F within "
-        f"{material.worst_force_error:.2%}; {len(strain) - (rows.stop - rows.start)} rows of the "
-        f"unloading left out\n  for the profile: {_profile_line(wants, step)}"
+        f"{material.worst_force_error:.2%}; {len(strain) - (rows.stop - rows.start)} unloading "
+        f"rows were excluded\n  for the profile: {_profile_line(wants, step)}"
     )
     changed = {"modulus": step, "wants": wants, "scales": None, "date": now()}
     shown = Points("law", "strain", "stress [kPa]", x, y * 1e-3, material.stress(x) * 1e-3)
@@ -351,7 +353,7 @@ def _stress_strain(
 
 
 def _thinned(strain: FloatArray, stress: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average the points in `_BINS` strain ranges if there are at least twice as many."""
+    """Average the points in `_BINS` strain ranges if there are at least 2 `_BINS` points."""
     if len(strain) < 2 * _BINS:
         return strain, stress
     edges = np.linspace(strain.min(), strain.max(), _BINS + 1)
@@ -376,6 +378,7 @@ def _check_beginning(strain: FloatArray, stress: FloatArray) -> None:
     if secant < slope / _TOE or secant > slope * _TOE:
         raise CalibrationError(
             f"found {secant / 1e3:.3g} kPa from 0 to the strain {strain[first[0]]:.3g}, then "
-            f"{slope / 1e3:.3g} kPa: a toe, or a zero that is off; expected a curve through 0: "
-            f"subtract {-start / slope:.3g} from the strain, and leave out what is below 0"
+            f"{slope / 1e3:.3g} kPa, which indicates a toe region or a zero offset; expected a "
+            f"curve through 0: subtract {-start / slope:.3g} from the strain, and remove the "
+            "points with negative strain"
         )

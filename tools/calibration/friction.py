@@ -22,15 +22,17 @@ from softfinger.tools.calibration.joints import write_keys
 from softfinger.tools.calibration.live_hand import LiveHand
 from softfinger.tools.recordings.reader import read_recording
 
-# (rad/s, rad, number) for each sweep. Slow sweeps measure breakaway friction, fast ones the rest.
+# (rad/s, rad, number) for each sweep. Slow sweeps determine breakaway friction; fast sweeps
+# determine the other friction parameters.
 _SWEEPS = ((0.05, 0.06, 2), (0.3, 0.4, 2), (0.6, 0.4, 2))
 _WIDEST = max(wide for _, wide, _ in _SWEEPS)
 _FROM_ENDS = 0.05  # rad, margin to each end of the joint range
 # rad, tolerance for the start of a sweep, because friction may stop a joint before its goal.
 _ARRIVED = 0.05
-_REST = 0.3  # s, pause between two strokes, in addition to the setpoint smoothing time
+_REST = 0.3  # s, pause between two strokes, in addition to the setpoint's smoothing time
 _TOUCHED = 0.2  # s, discarded before and after each contact because detection takes time
-_SEEN = 2.0  # σ, minimum excess over sliding friction for reporting breakaway friction
+# Standard deviations; breakaway friction is reported if it exceeds sliding friction by more.
+_SEEN = 2.0
 
 
 def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str:
@@ -60,7 +62,7 @@ def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str
     fits = [_fit(columns, name, settings, unit) for name in names]
     found = round(float(np.mean([fit.coulomb for fit in fits])), 4)
     told = [f"{name}: {_told(fit)}" for name, fit in zip(names, fits, strict=True)]
-    told.append(f"one count of the current is {unit:.4f} N·m")
+    told.append(f"one current count corresponds to {unit:.4f} N·m")
     return "\n  ".join([*told, *write_keys(arguments, {"control": {"joint_friction": found}})])
 
 
@@ -100,14 +102,18 @@ def _told(fit: FrictionFit) -> str:
 
 
 def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArray[Any]]:
-    """Sweep the joints one after the other and return all states."""
+    """Sweep one joint at a time, and return all states."""
     names = sorted(settings.scene.fingers)
     ways = {name: _way(settings, name) for name in names}
     told = ", ".join(
         f"{name} {math.degrees(start):.0f}° to {math.degrees(start + way):.0f}°"
         for name, (start, way) in ways.items()
     )
-    bring(arguments, f"friction: keep the space around the fingers free; sweeps {told}", {})
+    bring(
+        arguments,
+        f"friction: keep the space around the fingers free; the joints will sweep {told}",
+        {},
+    )
     with LiveHand(arguments) as hand:
         hand.command("move", **{name: start for name, (start, _) in ways.items()})
         hand.until(
@@ -130,7 +136,7 @@ def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArr
 def _way(settings: Settings, name: str) -> tuple[float, float]:
     """Return the start and signed length [rad] of a joint's sweeps.
 
-    The sweeps open the joint if its range permits, otherwise they close it. Raises CalibrationError
+    The sweeps open the joint if its range permits, and close it otherwise. Raises CalibrationError
     if the range is too short.
     """
     hand, finger = settings.hand, FINGERS.index(name)
@@ -140,8 +146,8 @@ def _way(settings: Settings, name: str) -> tuple[float, float]:
     way = -min(opens, _WIDEST) if opens > 0.5 * _WIDEST else min(closes, _WIDEST)
     if abs(way) < 0.5 * _WIDEST:
         raise CalibrationError(
-            f"friction: {name}: found {math.degrees(abs(way)):.0f}° from hand.open_angle to the "
-            f"ends of its range, expected at least {math.degrees(0.5 * _WIDEST):.0f}°"
+            f"friction: {name}: found {math.degrees(abs(way)):.0f}° between hand.open_angle and "
+            f"the ends of the joint's range, expected at least {math.degrees(0.5 * _WIDEST):.0f}°"
         )
     return start, way
 

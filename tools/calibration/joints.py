@@ -32,12 +32,12 @@ from softfinger.tools.calibration.calibration_frames import bring
 from softfinger.tools.recordings.reader import read_recording
 
 _POSES = {
-    "closed": "close it fully",
-    "open": "open it fully",
-    "zero": "put it upright, straight away from the palm",
+    "closed": "close the finger fully",
+    "open": "open the finger fully",
+    "zero": "point the finger straight away from the palm",
 }
 _LEAST = 0.2  # rad, minimum rotation between closed and open
-_ALONE = 0.25  # 1, fraction of this rotation by which the other finger may move
+_ALONE = 0.25  # 1, maximum motion of the other finger, as a fraction of this rotation
 _MARGIN = 0.03  # rad, margin between the stops and the commanded range
 _Counts = dict[int, int]  # keys: servo IDs
 
@@ -48,13 +48,13 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
     Raises
     ------
     ServoError, CalibrationError, SettingsError
-        If this fails; the profile is then unchanged.
+        If the procedure fails; the profile is then unchanged.
     """
     servos = settings.servos
     if servos.backend != "dynamixel":
         raise CalibrationError(
-            f"servos.backend: found {servos.backend!r}, expected 'dynamixel': this step needs "
-            "real servos"
+            f"servos.backend: found {servos.backend!r}, expected 'dynamixel': this step "
+            "requires physical servos"
         )
     new: dict[str, dict[str, list[Any]]] = {
         "servos": {name: list(getattr(servos, name)) for name in ("ids", "direction", "zero")},
@@ -81,35 +81,41 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
             for (section, key), value in zip(keys, found, strict=True):
                 new[section][key][finger] = value
             old = servos.ids[finger]
-            swapped = "" if servo == old else f" (not {old}: IDs are swapped)"
+            swapped = "" if servo == old else f" (servos.ids has {old}: the IDs are swapped)"
             told.append(
                 f"{name}: servo {servo}{swapped}, direction {direction:+d}, zero {zero} counts, "
                 f"{math.degrees(low):.1f}° to {math.degrees(high):.1f}°"
             )
     if len({new["servos"]["ids"][finger] for finger in scene}) < len(scene):
-        raise CalibrationError(f"servo {new['servos']['ids'][0]} turned for both fingers")
+        raise CalibrationError(
+            f"servo {new['servos']['ids'][0]} rotated with both fingers, expected one servo per "
+            "finger: move one finger at a time"
+        )
     return "\n  ".join([*told, *write_keys(arguments, new)])
 
 
 def _read(line: ServoLine, ids: list[int]) -> _Counts:
-    """Return all servo positions; raise ServoError if torque is on or one exceeds a turn."""
+    """Return all servo positions; raise ServoError if torque is on or a value exceeds one turn."""
     counts = {}
     for servo in ids:
         table = Registers(line.read(servo, 0, CHECKED) or b"")
         if not table:
-            raise ServoError(f"servo {servo}: no answer: see `softfinger doctor`")
+            raise ServoError(f"servo {servo}: no reply: run `softfinger doctor`")
         if table[reg.TORQUE_ENABLE]:
-            raise ServoError(f"servo {servo}: torque is on: end `softfinger run`, or disarm")
+            raise ServoError(
+                f"servo {servo}: torque is on: stop `softfinger run`, or send `disarm`"
+            )
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # After power-up, the position equals the encoder count, which is less than one turn.
+        # After power-up, a servo's position is the encoder count, which is less than one turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder
         if not 0 <= encoder < reg.COUNTS_PER_TURN:
             raise ServoError(
-                f"servo {servo}: its position of {encoder} counts is outside one turn, 0 to "
-                f"{reg.COUNTS_PER_TURN - 1}, and would be off by a turn after a power-up: switch "
-                "its power off and on; if that does not help, mount its horn half a turn further"
+                f"servo {servo}: found a position of {encoder} counts, expected 0 to "
+                f"{reg.COUNTS_PER_TURN - 1} (one turn), because the position changes by a turn at "
+                "power-up: switch its supply off and on; if that does not help, mount the horn "
+                "half a turn further"
             )
     return counts
 
@@ -126,7 +132,8 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
     for other in others:
         if moved[other] > _ALONE * moved[servo]:
             raise CalibrationError(
-                f"{name} finger: servos {servo} and {other} turned, expected one: move it alone"
+                f"{name} finger: servos {servo} and {other} rotated, expected one servo: move "
+                "only one finger"
             )
     return servo
 
@@ -142,7 +149,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
     """
     if len(arguments.recording) != 1:
         raise CalibrationError(
-            "heat: expected --recording with one grip, made by softfinger record"
+            "heat: expected --recording with a recording of one grip, made with softfinger record"
         )
     found = read_recording(arguments.recording[0])
     law, finger = HeatLaw(), arguments.finger
@@ -163,7 +170,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write ``new`` to the file, or to a copy of the profile, and preserve all other text."""
+    """Write ``new`` to the file, or to a copy of the profile; all other text is preserved."""
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
     load(source, arguments.dir or own_runtime_folder(), [*arguments.set, *changes])
@@ -177,7 +184,10 @@ def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any
     with contextlib.suppress(tomllib.TOMLDecodeError):
         found = tomllib.loads(text)
     if found != wanted:
-        raise SettingsError(f"{source}: add these settings yourself: {', '.join(changes)}")
+        raise SettingsError(
+            f"{source}: the file could not be changed; add these settings yourself: "
+            f"{', '.join(changes)}"
+        )
     write_whole(arguments.file, text.encode())
     return changes
 

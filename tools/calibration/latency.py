@@ -29,10 +29,11 @@ FloatArray = NDArray[np.float64]
 _STEPS = (1.0, 0.5, 1.25, 0.5)  # 1, successive forces relative to the first force
 _HELD = 0.5  # s, hold time per force
 _STD_MAX = 5e-3  # s, maximum standard deviation of the latency
-# Accepted ratio of d from frames to d from joints. Outside it, frames do not follow the joints.
+# Accepted ratio of d from frames to d from joints. Outside this range, the frames do not follow the
+# joints.
 _SCALE = 0.5, 2.0
 _MISFIT_MAX = 0.3e-3  # m RMS; larger values indicate sliding, tilting or a second contact
-# Relative errors of d from frames, if d is estimated from the frame shape or its amplitude.
+# Relative errors of d from frames, if d is estimated from the frame's shape or from its amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 
@@ -72,30 +73,32 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
     if fit.std > _STD_MAX:
         raise CalibrationError(
             f"latency: found a standard deviation of {fit.std * 1e3:.1f} ms, expected at most "
-            f"{_STD_MAX * 1e3:g} ms: grasp with more force, and change it several times"
+            f"{_STD_MAX * 1e3:g} ms: grasp with more force, and change the force several times"
         )
     if not _SCALE[0] < fit.scale < _SCALE[1] or fit.residual > _MISFIT_MAX:
         raise CalibrationError(
-            f"latency: found d by the frames at {fit.scale:.2f} of d by the joints, with "
-            f"{fit.residual * 1e3:.2f} mm rms between them, expected {_SCALE[0]:g} to "
-            f"{_SCALE[1]:g} and at most {_MISFIT_MAX * 1e3:g} mm: grasp a flat object that "
-            "neither slides nor tilts"
+            f"latency: found a ratio of d from the frames to d from the joints of {fit.scale:.2f} "
+            f"with a difference of {fit.residual * 1e3:.2f} mm rms, expected a ratio of "
+            f"{_SCALE[0]:g} to {_SCALE[1]:g} and at most {_MISFIT_MAX * 1e3:g} mm: grasp a flat "
+            "object that neither slides nor tilts"
         )
     latency = round(max(set_latency + fit.delay, 0.0), 4)
     told = (
-        f"{latency * 1e3:.1f} ± {fit.std * 1e3:.1f} ms (the daemon used {set_latency * 1e3:g} "
-        f"ms) from {fit.ramps} ramps; d by the frames is {fit.scale:.2f} of d by the joints, "
-        f"{fit.residual * 1e3:.2f} mm rms"
+        f"{latency * 1e3:.1f} ± {fit.std * 1e3:.1f} ms (the daemon used {set_latency * 1e3:g} ms) "
+        f"from {fit.ramps} ramps; d from the frames is {fit.scale:.2f} times d from the joints, "
+        f"difference {fit.residual * 1e3:.2f} mm rms"
     )
     return "\n  ".join([told, *write_keys(arguments, {"tactile": {"latency": latency}})])
 
 
 def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
-    """Grasp with several forces and open again; return the hand with its stored stream."""
+    """Grasp with several forces, then open the hand; return the hand with its stored stream."""
     first = arguments.force[0] if arguments.force else settings.control.force_default
     forces = [min(step * first, settings.safety.force_max) for step in _STEPS]
     bring(
-        arguments, f"latency: put an object between the fingers; it is grasped with {first:g} N", {}
+        arguments,
+        f"latency: put an object between the fingers; the hand will grasp it with {first:g} N",
+        {},
     )
     with LiveHand(arguments) as hand:
         for force in forces:

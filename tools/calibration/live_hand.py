@@ -1,4 +1,4 @@
-"""Move a running daemon's hand during a calibration and store its stream."""
+"""Move the hand of a running daemon during a calibration, and store the stream."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _WITHIN = 20.0  # s in hand time, time limit for each command
 class LiveHand:
     """Context manager that arms the hand and stores its stream as in a `Recording`.
 
-    On exit, the hand is disarmed again if it was disarmed on entry. After an error, torque is
+    On exit, the hand is disarmed again if it was disarmed on entry. After an error, the torque is
     switched off.
     """
 
@@ -35,7 +35,7 @@ class LiveHand:
         self._address, self._keys = arguments.address, arguments.keys
         self._taken: list[tuple[bytes, dict[str, Any]]] = []
         self._disarm = False
-        self._commanded = False  # a command in this context has been accepted
+        self._commanded = False  # True once a command in this context has been accepted
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:

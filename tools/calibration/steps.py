@@ -64,9 +64,10 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-# Relative softening after the first loads that is reported. Plates and noise cause less.
+# Minimum relative softening after the first loads that is reported. Plates and noise cause less
+# softening.
 _SOFTENS = 0.03
-# New calibration, summary line, panels of the plot.
+# New calibration, summary line, and panels of the plot.
 Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 
@@ -78,13 +79,15 @@ def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
     calibration = load_calibration(arguments.file)
     wrong = difference(calibration.sensor, sensor)
     if wrong:
-        raise CalibrationFileError(f"{arguments.file}: calibration of another sensor: {wrong}")
+        raise CalibrationFileError(
+            f"{arguments.file}: the calibration belongs to another sensor: {wrong}"
+        )
     return calibration
 
 
 @dataclass(frozen=True)
 class Step:
-    """Inputs for one step, and quantities used in several steps."""
+    """Inputs for one step, and quantities that several steps use."""
 
     arguments: argparse.Namespace
     settings: Settings
@@ -151,7 +154,7 @@ def done(step: Step) -> Done:
     """Compute the step; may raise CalibrationError."""
     truths = step.loads.truths
     if not step.loads.frames:
-        raise CalibrationError("no frame with d above 0 in this run")
+        raise CalibrationError("found no frame with d above 0 in this run")
     for name, values in truths.items():
         if not np.isfinite(values).all():
             raise CalibrationError(f"{name}: found a value that is not finite")
@@ -178,12 +181,14 @@ def _tare(step: Step) -> Done:
     count = sum(map(len, step.loads.frames))
     rho = found.correlation
     result = _kept(TareStep, found, noise=noise, frames=count)
-    line = f"{count} frames, zero up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
+    line = (
+        f"{count} frames, zero offset up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
+    )
     if rho.size:
         beside = max(float(rho[0, 1:2].sum()), float(rho[1:2, 0].sum()))
-        line += f", correlated {beside:.2f} between neighbours"
+        line += f", correlation {beside:.2f} between neighbouring cells"
     if found.drift > 0.0:
-        line += f", all cells drift by {found.drift:.2f} counts"
+        line += f", common drift of all cells {found.drift:.2f} counts"
     spread = Map("noise, standard deviation [counts]", found.noise)
     return step.result(tare=result), line, (Map("zero [counts]", found.zero), spread)
 
@@ -197,7 +202,7 @@ def _equilibrate(step: Step) -> Done:
         f"{found.residual:.2%} after; {dead} dead"
     )
     calibration = step.result(equilibrate=result, curve=None, **_UNDONE)
-    return calibration, line, (Map("gain of each cell, 0: dead", found.gain),)
+    return calibration, line, (Map("gain of each cell (0: dead cell)", found.gain),)
 
 
 def _curve(step: Step) -> Done:
@@ -217,13 +222,13 @@ def _curve(step: Step) -> Done:
     for k, frames in enumerate(step.loads.frames):
         if (frames >= sensor.full_count).any():
             raise CalibrationError(
-                f"curve: load {k + 1} saturates a cell, so its force can't be used"
+                f"curve: load {k + 1} saturates a cell, so its force can't be used; reduce the load"
             )
     gains = step.calibration.equilibrate
     full = float(sensor.full_count) * max(map(max, gains.gain) if gains else [1.0])
     found = fit_curve(step.arguments.kind, step.readings, force, step.cell_area, full)
     result = _kept(CurveStep, found)
-    line = f"{found.kind} from {len(force)} loads, forces within {found.residual:.2%} rms"
+    line = f"{found.kind} from {len(force)} loads, force error {found.residual:.2%} rms"
     left = Points("residuals", "known [N]", "relative error [%]", force, 100.0 * found.errors)
     return step.result(curve=result, **_UNDONE), line, (left,)
 
@@ -241,7 +246,7 @@ def _centre(step: Step) -> Done:
     result = _kept(CentreStep, found)
     x, y = found.centre
     rotation = (
-        "rotation not measured: no press was tilted"
+        "rotation not measured, because all presses were upright"
         if found.rotation is None
         else f"rotation {math.degrees(found.rotation):.2f}°"
     )
@@ -259,16 +264,16 @@ def _modulus(step: Step) -> Done:
     pressed = zip(step.pressures, step.readings, strict=True)
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
-    whole = ~full.any(axis=(1, 2))  # saturated cells hide part of the force
+    whole = ~full.any(axis=(1, 2))  # saturated cells mask part of the force
     tip = make_tip(step.settings)
     found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
-        f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} loads, zero of d at "
-        f"{found.offset * 1e3:.3f} mm, force within {found.residual:.2%} rms"
+        f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} loads, zero offset of "
+        f"d {found.offset * 1e3:.3f} mm, force error {found.residual:.2%} rms"
     )
     line += f"; {_over_d(found.trend)}"
     if not whole.all():
-        line += f"; {np.count_nonzero(~whole)} frames left out, saturated"
+        line += f"; {np.count_nonzero(~whole)} saturated frames were excluded"
     result = _kept(ModulusStep, found)
     d, theta, force = d[whole], theta[whole], force[whole]
     table = ContactTable.build(tip, Material.constant(found.modulus))
@@ -284,7 +289,7 @@ def _law(step: Step) -> Done:
     if d is None:
         raise CalibrationError("law: expected --d, or a run that contains d")
     if len(d) < 3 or np.ptp(d) <= 0.0:
-        raise CalibrationError("law: expected at least three presses of different d")
+        raise CalibrationError("law: expected at least three presses with different d")
     sensor = step.calibration.sensor
     grid = calibrated_grid(settings, FINGERS.index(sensor.finger), step.calibration)
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
@@ -315,17 +320,20 @@ def _law(step: Step) -> Done:
     except CurvesError as error:
         if best.valid == 0.0:
             raise CalibrationError(
-                f"law: no model fits these presses; the best: {lines[0]}; measured: {error}"
+                f"law: no model fits these presses; best model: {lines[0]}; measured curves: "
+                f"{error}"
             ) from None
-        lines.append(f"measured: no curves: {error}")
+        lines.append(f"measured: could not fit curves: {error}")
     if best.trend is not None:
         lines.insert(1, _over_d(best.trend))
     softer = first_cycle(d, theta, signed.sum(axis=(1, 2)))
     if softer is not None:
-        lines.insert(1, f"first presses read {softer:+.1%} compared with later equal presses")
+        lines.insert(
+            1, f"the first presses read {softer:+.1%} compared with later presses of equal depth"
+        )
         if softer > _SOFTENS:
             lines[1] += (
-                ": the rubber softens; press it several times to the full depth, then "
+                ": the rubber softens; press the tip several times to the full depth, then "
                 "calibrate again"
             )
     told = (f"tip.{name} = {json.dumps(value)}" for name, value in wants.items())
@@ -348,7 +356,7 @@ def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArra
     d, theta, frames = step.loads.truths["d"], step.theta, step.loads.frames
     sensor, converter, tare = step.calibration.sensor, step.converter, step.calibration.tare
     if any((each >= sensor.full_count).any() for each in frames):
-        raise CurvesError("a press saturates a cell, so its force can't be used")
+        raise CurvesError("a press saturates a cell, so its force can't be used; reduce the load")
     seen = [np.stack([converter(frame).copy() for frame in each]) for each in frames]
     pressures = np.stack([converter.pressure(each) for each in step.over])
     rest = converter.pressure((tare.excess if tare else 0.0) * converter.gain)
@@ -373,18 +381,18 @@ def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArra
 def _measured_told(law: TipCurves, left: FloatArray) -> str:
     d, theta, force = left.tolist()
     return (
-        f"measured: curves of {law.presses} presses to {law.deepest * 1e3:g} mm and "
+        f"measured: curves from {law.presses} presses up to {law.deepest * 1e3:g} mm and "
         f"{math.degrees(law.tilt):g}°; remaining errors: d {d * 1e3:.3f} mm, θ "
         f"{math.degrees(theta):.2f}°, F {force:.1%}"
     )
 
 
 def _over_d(trend: Trend) -> str:
-    """Describe E at minimum, middle and maximum d, with a warning if E drifts."""
+    """Describe E at the minimum, middle and maximum d, with a warning if E drifts."""
     order = np.argsort(trend.d, kind="stable")[[0, len(trend.d) // 2, -1]]
     values = ", ".join(f"{each / 1e6:.3f}" for each in trend.modulus[order])
     depths = ", ".join(f"{each * 1e3:g}" for each in trend.d[order])
-    told = f"E alone at {depths} mm: {values} MPa"
+    told = f"E fitted separately at {depths} mm: {values} MPa"
     if not trend.drifts:
         return told
     return f"{told}: drifts by {trend.drift:+.0%} ± {trend.std:.1%}, so {trend.cause}"
@@ -398,15 +406,14 @@ def _name(fit: TipFit) -> str:
 
 def _told(fit: TipFit) -> str:
     words = (
-        f"{_name(fit)}: E = {fit.modulus / 1e6:.4f} MPa, zero of d at {fit.offset * 1e3:.3f} mm, "
-        f"χ² {fit.chi2:.2f} per cell; "
+        f"{_name(fit)}: E = {fit.modulus / 1e6:.4f} MPa, zero offset of d {fit.offset * 1e3:.3f} "
+        f"mm, χ² {fit.chi2:.2f} per cell; "
     )
     if fit.valid == 0.0:
-        return words + "no frame is a valid contact"
+        return words + "all frames are invalid"
     return words + (
-        f"remaining errors: d {fit.d_error * 1e3:.3f} mm, θ "
-        f"{math.degrees(fit.theta_error):.2f}°, F {fit.force_error:.1%}, {fit.valid:.0%} of the "
-        "frames valid"
+        f"remaining errors: d {fit.d_error * 1e3:.3f} mm, θ {math.degrees(fit.theta_error):.2f}°, "
+        f"F {fit.force_error:.1%}, {fit.valid:.0%} of the frames are valid"
     )
 
 
@@ -417,7 +424,7 @@ def _relaxation(step: Step) -> Done:
     found = fit_relaxation(t, force, step.settings.tip.relaxation_times)
     strengths = ", ".join(f"{each:.3f}" for each in found.strengths)
     line = (
-        f"force within {found.residual:.2%} rms, {found.elastic:.2%} for an elastic tip; for the "
+        f"force error {found.residual:.2%} rms, {found.elastic:.2%} for an elastic tip; for the "
         f"profile: tip.relaxation = [{strengths}]"
     )
     shown = Points("hold", "t [s]", "F [N]", t, force, found.model)

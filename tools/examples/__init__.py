@@ -1,1 +1,1 @@
-"""Self-contained example programs to copy, which use the public client and kinematics."""
+"""Self-contained example programs for users to copy; they use the public client and kinematics."""

@@ -5,7 +5,8 @@ whole file,
 
     python -m softfinger.tools.examples.grasp_and_turn --picture grasp_and_turn.png
 
-or run it cell by cell in an editor that supports ``# %%``. It needs matplotlib (extra ``plot``).
+or run the file cell by cell in an editor that supports ``# %%``. The script needs matplotlib (extra
+``plot``).
 """
 
 # %% Settings: hand address, force and angles
@@ -27,7 +28,7 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--stream")
 parser.add_argument("--commands")
 parser.add_argument("--picture", default="grasp_and_turn.png")
-where = parser.parse_known_args()[0]  # ignore arguments of a notebook
+where = parser.parse_known_args()[0]  # ignore the arguments of a notebook kernel
 
 FORCE = 8.0  # N on each tip
 ANGLES = (12.0, -12.0, 0.0)  # degrees, in this order
@@ -80,7 +81,7 @@ minimum = theta[np.argmin(energy, axis=1)]
 LOOKS = {"left": ("#0072B2", "-"), "right": ("#D55E00", "--")}
 figure = Figure(figsize=(9.0, 4.2), layout="constrained")
 panels = figure.subplot_mosaic([["force", "map"], ["angle", "map"]], width_ratios=[1.0, 1.15])
-# levels are denser at low U, because U grows as d³
+# the levels are denser at low U, because U grows as d³
 levels = 1e3 * energy.max() * np.linspace(0.0, 1.0, 11) ** 2
 shown = panels["map"].contourf(
     theta * DEGREES, d * 1e3, energy * 1e3, levels, cmap="Greys", vmax=1.8 * levels[-1]

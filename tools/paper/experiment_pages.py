@@ -1,9 +1,9 @@
 """Draw Figs. 7, 10 and 11: model curves for the paper's two experiments and for its appendix.
 
 The paper shows its measurements only as plots, so the measured points are not reproduced. The
-appendix splits U(d, 0) (eq. 12) into three terms. They are computed both by integration and from
-the printed equations. `terms` and `limits` use SI units and the paper's dimensions: eq. 16 is a
-length, eq. 18 is dimensionless, and eq. 19 is an inverse length.
+appendix splits U(d, 0) (eq. 12) into three terms. The terms are computed both by integration and
+from the printed equations. `terms` and `limits` use SI units and the paper's dimensions: eq. 16 is
+a length, eq. 18 is dimensionless, and eq. 19 is an inverse length.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return force and energy along the path: the finger rotates about its root, the object rolls.
+    """Return force and energy while the finger rotates about its root and then the object rolls.
 
     For each final displacement D, the root is D/sin 11.5° away from the tip centre. During the
     rotation, d therefore increases from first touch as D sin |θ|/sin 11.5°. During rolling, d is
@@ -124,7 +124,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
             f"F at d = {deepest} mm [N]": _force(d, tilting),
         }
         force, law = _force(d, rolling), _force_table_i(d, rolling)
-        # If the springs point at the tip centre (Nguyen and Arimoto), N = πE d² at any tilt.
+        # If the springs point towards the tip centre (Nguyen and Arimoto), N = πE d² at any tilt.
         radial = np.full(rolling.shape, math.pi * MODULUS * (d * MILLI) ** 2)
         second |= {
             f"F at d = {deepest} mm [N]": force,
@@ -174,7 +174,7 @@ class Terms(NamedTuple):
     third: FloatArray  # 1/m, eq. 19
 
     def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
-        """Return U(d, 0) [J] according to eq. 12."""
+        """Return U(d, 0) [J] from eq. 12."""
         first, second, third = self.terms(radius, modulus, d)
         return first + second + third
 
@@ -186,7 +186,7 @@ class Terms(NamedTuple):
 
 
 def limits(radius: float, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return θ_max and p [rad] from eqs. 15 and 17: the values of θ and t at the contact rim."""
+    """Return θ_max and p [rad] (eqs. 15 and 17), i.e. the values of θ and t at the contact rim."""
     h = radius - d
     theta_max = np.arctan(np.sqrt(radius**2 - h**2) / h)
     return theta_max, np.arccos(h / radius * np.tan(theta_max))
@@ -216,7 +216,7 @@ def integrated_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def _appendix() -> tuple[Sheet, ...]:
-    d = np.arange(1, 81) / 10.0  # The terms cancel at d = 0.
+    d = np.arange(1, 81) / 10.0  # The terms cancel each other at d = 0.
     metres = d * MILLI
     columns = {"d [mm]": d}
     for how, terms in (
@@ -257,13 +257,13 @@ PAGES = {
                 "the elastic force is proportional to the over-square of the displacement, also in "
                 "experiments",
                 "The model's exponent is exactly 2 at every angle, with the prefactor 1/cos θ. "
-                "The exponent is larger only if the modulus increases with strain.",
+                "The exponent is larger only if the modulus increases with the strain.",
             ),
             Erratum(
                 "IV-A",
                 "an approximately constant error over d, which a higher modulus brings close",
-                "The force of springs is πE d²/cos θ. Another E multiplies F by a factor; it "
-                "does not add a constant that is independent of d.",
+                "The force of springs is πE d²/cos θ. A different E multiplies F by a constant "
+                "factor. It does not add a constant that is independent of d.",
             ),
         ),
         notes=(
@@ -303,15 +303,15 @@ PAGES = {
         errata=(
             Erratum(
                 "eq. 18",
-                "the last integral, of t⁻³ from cos θ_max to 1, has no dt",
+                "the last integral, of t⁻³ from cos θ_max to 1, lacks dt",
                 "The integral is 2π ∫ t⁻³ dt. Its value is correct.",
             ),
             Erratum(
                 "Appendix I",
                 "eq. 10 is converted to spherical coordinates",
                 "x² + y² = (a − d)² tan² θ and eq. 14 are polar coordinates in the contact plane, "
-                "r = (a − d) tan θ. The angle θ at the tip's centre points to a point of that "
-                "plane, not to a point of the sphere.",
+                "r = (a − d) tan θ. The angle θ at the tip's centre specifies a point in this "
+                "plane, not a point on the sphere.",
             ),
         ),
         notes=("Tip of radius 20 mm, E = 0.304 MPa, as in the paper.",),

@@ -44,7 +44,7 @@ MILLI = 1e-3
 MPA = 1e-6
 _NODES = 64  # Gauss nodes per double integral
 _STEEP_TILT = 25  # degrees, tilt at which the slope is reported
-_FITTED = slice(10, None)  # rows from 1 to 8 mm, used to fit the exponents
+_FITTED = slice(10, None)  # rows from 1 to 8 mm, which are used to fit the exponents
 _STEP = 1e-4  # relative or rad, finite-difference step
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
@@ -62,7 +62,7 @@ def _tangent(material: Material, strain: FloatArray) -> FloatArray:
 
 
 def law() -> tuple[Sheet, ...]:
-    """Tabulate the law versus strain, and compare Table I with the law at the same strains."""
+    """Tabulate the law versus strain, and compare the law with Table I at the table's strains."""
     material = Material.table_i()
     strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
     curve = {
@@ -146,7 +146,7 @@ class Plotted:
     equation: int
     power: str  # power law in d at θ = 0
     prefactor: str
-    straight: float  # power-law factor divided by E
+    straight: float  # factor of the power law, divided by E
 
     def closed(self, d: Numbers, theta: Numbers) -> FloatArray:
         """Return the closed form in the figure's unit, with d in mm and θ in degrees."""
@@ -341,16 +341,16 @@ PAGES = {
                 "III-A",
                 "Young's modulus is comparatively large when the fingertip deforms a little, and "
                 "comparatively small unless it deforms largely",
-                "The modulus in Table I increases with strain, from 0.135 to 0.304 MPa, so the "
-                "text contradicts itself. E should be calibrated in compression; the default is "
-                "0.304 MPa.",
+                "The text contradicts Table I, in which the modulus increases with the strain, "
+                "from 0.135 to 0.304 MPa. Calibrate E in compression; the default is 0.304 MPa.",
             ),
             Erratum(
                 "III-A",
-                "the true stress of a tension test over its strain is the springs' law",
+                "the springs follow the true stress versus strain of a tension test",
                 "The springs are compressed. For a neo-Hookean rubber with the modulus E at small "
-                "strains, the true stress at 40 % is 0.42 E in tension and 0.44 E in compression, "
-                "but the force per initial cross-section is 0.30 E and 0.73 E.",
+                "strains, the true stress at 40 % strain is 0.42 E in tension and 0.44 E in "
+                "compression. The force per initial cross-section is 0.30 E in tension and 0.73 E "
+                "in compression.",
             ),
         ),
         notes=(
@@ -376,8 +376,8 @@ PAGES = {
                 "the continuous line is πEd², and all the other curves follow a power law whose "
                 "exponent is more than the square",
                 "With the constant E of the plot, the exponent is exactly 2 at every angle. The "
-                "angle changes only the prefactor, F = πEd² · 1/cos θ. With Table I's law, the "
-                "exponent is above 2 and increases with the angle.",
+                "angle changes only the prefactor, F = πEd² · 1/cos θ. With the law of Table I, "
+                "the exponent is above 2 and increases with the angle.",
             ),
         ),
         notes=(_TIP,),
@@ -396,8 +396,8 @@ PAGES = {
             ),
         ),
         notes=(
-            f"{_TIP} The minimum at θ = 0 is that at a fixed d. At a fixed normal force N, U − N d "
-            "has the minimum.",
+            f"{_TIP} At a fixed d, U is minimal at θ = 0. At a fixed normal force N, U − N d is "
+            "minimal at θ = 0.",
         ),
     ),
     "fig5b": _depth_page(
@@ -410,8 +410,8 @@ PAGES = {
                 "the continuous line is proportional to the cube of d, and the power law exceeds "
                 "the cube as the angle increases to 30°",
                 "With the constant E of the plot, the exponent is exactly 3 at every angle. The "
-                "angle changes only the prefactor, U = (πEd³/3) · 1/cos² θ. With Table I's law, "
-                "the exponent is above 3 and increases with the angle.",
+                "angle changes only the prefactor, U = (πEd³/3) · 1/cos² θ. With the law of Table "
+                "I, the exponent is above 3 and increases with the angle.",
             ),
         ),
         notes=(_TIP,),

@@ -41,7 +41,7 @@ Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ) and the resu
 RADIUS = 0.020  # m
 SCAN = 0.040  # s
 TILTED = math.radians(11.5)  # finger rotation about its root
-ROLLED = math.radians(20.7)  # rotation of the object as it rolls back
+ROLLED = math.radians(20.7)  # rotation of the object while it rolls back
 _SPEED = 0.002  # m/s, compression speed
 _GAP = 0.5e-3  # m, gap before compression
 _D_MAX = 0.4 * RADIUS
@@ -49,8 +49,8 @@ _ROOT_DEPTH = 0.004  # m, displacement after the finger rotation
 _MOTION_MARGIN = math.radians(3.0)
 _WIDTH = 0.040
 _HALF_SEPARATION = 0.050
-_ROLL_STEPS = 104  # frames during rolling
-_LATE_FRAME_COUNT = 2  # frames in transit
+_ROLL_STEPS = 104  # number of frames during rolling
+_LATE_FRAME_COUNT = 2  # number of frames in transit
 _RELATIVE_D_MIN = 1.0  # mm, displacement above which relative errors are shown
 _ROLLED_AT = 4  # mm, displacement in the figure of the whole path
 _PATH = -12.5, 10.5
@@ -76,8 +76,8 @@ def run_compression(tilt: float) -> dict[str, FloatArray]:
 def run_rotation() -> dict[str, FloatArray]:
     """Rotate the finger by 11.5° about its root against a fixed object, starting at first touch.
 
-    The root distance is chosen so that d reaches 4 mm. The servo moves the joint. Between frames, d
-    and θ are predicted from the joint angle.
+    The distance from the root is chosen so that d reaches 4 mm. The servo moves the joint. Between
+    frames, d and θ are predicted from the joint angle.
     """
     length = _ROOT_DEPTH / math.sin(TILTED)
     sections: Sections = {
@@ -151,7 +151,7 @@ def _frames(
     assert hand is not None
     if place is not None:
         place(hand, 0.0)
-        loop.advance(3.0 * SCAN)  # Let older frames arrive first.
+        loop.advance(3.0 * SCAN)  # Let all older frames arrive first.
     last = loop.state.contacts[0].seq
     for k in range(count + _LATE_FRAME_COUNT):
         if place is not None:
@@ -175,7 +175,7 @@ def _estimates(contact: Contact) -> tuple[float, ...]:
 def _columns(
     rows: Iterable[Row], daemon: Daemon, suffix: str = "", sign: float = 1.0
 ) -> dict[str, FloatArray]:
-    """Return true and estimated values per frame; ``sign`` converts θ to the paper's sign."""
+    """Return true and estimated values per frame; ``sign`` converts θ to the paper's convention."""
     truth, estimates = (np.array(each) for each in zip(*rows, strict=True))
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
     contact = daemon.tables[0](d, theta)

@@ -1,6 +1,6 @@
 """Explain the minimum slightly before 0° (Sec. IV-B): part of the rolling motion shears the tip.
 
-The finger is tilted to −11.5°, then the object rolls to 9.2° at constant displacement d. A fraction
+The finger is tilted to −11.5°. Then the object rolls to 9.2° at constant displacement d. A fraction
 s of the face motion is not followed by rolling and shears the tip by
 
     ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
@@ -9,13 +9,14 @@ For the springs of the parallel distributed model, with equal lateral and axial 
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      F = πE [d²/cos θ + 2 d ζ sin θ]
 
-F is the sum of the spring forces on the base. A sensor under the tip measures this sum. The ζ term
-has the same sign as θ, so the minima of F and U are before the upright position. ∂U/∂d is the force
-on the face at fixed tilt and shear. Its minimum is between those of F and U.
+F is the sum of the spring forces on the base. A sensor under the tip measures this sum. The terms
+with ζ sin θ and ζ tan θ have the sign of θ, so the minima of F and U are before the upright
+position. ∂U/∂d is the force on the face at fixed tilt and shear. The minimum of ∂U/∂d lies between
+the minima of F and U.
 
-*Plant* is the simulated tip, which integrates the shear. The force on its base is N cos θ + T sin
-θ. This exceeds F by πE ζ² cos θ, because the plant's springs shear as soon as they touch at the
-contact rim.
+*Plant* is the simulated tip, which integrates the shear. The force on the base of the plant's tip
+is N cos θ + T sin θ. This force exceeds F by πE ζ² cos θ, because the plant's springs shear from
+the moment they touch at the contact rim.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ DOT = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
 
 @dataclass(frozen=True)
 class Sheet:
-    """Columns of equal length, with keys of the form ``name [unit]``; ``name`` names the file.
+    """Columns of equal length, with keys ``quantity [unit]``; ``name`` is the file name.
 
     Values are strings or numbers. NaN is written as an empty cell. Dimensionless numbers have the
     unit 1, and strings have no unit.

@@ -1,16 +1,16 @@
 """Compute quasi-static manipulation (Sec. V) from equations and compare with the simulated hand.
 
-Both tips consist of the paper's springs and stick to the object. There is no other friction. For a
-tip with shear ζ
+Both tips consist of the paper's springs and stick to the object. The model does not include any
+other friction. For a tip with shear ζ
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
-The shear rate is the rolling speed minus the speed along the face and minus the component along a
-tilted face due to increasing d. s, d and θ are defined in `kinematics.hand.geometry`; the right
-tip's θ is mirrored. The object is at equilibrium if Σ δU = 0 for each possible motion. With M =
-∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0. Every
-pose in a slow turn satisfies this condition. `turned` solves it step by step, without time, mass or
-damping.
+The shear rate is the rolling speed minus two other terms: the speed along the face, and the
+component along a tilted face due to increasing d. s, d and θ are defined in
+`kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium if Σ δU = 0
+for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ +
+T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies this condition. `turned` solves this
+condition step by step, without time, mass or damping.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _FREE = {"table_friction": 0.0, "joint_friction": 0.0}
 
 
 class Held(NamedTuple):
-    """Pose of hand and object, and both tip contacts."""
+    """Pose of the hand and the object, and contacts of both tips."""
 
     q: FloatArray
     pose: FloatArray
@@ -117,7 +117,7 @@ def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
 
 
 def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
-    """Find the root near ``start`` by Newton's method; raise RuntimeError if this fails."""
+    """Find the root near ``start`` by Newton's method; raise RuntimeError without convergence."""
     x = start.copy()
     for _ in range(30):
         value = residual(x)
@@ -165,7 +165,7 @@ def potential(there: Held, start: Held) -> float:
 def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
     """Return V at the object angle of ``floor`` plus each offset in ``aside`` [rad].
 
-    The antisymmetric joint angle is that of ``floor``, and V is minimised over all other
+    The antisymmetric joint angle equals that of ``floor``, and V is minimised over all other
     coordinates. The tips roll to each pose from ``start`` in one step. V is NaN where a tip would
     slip.
     """
@@ -195,8 +195,8 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
 def swing() -> list[dict[str, float]]:
     """Rotate the object in the simulated hand back and forth; return one row every 20 ms.
 
-    The holding force deviates by a few percent, so ΣU and T are scaled to `FORCE`: ΣU is
-    proportional to F^(3/2), and T to F.
+    The holding force deviates by a few percent from `FORCE`. ΣU and T are therefore scaled to
+    `FORCE`, since ΣU is proportional to F^(3/2) and T to F.
     """
     sections: dict[str, dict[str, Any]] = {
         "material": {"law": "constant", "modulus": MODULUS},

@@ -1,8 +1,8 @@
 """Run ``softfinger validate``: compare the model with published values.
 
-Each row shows a computed quantity, the published value with its source, and a verdict: agree,
-disagree or unknown. Quantities that are not modelled, or that require measurements on hardware, are
-unknown; the reason is given.
+Each row shows a computed quantity, the published value with its source, and the verdict ``agree``,
+``disagree`` or ``unknown``. The verdict is ``unknown``, with a reason, for quantities that are not
+modelled or that require measurements on hardware.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _tips() -> Iterator[PublishedValue]:
     source = "Human Inspired Dexterity in Robotic Manipulation, table 7.1"
     for law in _LAWS:
         zeta = exponent(DEPTHS, _table(law)(DEPTHS, 0.0 * DEPTHS, "force"))
-        stiff = "with a constant modulus, F = π E d² for every E" if law == "springs" else ""
+        stiff = "with a constant modulus, ζ = 2 for every E" if law == "springs" else ""
         yield between(f"ζ of F = C d^ζ, 1 to 7 mm: {law}", 1.46, 1.88, f"silicone cores: {source}",
                       zeta, why=stiff)  # fmt: skip
     radius = np.sqrt(2.0 * RADIUS * DEPTHS - DEPTHS**2)
@@ -114,10 +114,10 @@ def _tips() -> Iterator[PublishedValue]:
     yield PublishedValue(
         "γ of the contact radius: solid",
         "0.00 to 0.33",
-        "the same",
+        "Xydas & Kao, IJRR 18(9), 1999",
         "—",
         "unknown",
-        "the data contain the pressure under the base, not on the face",
+        "the data contain only the pressure under the base, not on the face",
     )
     springs = _table("springs")
     hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(RADIUS)
@@ -150,7 +150,7 @@ def _energy() -> Iterator[PublishedValue]:
         source,
         f"{before:.1f}°",
         "agree" if -3.0 < before < 0.0 else "disagree",
-        "if 5 % of the rolling motion shears the tip instead",
+        "if 5 % of the rolling motion shears the tip",
     )
     d, chosen = 1e-3 * np.arange(8, 33) / 4.0, Material.constant(1.0)
     for face in ("frictionless", "sticking"):
@@ -176,7 +176,7 @@ def _relaxation() -> Iterator[PublishedValue]:
         "Pawluk & Howe, 1999",
         ", ".join(f"{t:g} s" for t in times),
         "unknown",
-        "the published times; `calibrate relaxation` measures the amplitudes",
+        "the defaults are the published values; `calibrate relaxation` measures the amplitudes",
     )
     yield PublishedValue(
         "stability of a grasp over time",
@@ -192,7 +192,7 @@ def _relaxation() -> Iterator[PublishedValue]:
         "Case et al., Soft Robotics 2015",
         "none",
         "disagree",
-        "the simulated tips do not change",
+        "the simulated tips do not soften",
     )
     yield PublishedValue(
         "shear on a sticking face",
@@ -209,7 +209,7 @@ def _sensors() -> Iterator[PublishedValue]:
         d, angle, force = _errors(Settings() if name == "ideal" else load(Path(name)))
         for quantity, ours, published, unit, source in (
             ("depth", 1e3 * d, 0.4, " mm", "localisation error of Insight, arXiv 2111.05934"),
-            ("angle", math.degrees(angle), 5.0, "°", "force direction, the same source"),
+            ("angle", math.degrees(angle), 5.0, "°", "force direction, Insight, arXiv 2111.05934"),
             ("force", force, 0.44, " N", "uSkin 0.12, FingerTac 0.16 to 0.44, arXiv 2411.13335"),
         ):  # fmt: skip
             yield between(f"rms error of {quantity} at 5 mm: simulated sensor, {name}", 0.0,
@@ -234,7 +234,7 @@ def _hands() -> Iterator[PublishedValue]:
     from softfinger.tools.benchmarks.reflex import overloaded
 
     answers = [overloaded({}, 0.0, 13.0, seed).answer for seed in range(1, _TRIALS + 1)]
-    simulated = "in virtual time, without delays of the bus and the motor except those simulated"
+    simulated = "in virtual time, with only the simulated delays of bus and motor"
     yield between("maximum time from the onset of slip to a force increase", 0, 40,
                   "reaction in 35 to 40 ms, arXiv 2602.16127; humans 100 ms, Delhaye 2024",
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
@@ -244,7 +244,7 @@ def _hands() -> Iterator[PublishedValue]:
         "Rhoban, arXiv 2410.08650",
         f"{Settings().simulation.joint_friction:g} N·m",
         "disagree",
-        "Coulomb friction that is independent of the load",
+        "simulated as Coulomb friction, which is independent of the load",
     )
     yield PublishedValue(
         "all results on physical hardware",

@@ -1,1 +1,1 @@
-"""Implement `run`, `emulate` and `compile`, their child processes and the event log."""
+"""Implement the commands `run`, `emulate` and `compile`, child processes and the event log."""

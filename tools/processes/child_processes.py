@@ -21,20 +21,20 @@ from softfinger.daemon.errors import SoftfingerError
 
 # This sequence restores the terminal if the monitor was killed.
 RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
-_RECORDER_TIMEOUT = 20.0  # s, timeout for a recorder to subscribe or to close its file
+_RECORDER_TIMEOUT = 20.0  # s, time limit for a recorder to subscribe or to close its file
 
 
 class RecorderError(SoftfingerError):
-    """The recorder did not start. The error text is the recorder's message."""
+    """The recorder did not start. The error text is the recorder's own message."""
 
 
 class _Lifeline:
     """Pipe that ends a child process when it is closed."""
 
     def start(self, words: list[str], keys: str, **options: Any) -> subprocess.Popen[Any]:
-        """Start ``softfinger`` with the arguments ``words``, and ``--keys`` if keys are set."""
+        """Start ``softfinger`` with the arguments ``words`` and, if keys are set, ``--keys``."""
         reads, self._ours = os.pipe()
-        # -P keeps a folder named tools in the working directory from being imported.
+        # With -P, a folder named tools in the working directory is not imported.
         command = [sys.executable, "-P", "-m", "softfinger", *words, "--lifeline", str(reads)]
         try:
             return subprocess.Popen(
@@ -73,7 +73,8 @@ class MonitorProcess:
         self.process = self._lifeline.start(words, keys)
         called = False
 
-        def child_changed(*_: Any) -> None:  # also called for stopped and continued children
+        # This handler is also called for stopped and continued children.
+        def child_changed(*_: Any) -> None:
             nonlocal called
             if not called and self.process.poll() is not None:
                 called = True
@@ -94,7 +95,7 @@ class MonitorProcess:
                 break
             except subprocess.TimeoutExpired:
                 end()
-        # If the monitor was killed, its page is still on the screen.
+        # If the monitor was killed, the screen still shows its page.
         if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
@@ -110,7 +111,7 @@ class MonitorProcess:
 class RecorderProcess:
     """Run ``record`` with the arguments ``words``, of which the first is the file.
 
-    ``failed`` is set once the recording is known to be incomplete.
+    ``failed`` is set as soon as the recording is known to be incomplete.
     """
 
     def __init__(
@@ -161,7 +162,7 @@ class RecorderProcess:
         if self._process.returncode < 0:
             name = signal.Signals(-self._process.returncode).name
             why = [f"ended by {name}; `softfinger record --recover {self._path}` repairs its file"]
-        self._on_end(f"the recorder has ended, and nothing more is recorded: {why[0]}")
+        self._on_end(f"the recorder has ended, so recording has stopped: {why[0]}")
 
     def close(self) -> str:
         """End the recording and return the recorder's summary."""

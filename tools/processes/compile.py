@@ -38,7 +38,7 @@ from softfinger.tools.sweep import Progress, processors
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
-_MEMORY_MAX = 400e6  # bytes, upper bound per process
+_MEMORY_MAX = 400e6  # bytes, upper bound of the memory use per process
 _CHECK_INTERVAL = 0.2  # s
 
 
@@ -65,14 +65,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Built(NamedTuple):
-    """Result of a build: the number of missing parts, and a flag for failures."""
+    """Result of a build: number of missing parts, and whether a part has failed."""
 
     parts: int
     failed: bool
 
 
 def print_event(_level: str, _kind: str, text: str) -> None:
-    """Print an event to standard error, for tools without a log."""
+    """Print an event to standard error, for tools that do not have a log."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -83,18 +83,21 @@ def build_kernels(
 
     If all parts exist, the function returns quickly without a message. If standard error is a
     terminal and ``bar`` is set, a bar shows the progress. Otherwise ``tell(level, kind, text)`` is
-    called for each part. Failures are also passed to ``tell``. An interruption ends all processes.
+    called for each part. Failures are also passed to ``tell``. If the function is interrupted, all
+    processes end.
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
-        text = f"{folder.path}: compiling {count} damaged files again"
+        text = f"{folder.path}: compiling {count} corrupted files again"
         tell("warning", "compile", text)
     missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
     if not missing:
         return Built(0, False)
     if folder is None:
         tell(
-            "warning", "compile", "kernels are compiled in this process, which takes half a minute"
+            "warning",
+            "compile",
+            "compiling the kernels in this process, which takes about half a minute",
         )
         return Built(0, False)
     if why_plain:
@@ -159,11 +162,12 @@ class _Build:
             for process in self._processes:
                 with process:
                     pass
-        # Report each reason only once, because wrong settings make all parts fail in the same way.
+        # Report each reason only once, because invalid settings make all parts fail in the same
+        # way.
         reasons: set[str] = set()
         for name, future in built.items():
             if (reason := future.result()) and reason not in reasons:
-                self._tell("warning", "compile", f"{name} was not compiled ahead: {reason}")
+                self._tell("warning", "compile", f"{name} was not compiled ahead of time: {reason}")
             reasons.add(reason)
         self.failed = reasons != {""}
 
@@ -174,7 +178,7 @@ class _Build:
         )
 
     def _build(self, part: Part, after: Future[str] | None) -> str:
-        """Wait for ``after``, build a part in this thread's process; return the failure reason."""
+        """Wait for ``after``, build a part in this thread's process; return any failure reason."""
         if after is not None:
             wait([after])
         head, process = "", getattr(self._own, "process", None)
@@ -200,12 +204,12 @@ class _Build:
             return rest
         self._own.process = None
         del self._at[part.name]
-        return f"its process ended with status {process.wait()}"
+        return f"the compiling process exited with status {process.wait()}"
 
 
 def _start() -> subprocess.Popen[str]:
     """Start a process that runs `main`."""
-    # -P keeps a folder named tools in the working directory from being imported.
+    # With -P, a folder named tools in the working directory is not imported.
     command = [sys.executable, "-P", "-m", "softfinger.tools.processes.compile"]
     path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(
@@ -214,7 +218,7 @@ def _start() -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
         text=True,
-        process_group=0,  # Only the parent receives Ctrl-C, and it ends the children.
+        process_group=0,  # Only the parent process receives Ctrl-C; it then ends the children.
     )
 
 
@@ -225,10 +229,11 @@ def main() -> None:
     output has three kinds of lines: ``kernel NAME`` when a kernel is started, ``done`` when a part
     has been built, and ``failed REASON`` when a part could not be built.
     """
-    # The compiler allocates many long-lived objects, so frequent collections cost 10 % of the time.
+    # The compiler allocates many long-lived objects, so frequent garbage collections take 10 % of
+    # the time.
     gc.set_threshold(100_000)
     out = sys.stdout
-    sys.stdout = sys.stderr  # Other output must not disturb the protocol.
+    sys.stdout = sys.stderr  # Other output must not interfere with the protocol.
 
     def tell(line: str) -> None:
         print(line, file=out, flush=True)

@@ -1,4 +1,4 @@
-"""Run ``softfinger emulate``, an emulated hand's process: arguments, signals, exit status."""
+"""Run ``softfinger emulate``, the process of an emulated hand: arguments, signals, exit status."""
 
 from __future__ import annotations
 
@@ -20,59 +20,64 @@ if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
 _FAULTS = """\
-faults, each KIND[=VALUE][@START], any number of them:
-  tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
-                   on both boards, or on one: left:silent, right:torn=0.2
+faults; any number can be given, each in the form KIND[=VALUE][@START]:
+  tactile boards   torn, noisy (=PROBABILITY per frame), silent, frozen, wrong-size, saturated,
+                   zero; on both boards, or on one board: left:silent, right:torn=0.2
   to the servos    lose, lose-writes =PROBABILITY that an instruction does not reach any servo
   servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY; delay=S for every reply
   servos           silent, answer, reboot, overheat, overload, undervoltage =ID; readings: stuck
                    (constant angle, velocity and current 0), jump (by 0.2 rad), frozen (all
                    registers constant, including time), refuse (errors only); recover =ID
-  ports            unplug, plug for the port of the servos; left:unplug, right:plug … for a board
-  measurements     wrong values while the hand itself is unchanged; on both fingers, or on one:
-                   left:gain=0.5. gain=FACTOR of all pressures, shift-x, shift-y=CELLS of the image,
-                   mirror=1 (columns reversed), drift=FRACTION of the largest count (may be
-                   negative), replay=S (repeats the last S seconds of frames, at most 3, with new
-                   numbers), current=FACTOR of the reported current; to end: factors 1, others 0
-  the object       push=N along its faces, away from the palm, twist=N·m; 0 ends it
-  recovery         well ends all faults, left:well those of one board and its measurements. Loads of
-                   the object stay, and hardware errors of servos until a reboot
-  @START           start time [s], by default at once. gain=0.5@3..5: a measurement changes linearly
-                   from 3 to 5 s
+  ports            unplug, plug: the servo port; left:unplug, right:plug …: the port of a board
+  measurements     wrong values, while the hand itself is unchanged; on both fingers, or on one:
+                   left:gain=0.5. gain=FACTOR for all pressures, shift-x, shift-y=CELLS for the
+                   image, mirror=1 (columns reversed), drift=FRACTION of the maximum count (may be
+                   negative), replay=S (repeats the last S seconds of frames, at most 3 s, with new
+                   numbers), current=FACTOR for the reported current. To end a fault, set its
+                   factor to 1 or its other value to 0
+  the object       push=N along its faces, away from the palm, twist=N·m; 0 ends the load
+  recovery         well ends all faults; left:well ends those of one board and its measurements.
+                   Loads on the object remain, and so do hardware errors of servos until a reboot
+  @START           start time [s]; without it, the fault starts immediately. With gain=0.5@3..5, a
+                   measurement changes linearly from 3 to 5 s
 
 softfinger emulate --send "drop=0.01 left:frozen@2" changes a running emulator, through DIR/control.
 
-a plate on a stage, which presses a tip instead of the object, for trying `calibrate`:
-  --send "press PRESSES", which returns when the plate has arrived
-  PRESSES are separated by commas; each consists of some of these words:
-    depth=4mm      or force=5N; or pressure=10kPa on all cells, as from a bladder; depth=0mm lifts
+a plate on a test stage, which presses a tip instead of the object, to try out `calibrate`:
+  --send "press PRESSES" returns when the plate has reached its position
+  PRESSES is a list separated by commas; each press consists of some of these words:
+    depth=4mm      or force=5N, or pressure=10kPa on all cells, as from a bladder; 0mm lifts off
     tilt=10deg     tilt of the plate (0)
     speed=2mm/s    approach speed (5)
-    hold=1s        hold, then lift; without it the last press stays, and others are held for 1 s
+    hold=1s        hold for this time, then lift off; by default, the last press stays and others
+                   are held for 1 s
     tip=left       or right (both)
-  The log shows the force on a tip when a plate has come to rest. Plates do not act on the joints.
+  When a plate has reached its position, the log shows the force on the tip. Plates do not move the
+  joints.
 
-a person's hand, which turns joints without torque, for trying `calibrate joints`:
-  --send "turn left=closed right=open"   each to its stop, or upright with zero; returns on arrival
+a person's hand, which turns joints while torque is off, to try out `calibrate joints`:
+  --send "turn left=closed right=open"   turns each joint to its stop, or to its
+                                         zero position with zero; returns on arrival
 
-the object, after it slipped away: --send place puts it back, at rest and without a load.
+the object: --send place puts it back after it has slipped away, at standstill and without a load.
 
-the record of the servo bus, for tests of a daemon: --send report prints it as JSON, --send forget
+the record of the servo bus, for testing a daemon: --send report prints it as JSON, --send forget
 starts a new record, and --send "report forget" does both without a gap:
   t, monotonic     current time of the hand [s], and time.monotonic() at that time
   servos           left first, for each:
     id, torque, mode, q, hardware_error, watchdog (time-out [s], 0 if it is not armed, null after it
                    stopped the motor), stopped_by_watchdog: current state
     goal_q, goal_current
-                   smallest and largest goal received [rad, A; positive closes], including refused
-                   ones; null without goals; goals near the position of a limp joint are omitted
+                   minimum and maximum goal received [rad, A; positive closes], including refused
+                   ones; null if there were no goals; goals near the position of a joint without
+                   torque are omitted
     goals_refused  number of writes with a goal that the servo refused
-    torque_on      count, t of the last; far: number of times the goal was more than 0.05 rad away,
-                   farthest [rad]
+    torque_on      count, t of the last time; far: number of times the goal was more than 0.05 rad
+                   away, and the maximum distance [rad]
     quiet, longest_quiet
                    time since the last instruction with torque on (null while it is off), and the
                    longest such time [s]
-    watchdog_fired count, t of the last
+    watchdog_fired count, t of the last time
   object           current pose (x, y [m], angle [rad])
   force            current force on each tip [N], left first
 """
@@ -84,38 +89,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dir",
         type=Path,
         metavar="DIR",
-        help="your own folder for the links servos, tactile-left, tactile-right; made if absent "
-        "(default: a folder in your runtime folder)",
+        help="your own folder for the links servos, tactile-left and tactile-right; created if "
+        "it does not exist (default: a folder in your runtime folder)",
     )
     add_settings(parser)
-    parser.add_argument("--model", metavar="NAME", help="model of the servos")
+    parser.add_argument("--model", metavar="NAME", help="servo model")
     parser.add_argument(
         "--ids",
         type=_ids,
         metavar="L,R",
-        help="IDs of the servos, left first; with 1,1 both answer at once, like factory-new servos",
+        help="servo IDs, left first; with 1,1 both servos reply at the same time, like "
+        "factory-new servos",
     )
     parser.add_argument(
         "--baud",
         type=int,
         default=0,
         metavar="N",
-        help="servos answer only at this baud rate, with its transmission time; "
-        "0: at any rate and without delay (default)",
+        help="servos reply only at this baud rate, with its transmission time; 0: at any baud "
+        "rate and without delay (default)",
     )
     parser.add_argument(
         "--factory",
         action="store_true",
-        help="factory-new servos: position mode, 500 µs return delay; complete with "
-        "--baud 57600 --ids 1,1",
+        help="emulate factory-new servos: position mode, return delay of 500 µs; add --baud "
+        "57600 --ids 1,1 for their factory address",
     )
     parser.add_argument(
         "--send",
         metavar="WORDS",
-        help="send faults or requests (see below) to the emulator that runs in DIR, then exit",
+        help="send faults or requests (see below) to the emulator running in DIR, then exit",
     )
     parser.add_argument(
-        "--fault", action="append", default=[], metavar="FAULT", help="a fault; see below"
+        "--fault", action="append", default=[], metavar="FAULT", help="fault to emulate; see below"
     )
 
 
@@ -125,12 +131,14 @@ def _ids(text: str) -> tuple[int, ...]:
     except ValueError:
         ids = ()
     if len(ids) != 2 or not all(0 <= each <= 252 for each in ids):
-        raise argparse.ArgumentTypeError(f"expected two IDs of 0 to 252 such as 1,2, found {text}")
+        raise argparse.ArgumentTypeError(
+            f"expected two IDs between 0 and 252, such as 1,2, found {text}"
+        )
     return ids
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT, SIGTERM or SIGHUP. Return 1, with a message, if the set-up fails."""
+    """Emulate until SIGINT, SIGTERM or SIGHUP. Return 1 after a message if the set-up fails."""
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder with --dir")
@@ -150,7 +158,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
     # The following imports are slow (numpy, numba), so settings errors are reported earlier.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # Garbage collections during imports take a tenth of the start-up time.
+    gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
         EmulatedServos,
@@ -184,31 +192,34 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 
 @contextlib.contextmanager
 def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
-    """Run `softfinger emulate` with the arguments ``words`` in a process; yield it once it answers.
+    """Run `softfinger emulate` with the arguments ``words``; yield the process once it is ready.
 
-    Raises NoEmulator if it has ended instead. Its message is on standard error.
+    Raises NoEmulator if the process ends before it is ready. The process prints its error message
+    to standard error.
     """
     from softfinger.daemon.simulation.emulator.folder import NoEmulator
 
-    # -P keeps a folder named softfinger in the working directory from being imported.
+    # With -P, a folder named softfinger in the working directory is not imported.
     command = [sys.executable, "-P", "-m", "softfinger", "emulate", *map(str, words)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             if process.stdout.readline() != "ready\n":
-                raise NoEmulator(f"{' '.join(command[3:])}: ended, see its message above")
+                raise NoEmulator(
+                    f"{' '.join(command[3:])}: the program ended; see its message above"
+                )
             yield process
         finally:
             process.terminate()
 
 
 def _ready(ports: dict[str, Path]) -> str:
-    """Return the lines for an emulator that answers, as one text, since readers may wait for it."""
+    """Return the output of a ready emulator as one text, since readers may wait for its end."""
     return "".join(["ready\n", *(f"{name}: {path}\n" for name, path in ports.items())])
 
 
 def _unhurried(settings: Settings, paced: bool) -> Settings:
-    """Return the settings with real-time measures that suit a pseudo-terminal.
+    """Return the settings with real-time options that are suitable for a pseudo-terminal.
 
     SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Idle
     states are disabled only if the servos reproduce the wire timing, which requires very short

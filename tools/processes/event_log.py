@@ -1,4 +1,4 @@
-"""Log the daemon's events as lines on standard error or in a file, from a separate thread.
+"""Write the daemon's events as lines to standard error or to a file, from a separate thread.
 
 A stopped terminal (Ctrl-S), a full pipe or a full disk blocks writes. Therefore ticks never write,
 and lines that cannot be written are dropped.
@@ -23,13 +23,14 @@ from typing import Any, TextIO
 
 from softfinger.daemon.own_files import write_text
 
-_LINE_COUNT_MAX = 1000  # lines queued for a slow reader; the oldest are dropped
+# Maximum number of lines queued for a slow reader; the oldest lines are dropped.
+_LINE_COUNT_MAX = 1000
 _PRIORITIES = {"error": "<3>", "warning": "<4>", "": "<6>", "info": "<6>"}  # see sd-daemon(3)
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
 
 
 class EventLog:
-    """Log for people or programs, whose ``line`` method never blocks or fails.
+    """Log that is readable by people or programs; the ``line`` method never blocks or fails.
 
     Lines are appended to an existing ``file``. Raises OSError if the file cannot be opened.
     """
@@ -56,7 +57,7 @@ class EventLog:
             self._news.set()
 
     def plain(self, text: str, level: str = "") -> None:
-        """Queue one line without a kind, which plain logs show unchanged.
+        """Queue one line without a kind; plain logs show the line unchanged.
 
         In JSON, an empty ``level`` becomes ``info``.
         """
@@ -70,7 +71,7 @@ class EventLog:
         logging.getLogger().addHandler(handler)
 
     def close(self, patience: float = 1.0) -> None:
-        """Write the queued lines, for up to ``patience`` s."""
+        """Write the queued lines, taking at most ``patience`` s."""
         self._closing = True
         self._news.set()
         self._thread.join(patience)
@@ -108,7 +109,7 @@ class EventLog:
 
 
 def _clock(date: str, timestamp: float) -> str:
-    """Format the time of day, or the plain seconds if the system clock is invalid."""
+    """Format the time of day, or print plain seconds if the system date is invalid."""
     try:
         clock = time.strftime(date, time.localtime(timestamp))
     except (OverflowError, OSError, ValueError):

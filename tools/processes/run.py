@@ -34,17 +34,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
     add_duration(parser)
     parser.add_argument(
-        "--monitor", action="store_true", help="show the live page in this terminal; q ends both"
+        "--monitor",
+        action="store_true",
+        help="show the live page in this terminal; q ends the page and the daemon",
     )
     parser.add_argument(
-        "--log", choices=("plain", "json"), default="plain", help="lines for people, or JSON"
+        "--log", choices=("plain", "json"), default="plain", help="log format: plain lines, or JSON"
     )
     parser.add_argument(
-        "--log-file", type=Path, metavar="FILE", help="append the log to FILE, not to stderr"
+        "--log-file",
+        type=Path,
+        metavar="FILE",
+        help="append the log to FILE instead of writing it to stderr",
     )
     parser.add_argument("--verbose", action="store_true", help="also log the real-time measures")
     parser.add_argument(
-        "--no-task", action="store_true", help="stay disarmed even if the profile names a task"
+        "--no-task", action="store_true", help="stay disarmed even if the profile defines a task"
     )
     parser.add_argument(
         "--record",
@@ -81,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         return _serve(settings, arguments, signals, log)
     except Interrupted:
-        log.line("info", "end", "ended while starting; torque was never on")
+        log.line("info", "end", "ended during startup; torque was never on")
         return 0
     finally:
         log.close()
@@ -93,7 +98,7 @@ def _serve(
     # The following imports are slow (numpy, numba, zmq), so settings errors are reported earlier.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # Garbage collections during imports take a tenth of the start-up time.
+    gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
     from softfinger.daemon.loop.build import Daemon
     from softfinger.tools.processes.compile import build_kernels
 
@@ -109,7 +114,7 @@ def _serve(
         daemon = Daemon(settings, on_event=on_event)
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
-        # systemd does not restart the service after status 2.
+        # After exit status 2, systemd does not restart the service.
         return 2 if isinstance(error, SettingsError) else 1
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
@@ -132,7 +137,7 @@ def _serve(
                 log.plain(f"softfinger: {error}")
                 return 1
         page: AbstractContextManager[Any] = nullcontext()
-        log.quiet = arguments.monitor  # The page now uses the terminal.
+        log.quiet = arguments.monitor  # From here on, the page uses the terminal.
         if arguments.monitor:
             addresses = settings.stream.address, settings.commands.address
             page = MonitorProcess(*addresses, loop.end, settings.access.keys)
@@ -155,14 +160,14 @@ def _serve(
     if state.fault:
         log.plain(f"softfinger: ended with a fault: {state.fault}", "error")
     if state.torque:
-        log.plain("softfinger: torque could not be turned off and may still be on", "error")
+        log.plain("softfinger: torque could not be switched off and may still be on", "error")
     unrecorded = recording is not None and recording.failed
     return 1 if state.fault or state.torque or unrecorded else 0
 
 
 @contextmanager
 def _service(loop: Any) -> Iterator[None]:
-    """Notify systemd, if requested: ready on the first tick, alive on each tick, and stopping."""
+    """Notify systemd, if requested, when the daemon is ready, on each tick, and when it stops."""
     service = Service.of_environment()
     if service is None:
         yield
@@ -203,7 +208,7 @@ def _scene(settings: Settings) -> str:
 
 
 def _numbers(state: State) -> dict[str, Any]:
-    """Return the numbers to be logged with an event; ``seq`` locates the event in a recording."""
+    """Return the numbers to log with an event; ``seq`` identifies the event in a recording."""
     numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
     real = {
         name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON lacks NaN.

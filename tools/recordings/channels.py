@@ -37,7 +37,7 @@ _FOXGLOVE: dict[bytes, tuple[str, dict[str, Any]]] = {
     ),
 }
 _STORED_AS = {"timestamp": "unix", "level": "severity"}
-_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's levels, where 0 means unknown
+_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's log levels, where 0 means unknown
 
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -139,7 +139,7 @@ def _restored(
         message["data"] = base64.b64decode(message.get("data") or "")
         frame = read(schema.TactileFrame, message)
         if frame.finger not in FINGERS or not math.isfinite(frame.timestamp):
-            raise ValueError("a tactile frame without its finger or time")
+            raise ValueError("a tactile frame without finger or time")
     for path in floats:
         place: Any = message
         for part in path[:-1]:

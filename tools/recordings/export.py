@@ -25,8 +25,8 @@ _EPILOG = """\
 Writes one table for each topic, e.g. hand-state.csv, with the time t and a column for each field
 (left.force). The frames of a sensor are also written to tactile-left.npz or tactile-right.npz, as
 t [n] and frames [n, rows, cols], for `softfinger analyse` and numpy.load. Parquet tables also
-contain the bytes of the frames. In all files, t is the time since the recording's first message in
-s by the daemon's clock; that of a frame is the time of its scan."""
+contain the bytes of the frames. In all files, t is the time in s since the recording's first
+message, on the daemon's clock; for a frame, t is the time of its scan."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export the topics. Return 1 if there is nothing to export.
+    """Export the topics; return 1 if there is nothing to export.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     for each in files:
         print(each)
     if not files:
-        print(f"export: {path}: contains no messages", file=sys.stderr)
+        print(f"export: {path}: the recording does not contain any messages", file=sys.stderr)
     return 0 if files else 1
 
 
@@ -73,7 +73,9 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
     for topic, word in zip(selected, words, strict=True):
         if topic not in recorded:
             known = ", ".join(each.decode() for each in recorded) or "none"
-            raise RecordingError(f"found topic {word!r}, the recording has {known}")
+            raise RecordingError(
+                f"found topic {word!r}, expected one of the recorded topics: {known}"
+            )
     return selected
 
 
@@ -82,7 +84,7 @@ _BLOCK = 2000  # rows per write
 
 
 class CsvTable:
-    """CSV file with full float precision and empty cells for NaN, without byte fields."""
+    """CSV file with full float precision and empty cells for NaN; byte fields are omitted."""
 
     suffix = ".csv"
 
@@ -153,20 +155,20 @@ def export(
 ) -> list[Path]:
     """Write one table per topic and one ``.npz`` file with frames per sensor into ``folder``.
 
-    The first column ``t`` is the time since the recording's first message [s] by the daemon's
-    clock, in all files alike. The others are those of the schema and any additional fields of the
-    first message of a topic.
+    In all files, the first column ``t`` is the time since the recording's first message [s],
+    according to the daemon's clock. The other columns are the fields of the schema and any
+    additional fields of the topic's first message.
 
     Returns
     -------
-    The files that were written.
+    Paths of the written files.
 
     Raises
     ------
     OSError, MissingExtra
     """
     tables: dict[bytes, Table] = {}
-    grids: dict[str, tuple[list[float], list[Any]]] = {}  # by finger, times and counts
+    grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts, by finger
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):
@@ -175,7 +177,9 @@ def export(
             if topic not in tables:
                 name = _file_name(topic)
                 if any(each.stem == name for each in files):
-                    raise RecordingError(f"{recording.path}: two topics would be written to {name}")
+                    raise RecordingError(
+                        f"{recording.path}: two topics would be written to the same file {name}"
+                    )
                 files.append(folder / f"{name}{kind.suffix}")
                 tables[topic] = kind(files[-1], _columns(topic, row))
                 opened.callback(tables[topic].close)
@@ -193,7 +197,7 @@ def export(
 
 
 def _file_name(topic: bytes) -> str:
-    """Return a safe file name for any topic: not hidden and without a folder."""
+    """Return a safe file name for any topic: not hidden, and without a folder part."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 

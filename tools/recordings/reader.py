@@ -1,8 +1,9 @@
 """Read MCAP files: `Recording` provides a file's summary and its messages in order of arrival.
 
 A recording may have been written by any MCAP writer, with or without chunks, indexes, statistics
-and other programs' channels. Sizes and counts in the file are not trusted: memory and time are
-bounded by the file's size on disk. `read_recording` returns the states as NumPy columns.
+and other programs' channels. Sizes and counts in the file are not trusted. The memory use and the
+run time are bounded by the file's size on disk. `read_recording` returns the states as NumPy
+columns.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ __all__ = ["Recording", "read_recording"]
 _MESSAGE_SIZE_MAX = 1 << 20  # bytes; a frame of the largest grid has 0.2 MB
 _SETTINGS_SIZE_MAX = 4 << 20  # bytes, including per-cell calibrations
 _CHUNK_SIZE_MAX = 64 << 20  # bytes, unpacked; chunks usually have 1 to 8 MB
-# bytes, minimum size counted per channel or message, because each record takes time to read.
+# Minimum size counted per channel or message [bytes], because reading each record takes time.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
-_OTHERS_NAMED_MAX = 3  # other programs' channels that are named in a warning
-_FIELD_COUNT_MAX = 500  # fields per message
+_OTHERS_NAMED_MAX = 3  # maximum number of other programs' channels listed in a warning
+_FIELD_COUNT_MAX = 500  # maximum number of fields per message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # record header: kind, content size
 _BEFORE_DATA = struct.Struct("<HIQQ")  # message header: channel, number, log time, publish time
@@ -50,8 +51,9 @@ _END = struct.Struct("<BQQQI8s")  # footer and magic
 def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     """Read a recording's states as one array per field, in order of arrival.
 
-    Names are those of `hand/state`, nested ones with a dot (``left.force``). The first, ``t``, is
-    the time since the recording's first message [s], as in all files of ``softfinger export``.
+    The names of the arrays are the field names in `hand/state`; nested names contain a dot
+    (``left.force``). The first array, ``t``, is the time since the recording's first message [s],
+    as in all files written by ``softfinger export``.
     ``pandas.DataFrame(read_recording("run.mcap"))`` accepts the result.
 
     Raises
@@ -133,8 +135,8 @@ class Recording:
             names = ", ".join([*self.others][:_OTHERS_NAMED_MAX])
             more = ", …" if len(self.others) > _OTHERS_NAMED_MAX else ""
             self._say(
-                f"{path}: {sum(self.others.values())} messages of {len(self.others)} channels of "
-                f"other programs are left out ({names}{more})"
+                f"{path}: {sum(self.others.values())} messages on {len(self.others)} channels "
+                f"from other programs were skipped ({names}{more})"
             )
 
     @property
@@ -158,19 +160,20 @@ class Recording:
 
     @cached_property
     def zero(self) -> int:
-        """Time of the first message by the daemon's clock [ns]; all times ``t`` count from it."""
-        state = self._left, self.chunks  # of a loop over messages that asks for it
+        """Daemon clock time of the first message [ns], which is the origin of all times ``t``."""
+        state = self._left, self.chunks  # used by loops over messages
         for _, message in self.messages():
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
             if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):
-                # The clock's time of a frame is that of its scan, its timestamp that of arrival.
+                # The clock time of a frame is its scan time; its timestamp is the arrival time.
                 after = stamp - self.start - float(message.get("delay_s", 0.0))
                 self._left, self.chunks = state
-                return mono - round(after * 1e6) * 1000  # Unix time is a float, exact to 0.2 µs
+                # The Unix time is a float with a resolution of 0.2 µs.
+                return mono - round(after * 1e6) * 1000
         return 0
 
     def time(self, message: dict[str, Any]) -> float:
-        """Return the time of a message since the first one [s], of a frame the time of its scan."""
+        """Return the time of a message or the scan time of a frame, relative to the start [s]."""
         mono, stamp = message.get("mono_ns"), message.get("timestamp")
         if isinstance(mono, int):
             return (mono - self.zero) * 1e-9
@@ -261,7 +264,8 @@ class Recording:
             for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
                 if (message := self._take_record(kind, content)) is not None:
                     yield message
-        except Exception as error:  # Format and compression errors have no common base class.
+        # The exceptions for format and compression errors do not have a common base class.
+        except Exception as error:
             self._damaged(error)
 
     def _take_record(self, kind: int, content: bytes) -> tuple[int, int, bytes] | None:
@@ -278,7 +282,7 @@ class Recording:
     def _count(self, unpacked: int) -> None:
         self._left -= unpacked
         if self._left < 0:
-            raise ValueError("it unpacks to more data than its size allows")
+            raise ValueError("its unpacked data are suspiciously large for the size of the file")
 
     def _learn(self, content: bytes) -> None:
         from mcap.data_stream import ReadDataStream
@@ -287,7 +291,7 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
-        # In a softfinger recording, an unknown topic comes from a newer version.
+        # An unknown topic in a softfinger recording was written by a newer version.
         if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
             self._other_names[channel.id] = channel.topic
             return
@@ -303,12 +307,12 @@ class Recording:
 
     def _damaged(self, error: Exception | None) -> None:
         first = not self.damage
-        usual = "its end is missing" if self.truncated else "a chunk can't be read"
+        usual = "the end of the file is missing" if self.truncated else "a chunk can't be read"
         # The MCAP library's messages about lengths and checksums would not help the user.
         self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
         if first and self._say is not None:
             what = "cut short" if self.truncated else "damaged"
-            self._say(f"{self.path}: {what} ({self.damage}); the intact part is read")
+            self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
         """Check the file's end; return the header's profile, or PROFILE if it is unreadable."""
@@ -385,7 +389,7 @@ class Recording:
 def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
     """Yield the kind and content of each record whose kind is in ``wanted``.
 
-    If a message is too long, its content is truncated to the header. Raises EOFError for an
+    If a message is too long, only its header is returned as the content. Raises EOFError for an
     incomplete record, and ValueError for an invalid record or another record that is too long.
     """
     while head := file.read(_RECORD.size):
@@ -410,7 +414,7 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
 
 
 def _plain(message: dict[str, Any]) -> dict[str, Any]:
-    """Check that a map has plain values, at most two levels of nested maps and few fields.
+    """Check that a map has only plain values, at most two levels of nested maps, and few fields.
 
     Raises ValueError if the check fails and AttributeError if the message is not a map.
     """

@@ -28,7 +28,7 @@ from softfinger.tools.recordings.reader import MessageSource, Recording
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
-# Fields that depend on the machine's timing instead of the loop's inputs.
+# Fields that depend on the machine's timing and not on the loop's inputs.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of hand/settings
@@ -36,7 +36,7 @@ _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of h
 
 @dataclass(slots=True)
 class Difference:
-    """Differences in one ``hand/state`` field: their number, the first and the largest one."""
+    """Differences in one ``hand/state`` field: number, first difference and largest difference."""
 
     count: int = 0
     first_tick: int = 0
@@ -70,10 +70,12 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
     """
     message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
-        raise RecordingError(f"{recording.path}: contains no hand/settings")
+        raise RecordingError(f"{recording.path}: the recording does not contain hand/settings")
     text, *calibrations = (message.get(name) for name in _SETTINGS)
     if not (isinstance(text, str) and all(isinstance(each, str) for each in calibrations)):
-        raise RecordingError(f"{recording.path}: its hand/settings lacks {' or '.join(_SETTINGS)}")
+        raise RecordingError(
+            f"{recording.path}: its hand/settings message lacks {' or '.join(_SETTINGS)}"
+        )
     try:
         settings = Settings.model_validate_json(text, strict=False)
     except ValidationError as error:
@@ -118,9 +120,9 @@ def counts_of(
     shape, expected = (message["rows"], message["cols"]), settings.tactile
     if shape != (expected.rows, expected.cols):
         raise RecordingError(
-            f"{recording.path}: its frames have {shape[0]} × {shape[1]} cells, the settings' "
-            f"sensors {expected.rows} × {expected.cols}: the recording or the settings belong to "
-            "another hand"
+            f"{recording.path}: its frames have {shape[0]} × {shape[1]} cells, expected the "
+            f"settings' {expected.rows} × {expected.cols}: the recording or the settings belong "
+            "to another hand"
         )
     return np.frombuffer(message["data"], "<u2").reshape(shape)
 
@@ -138,8 +140,8 @@ def recompute(
     own, calibrations = recorded_settings(recording)
     if not recording.count(schema.INPUT):
         raise RecordingError(
-            f"{recording.path}: contains no hand/input, the inputs of each tick: record with "
-            "--topics all, or with `softfinger run --record FILE`"
+            f"{recording.path}: the recording does not contain hand/input, the inputs of each "
+            "tick: record with --topics all, or with `softfinger run --record FILE`"
         )
     result = Comparison()
     try:
@@ -194,7 +196,8 @@ def _run(
         result.ticks += 1
         if state is not None:
             step = state.get("seq_step", 1)
-            # Pack and unpack the state like the recorded one, for identical types and rounding.
+            # Pack and unpack the state in the same way as the recorded state, for identical types
+            # and rounding.
             again = msgpack.unpackb(pack_state(now, scene, step))
             _compare(result, state, again)
 
@@ -208,7 +211,7 @@ _Tick = tuple[
 def _ticks(
     recording: Recording, used: Settings, progress: Callable[[int], None] | None
 ) -> Iterator[_Tick]:
-    """Yield all ticks. A tick's frames and commands precede its input, and its state follows it."""
+    """Yield all ticks. Frames and commands precede the tick's input, which precedes its state."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}
@@ -217,8 +220,9 @@ def _ticks(
         if topic == schema.TACTILE:
             if message.get("seq_step") != 1:
                 raise RecordingError(
-                    f"{recording.path}: contains one of {message.get('seq_step')} frames, "
-                    "expected all: record with stream.tactile_rate equal to the sensors' rate"
+                    f"{recording.path}: contains one in {message.get('seq_step')} frames, "
+                    "expected all frames: record with stream.tactile_rate equal to the sensors' "
+                    "rate"
                 )
             finger = FINGERS.index(message["finger"])
             frames[finger, message["seq"]] = counts_of(recording, message, used)

@@ -44,18 +44,19 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
 
 _EPILOG = """\
-Recording ends with Ctrl-C or after --duration. The messages written and lost are then printed.
+Recording ends with Ctrl-C or after --duration, and the numbers of written and lost messages are
+printed.
 With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mcap and so on.
-`replay --recompute` needs --topics all; `run --record` records all topics from the first tick on.
-Exit status: 0 everything was written, 1 not everything was written, with the reason."""
+`replay --recompute` requires --topics all; `run --record` records all topics from the first tick.
+Exit status: 0 everything was written, 1 something was not written, with the reason."""
 
 _SILENCE_TIME = 2.0  # s, time without messages before a notice is printed
-# s between socket reads, because waking up for each message would cost more than processing it.
+# s between socket reads; waking up for each message would take longer than processing it.
 _POLL_INTERVAL = 0.1
 _BACKLOG_TIMEOUT = 10.0  # s, time limit for processing queued messages at the end
-_TRANSIT_TIME = 0.5  # s, wait at the end for messages in transit on a busy machine
+_TRANSIT_TIME = 0.5  # s, waiting time at the end for messages in transit on a busy machine
 _PROGRESS_INTERVAL = 0.5  # s, time between progress lines and between flushes
-_BATCH_SIZE = 1000  # messages between time checks
+_BATCH_SIZE = 1000  # number of messages between time checks
 
 
 # A killed recorder loses only the incomplete chunk, i.e. the messages since the last flush.
@@ -96,7 +97,7 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
-            # This size exceeds the limit at which `add` ends a chunk.
+            # This chunk size is above the limit at which `add` ends a chunk.
             self._mcap = Writer(self._file, 2 * CHUNK_SIZE)
             self._mcap.start(PROFILE, LIBRARY)
             self._wrote()
@@ -106,9 +107,9 @@ class RecordingWriter:
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
         """Write one message, possibly modifying its map. Raises RecordingError.
 
-        A repeated message (``again``) contains its original time, which precedes the recording. Its
-        log time is therefore set to that of the previous message, so that all log times are within
-        the recording.
+        A repeated message (``again``) contains its original time, which precedes the recording. To
+        keep all log times within the recording, its log time is set to the log time of the previous
+        message.
         """
         assert not self._ended
         stamp = message.get("timestamp")
@@ -143,7 +144,8 @@ class RecordingWriter:
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._wrote()
             self._file.close()
-            del self._mcap  # Free the index of all chunks, which uses most of the writer's memory.
+            # Free the index of all chunks, which occupies most of the writer's memory.
+            del self._mcap
         except OSError as error:
             raise self._failed(error) from None
 
@@ -187,21 +189,21 @@ class RecordingWriter:
 
     def _failed(self, error: OSError) -> RecordingError:
         self._ended = True
-        # The remaining buffer cannot be written either and is dropped.
+        # The rest of the buffer cannot be written either, so drop it.
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):
             os.truncate(self.path, self.size)  # Only complete records remain.
         return RecordingError(
-            f"{self.path}: {error.strerror}; earlier messages can be read, `softfinger record "
-            f"--recover {self.path}` repairs the file"
+            f"{self.path}: {error.strerror}; the messages written so far can be read; run "
+            f"`softfinger record --recover {self.path}` to repair the file"
         )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument(
-        "file", type=Path, metavar="FILE.mcap", help="output file; must not exist yet"
+        "file", type=Path, metavar="FILE.mcap", help="output file, which must not exist yet"
     )
     add_stream(parser)
     parser.add_argument(
@@ -209,12 +211,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=topic,
         metavar="TOPIC",
-        help="e.g. state or hand/state, or all (default: all but input, each tick's inputs)",
+        help="e.g. state or hand/state, or all (default: all except input, the inputs of each "
+        "tick)",
     )
     add_split(parser)
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when this pipe closes
     parser.add_argument(
-        "--recover", action="store_true", help="repair a FILE that was cut short; record nothing"
+        "--recover", action="store_true", help="repair a truncated FILE instead of recording"
     )
 
 
@@ -222,7 +225,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Record until the end. Return 1 if the recording is incomplete. Raises SoftfingerError."""
     if arguments.recover:
         messages, damage = recover(arguments.file)
-        state = f"was damaged ({damage}), its intact part is kept" if damage else "sound"
+        state = f"was corrupted ({damage}); only the intact part was kept" if damage else "sound"
         print(f"{arguments.file}: {messages} messages; {state}")
         return 0
     with StopCondition(arguments.duration, arguments.lifeline) as ending:
@@ -235,13 +238,14 @@ class _Recorder:
     def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
         self._ending = ending
-        self._keys = client_keys(arguments.keys)  # Errors must occur before a file is created.
+        self._keys = client_keys(arguments.keys)  # Any errors must occur before a file is created.
         self._gaps: dict[bytes, Gaps] = {}
-        self._writers = [RecordingWriter(arguments.file)]  # The last writer is the active one.
+        # The last writer in this list is the active writer.
+        self._writers = [RecordingWriter(arguments.file)]
         self._opened = time.monotonic()
-        self._messages = 0  # number of messages received for writing
+        self._messages = 0  # number of messages received to be written
         self._unreadable = 0
-        self._waiting = False  # True once the notice about the missing stream was printed
+        self._waiting = False  # True once the notice about the missing stream has been printed
 
     def record(self) -> int:
         """Record messages until the end, and return the exit status."""
@@ -310,7 +314,7 @@ class _Recorder:
                     return
                 began = time.monotonic()
                 socket.poll(int(_POLL_INTERVAL * 1e3))
-                # If the process stalls, this counts as one poll interval.
+                # A stall of the process counts as one poll interval.
                 quiet -= min(time.monotonic() - began, _POLL_INTERVAL)
 
     def _take(self, frames: list[bytes]) -> None:
@@ -332,7 +336,8 @@ class _Recorder:
             return
         path = arguments.file
         path = path.with_name(f"{path.stem}-{len(self._writers) + 1}{path.suffix}")
-        # Open the new file before closing the old file, which remains usable if opening fails.
+        # Open the new file before closing the old file, so that the old file remains usable if
+        # opening fails.
         self._writers.append(RecordingWriter(path))
         self._opened = time.monotonic()
         writer.close()
@@ -356,7 +361,7 @@ class _Recorder:
             if written:
                 print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
             else:
-                # An empty file would prevent the next recording with this name.
+                # An empty file would block the next recording with this name.
                 path.unlink(missing_ok=True)
         lost = ", ".join(
             f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost
@@ -364,7 +369,7 @@ class _Recorder:
         received = f" of {self._messages} received" if self._messages > written else ""
         print(f"{written} messages written{received}; lost: {lost or 'none'}")
         if self._unreadable:
-            print(f"{self._unreadable} messages could not be read and were left out")
+            print(f"{self._unreadable} messages could not be read and were skipped")
         if failure:
             to_stderr("record")(failure)
         return 1 if failure else 0
@@ -377,7 +382,7 @@ def _topics(named: list[bytes] | None) -> list[bytes]:
 
 
 def recover(path: Path) -> tuple[int, str]:
-    """Repair a recording; return its number of messages and the reason why it was incomplete.
+    """Repair a recording; return the number of messages and the reason why it was incomplete.
 
     A complete file is not changed. The repaired file replaces the original only once it is
     complete. Raises RecordingError.
@@ -387,8 +392,8 @@ def recover(path: Path) -> tuple[int, str]:
         return recording.total, ""
     if recording.others:
         raise RecordingError(
-            f"{path}: has channels of other programs, which would be lost; "
-            "`mcap recover` keeps them"
+            f"{path}: contains channels from other programs, which would be lost; use `mcap "
+            "recover`, which keeps them"
         )
     closed = path.with_name(path.name + ".recovered")
     closed.unlink(missing_ok=True)

@@ -25,10 +25,10 @@ Without --recompute, the messages are published unchanged on the stream's socket
 pace or --speed times as fast. To subscribers this looks like a daemon.
 
 With --recompute, the recorded readings, frames and commands are processed by this version's
-estimator, tables, control and limits, and every state is compared with the recorded one. This needs
-a recording of all topics: `record --topics all`, or `run --record`, which starts at the first tick.
-From the first tick on, the same code and settings give bit-identical results.
-Exit status: 0 identical or published, 1 the file can't be read, 3 states differ."""
+estimator, tables, control and limits, and every state is compared with the recorded state. This
+requires a recording of all topics: `record --topics all`, or `run --record`, which starts at the
+first tick. If the recording starts there, the same code and settings give bit-identical results.
+Exit status: 0 published, or all states identical; 1 the file can't be read; 3 states differ."""
 
 _SUBSCRIBER_WAIT = 10.0  # s, timeout for the first subscriber
 _EXIT_DIFFERENT = 3
@@ -37,13 +37,15 @@ _EXIT_DIFFERENT = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
-    parser.add_argument("--address", default=StreamSettings().address, help="address to publish on")
+    parser.add_argument(
+        "--address", default=StreamSettings().address, help="address on which to publish"
+    )
     parser.add_argument(
         "--keys",
         type=Path,
         metavar="FOLDER",
-        help="publish only to the clients of these keys from `softfinger keys`, as a daemon with "
-        "access.keys does",
+        help="publish only to clients that have keys in this folder, created by `softfinger "
+        "keys`, like a daemon with access.keys",
     )
     parser.add_argument(
         "--speed",
@@ -54,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_range(parser)
     parser.add_argument(
-        "--no-wait", action="store_true", help="start at once, without waiting for a subscriber"
+        "--no-wait", action="store_true", help="start immediately, without waiting for a subscriber"
     )
     parser.add_argument(
         "--recompute", action="store_true", help="recompute the states with this version"
@@ -118,7 +120,7 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     from softfinger.tools.recordings.recomputed import recompute, recorded_settings
     from softfinger.tools.sweep import Progress
 
-    # Check for missing settings before the kernels are loaded.
+    # Check that the recording contains settings before the kernels are loaded.
     recorded, _ = recorded_settings(recording)
     from softfinger.tools.processes.compile import build_kernels, print_event
 
@@ -132,14 +134,15 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     )
     if not result.from_start:
         print(
-            "the recording begins after the first tick, without the loop's earlier state: states "
-            "may differ, all of them if the hand was armed; `run --record` records every tick"
+            "the recording starts after the first tick, so the loop's initial state is unknown "
+            "and states may differ (all states, if the hand was armed); to record every tick, "
+            "use `run --record`"
         )
     for count, what in ((result.missing_ticks, "ticks"), (result.missing_frames, "frames")):
         if count:
-            print(f"{count} {what} are missing from the recording")
+            print(f"{count} {what} are missing in the recording")
     if not result.differences:
-        print("identical to the last bit")
+        print("all states are bit-identical")
         return 0
     print(f"{'field':24} {'differ':>8} {'first tick':>10}  recorded → recomputed; worst")
     for name, each in result.differences.items():
@@ -148,7 +151,8 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     return _EXIT_DIFFERENT
 
 
-_QUEUE_LENGTH = 10_000  # messages queued for a subscriber; excess messages are lost
+# Maximum number of messages queued for a subscriber; excess messages are lost.
+_QUEUE_LENGTH = 10_000
 _SEND_TIMEOUT = 1.0  # s, timeout for the gateway to accept a message
 
 
@@ -182,7 +186,7 @@ class Wire:
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
         """Publish one message as soon as the gateway can accept it."""
-        if topic not in schema.TOPICS:  # a topic from another version
+        if topic not in schema.TOPICS:  # the topic comes from another version
             return
         self._link.wait_for_room(_SEND_TIMEOUT)
         index = GATEWAY_TOPICS.index(topic.decode())

@@ -1,4 +1,4 @@
-"""Run ``softfinger config``: check profiles, show those of the package, and every setting."""
+"""Run ``softfinger config``: check profiles, and show the package's profiles and all settings."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from softfinger.daemon.profile.load import examine, find, names, profile_text
 from softfinger.tools.arguments import add_changes, add_directory, own_runtime_folder
 
 _EPILOG = """\
-  softfinger config check my.toml           print all errors and warnings; status 1 for errors
-  softfinger config show hil > my.toml      start your own profile from a packaged one
-  softfinger config schema > schema.json    in the same folder, for completion and checks in editors
-  softfinger config reference tactile       print one section; or a key's name, e.g. pitch"""
+  softfinger config check my.toml           print all errors and warnings; exit status 1 for errors
+  softfinger config show hil > my.toml      create your own profile from a packaged profile
+  softfinger config schema > schema.json    in the same folder: completion and checks in editors
+  softfinger config reference tactile       print one section, or one key, e.g. pitch"""
 
 
 _CHECK = """\
-Print all errors and warnings of a profile, without touching hardware. Errors are those with which
-`softfinger run` does not start: keys, values, contradictions, and calibration files or contact
-tables that do not fit. Warnings are settings that are allowed but probably wrong, for example a
+Print all errors and warnings of a profile, without touching hardware. Errors prevent the start of
+`softfinger run`: invalid keys or values, contradictions, and calibration files or contact tables
+that do not match. Warnings are settings that are allowed but probably wrong, for example a
 sensor smaller than the footprint, or forces beyond the servos.
 
 exit status: 0 no errors (there may be warnings), 1 errors"""
@@ -36,15 +36,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         description=_CHECK,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    check.add_argument("config", type=Path, metavar="FILE", help="a TOML file, or a profile's name")
+    check.add_argument("config", type=Path, metavar="FILE", help="a TOML file, or a profile name")
     add_changes(check)
     add_directory(check)
     actions.add_parser("list", help="list the names of the profiles")
     show = actions.add_parser("show", help="print a profile")
     show.add_argument("profile", type=Path, metavar="PROFILE", help=f"one of {', '.join(names())}")
-    every = actions.add_parser("reference", help="every key with default, bounds and meaning")
+    every = actions.add_parser(
+        "reference", help="print every key with its default, bounds and meaning"
+    )
     every.add_argument("what", nargs="?", default="", metavar="SECTION|KEY")
-    actions.add_parser("schema", help="the JSON schema of a profile, for editors")
+    actions.add_parser("schema", help="print the JSON schema of a profile, for editors")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -95,7 +97,7 @@ def _text(profile: Path) -> str:
 
 
 def subject(profile: Path) -> str:
-    """Return the first sentence of a profile's opening comment."""
+    """Return the first sentence of the comment at the beginning of a profile."""
     comment = itertools.takewhile(lambda line: line.startswith("#"), _text(profile).splitlines())
     words = " ".join(line[1:].strip() for line in comment if not line.startswith("#:"))
     return min((words.partition(mark)[0] for mark in (": ", ". ")), key=len)

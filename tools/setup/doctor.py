@@ -1,7 +1,7 @@
-"""Run ``softfinger doctor``: check ports, servos, boards and machine, and suggest fixes.
+"""Run ``softfinger doctor``: check ports, servos, boards and the machine, and suggest fixes.
 
-Each check prints one line. This module handles the arguments, the order of the checks, printing and
-the exit status. The checks are in :mod:`softfinger.daemon.diagnosis`.
+Each check prints one line of results. This module handles the arguments, the order of the checks,
+printing and the exit status. The checks are in :mod:`softfinger.daemon.diagnosis`.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from softfinger.tools.processes.compile import build_kernels, print_event
 
 _EPILOG = """\
 exit status: 0 no check failed (there may be warnings), 1 a check failed, 2 the settings can't be
-used. Without --fix nothing is changed. With --fix, the latency timers of adapters are set to 1 ms,
-servos get their ID and baud rate if it is certain which servo is meant, all registers that the hand
-needs are set, and kernels are compiled. Servos are rebooted after a hardware error or if their
-position is off by a turn; the hand releases its object meanwhile. --fix never switches torque on or
-moves the hand.
+used. Without --fix, nothing is changed. With --fix, doctor sets the latency timers of adapters to
+1 ms, sets the ID and baud rate of each servo that can be identified with certainty, sets all
+registers that the hand requires, and compiles the kernels. It reboots servos that report a hardware
+error or whose position is wrong by a turn; the hand drops its object during a reboot. --fix never
+switches torque on or moves the hand.
 
-factory-new servos all have ID 1 at 57600 baud: connect one servo alone and run doctor --fix; then
-also connect the next one and run doctor --fix again."""
+All factory-new servos have ID 1 at 57600 baud: connect only one servo and run doctor --fix; then
+connect the next servo as well, and run doctor --fix again."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -107,7 +107,7 @@ def results(
         yield Finding("warn", "settings", warning)
     tactile = settings.tactile
     if not backend("tactile", tactile.backend).metal:
-        yield Finding("note", "tactile", f"{tactile.backend}: no board to check")
+        yield Finding("note", "tactile", f"{tactile.backend}: there is no board to check")
     else:
         for name in settings.scene.fingers:
             finger = FINGERS.index(name)
@@ -134,7 +134,7 @@ def _register_files(
 
 
 def _ports(settings: Settings) -> list[tuple[str, str]]:
-    """Return (key, path) for each port that the scene needs. Plugin ports are not included."""
+    """Return (key, path) for each port that the scene needs. Ports of plugins are not included."""
     ports = []
     servos = backend("servos", settings.servos.backend)
     tactile = backend("tactile", settings.tactile.backend)
@@ -162,10 +162,13 @@ def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Fi
     servos = settings.servos
     found = backend("servos", servos.backend)
     if not found.metal:
-        yield Finding("note", "servos", f"{servos.backend}: no servo to check")
+        yield Finding("note", "servos", f"{servos.backend}: there is no servo to check")
         return
     if found.source:
-        text = f"{servos.backend}: a plugin; test it with softfinger.testing.check_servos"
+        text = (
+            f"{servos.backend}: the servos use a plugin; test the plugin with "
+            "softfinger.testing.check_servos"
+        )
         yield Finding("note", "servos", text)
         return
     if not free[servos.port]:

@@ -37,9 +37,9 @@ MASSES = (0.05, 0.2, 0.5, 1.0, 2.0)  # kg
 _SETTLING_TIME = 3.0  # s, settling time of the grip
 _LOAD_TIME = 1.0  # s, ramp time of the weight
 _OBSERVATION_TIME = 1.0  # s, observation time under the full weight
-_LOAD_STEP_COUNT = 20  # steps of the weight ramp
+_LOAD_STEP_COUNT = 20  # number of steps in the weight ramp
 _TURN_MIN = math.radians(5.0)
-_SLIDE_MAX = 0.010  # m, displacement along the faces at which the object counts as lost
+_SLIDE_MAX = 0.010  # m, displacement along the faces above which the object counts as lost
 _GRAVITY = 9.81  # m/s²
 _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
 
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shape", choices=SHAPES, action="append", help="only these shapes")
     for name, metavar, kind in (
         ("--size", "MM", _between("a size of 0.2 to 10000 mm", 0.2, 1e4)),
-        ("--friction", "F", _between("a friction of 1e-5 to 1e5", 1e-5, 1e5)),
+        ("--friction", "F", _between("a friction coefficient of 1e-5 to 1e5", 1e-5, 1e5)),
         ("--mass", "KG", _between("a mass of 1e-5 to 1e5 kg", 1e-5, 1e5)),
     ):
         parser.add_argument(name, type=kind, nargs="+", metavar=metavar, help="only these values")
@@ -69,9 +69,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep",
         type=Path,
         metavar="FILE",
-        help="write the map for use by grasp; after Ctrl-C, the same call continues",
+        help="write the map to a file for use by grasp; after Ctrl-C, the same command continues",
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the map (extra 'plot')")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="plot the map (extra 'plot')")
     add_sweep(parser)
 
 
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     shapes = tuple(arguments.shape or SHAPES)
     axes = (
         tuple(sorted(arguments.friction or FRICTIONS)),
-        tuple(sorted(arguments.mass or MASSES)),  # The map reader requires sorted values.
+        tuple(sorted(arguments.mass or MASSES)),  # The reader of the map requires sorted values.
         tuple(sorted(arguments.size or SIZES)),
     )
     print(
@@ -145,7 +145,7 @@ def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, 
 def grasped(
     settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
 ) -> Cell:
-    """Grasp an object on the table, then apply its weight so that it pulls the object out.
+    """Grasp an object on the table, then apply its weight in the direction out of the hand.
 
     The daemon's settings contain the object's width or diameter ``size`` [m], friction and weight
     (``mass`` [kg]), but not its shape. The daemon always assumes a block.
@@ -174,7 +174,7 @@ def grasped(
         if hand.mode != "holding":
             return Cell(REFUSED, math.nan)
         before = hand.plant.object_pose.copy()
-        # Table friction opposes the load, so it is added to the load.
+        # The friction of the table opposes the load, so it is added to the load.
         pull = weight * (1.0 + settings.simulation.table_friction)
         for k in range(_LOAD_STEP_COUNT):
             load, phi = pull * (k + 1) / _LOAD_STEP_COUNT, float(hand.plant.object_pose[2])

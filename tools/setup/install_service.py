@@ -40,14 +40,14 @@ def unit(config: Path | None, user: str) -> str:
     words = [sys.executable, "-P", "-m", "softfinger", "run", "--no-task", "--log", "json"]
     if config is not None:
         if not find(config).is_file():
-            raise SettingsError(f"install-service: {config}: no such profile")
+            raise SettingsError(f"install-service: {config}: profile not found")
         words += ["--config", str(find(config).resolve())]
     line = ""
     if user:
         try:
             pwd.getpwnam(user)
         except KeyError:
-            raise SettingsError(f"install-service: {user}: no such user") from None
+            raise SettingsError(f"install-service: {user}: user not found") from None
         line = f"User={user}\n"
     command = " ".join(_quoted(word) for word in words)
     return _file("softfinger.service").format(command=command, user=line, group=serial_group())

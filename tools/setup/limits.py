@@ -1,4 +1,4 @@
-"""Run ``softfinger limits``: print a table of all limits with a profile's values."""
+"""Run ``softfinger limits``: print a table of all limits with their values in a profile."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _values(settings: Settings, row: Limit) -> list[str]:
-    """Return a limit's settings, each with the fraction at which the limit applies."""
+    """Return the settings of a limit, each with the fraction at which the limit applies."""
     share = "" if row.fraction == 1.0 else f"{row.fraction:g} × "
     return [f"{share}{key} = {_shown(_value(settings, key))}" for key in row.keys]
 

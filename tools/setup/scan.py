@@ -13,7 +13,7 @@ from softfinger.daemon.servos.provisioning import ONE_SERVO_ONLY, SEARCH_TIME, F
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Exit status: 0 a servo answered, 1 no servo answered or no port can be used."
+    parser.epilog = "Exit status: 0 a servo replied, 1 no servo replied or no port can be used."
     parser.add_argument(
         "ports", metavar="PORT", nargs="*", help="ports to scan (default: every serial port)"
     )
@@ -22,14 +22,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         action="append",
         metavar="N",
-        help="a baud rate to try; may be repeated (default: all rates that servos support)",
+        help="baud rate to try; can be given several times (default: all baud rates that servos "
+        "support)",
     )
     parser.add_argument(
         "--wait",
         type=float,
         default=SEARCH_TIME,
         metavar="S",
-        help="seconds to listen at each rate (0.8 s is enough for 253 servos at 1 Mbaud)",
+        help="listening time per baud rate in seconds (0.8 s is enough for 253 servos at 1 Mbaud)",
     )
 
 
@@ -38,7 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
     paths = arguments.ports or [path for path, _ in serial_ports()]
     if not paths:
         print(
-            "scan: found no serial port on this machine; give one as an argument", file=sys.stderr
+            "scan: found no serial port on this machine; give a port as an argument",
+            file=sys.stderr,
         )
         return 1
     count = 0
@@ -52,13 +54,13 @@ def run(arguments: argparse.Namespace) -> int:
         for servo in found.servos:
             rates.setdefault(replace(servo, baud=0), []).append(str(servo.baud))
         for servo, at in rates.items():
-            # An emulated servo may reply at several rates, which are listed in one line.
+            # An emulated servo may reply at several baud rates, which are listed on one line.
             print(f"{path}: {servo.describe(', '.join(at))}", flush=True)
         for garbled in found.garbled:
             print(f"{path}: {garbled}\n  → {ONE_SERVO_ONLY}", flush=True)
         for old in found.old_protocol():
             print(f"{path}: {old}", flush=True)
         if not found.servos and not found.garbled and not found.old:
-            print(f"{path}: no servo answers at any of these rates", flush=True)
+            print(f"{path}: no servo replies at any of these baud rates", flush=True)
         count += len(rates)
     return 0 if count else 1

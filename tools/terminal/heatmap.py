@@ -16,11 +16,11 @@ from rich.text import Span, Text
 
 FloatArray = NDArray[np.float64]
 
-LEVELS = 32  # number of colours; with fewer colours, redraws are faster
-SHADES = " ·░▒▓█"  # for terminals with too few colours
+LEVELS = 32  # number of colours; fewer colours make redraws faster
+SHADES = " ·░▒▓█"  # shades for terminals with too few colours
 
-# Lightness increases in equal steps from dark blue to bright yellow, so the order of the colours
-# also shows in greyscale and to colour-blind users.
+# Lightness increases in equal steps from dark blue to bright yellow, so the order of the colours is
+# also visible in greyscale and to colour-blind users.
 _ANCHORS = (
     (24, 18, 56),
     (50, 46, 110),
@@ -94,7 +94,7 @@ def picture(grid: FloatArray, full: float, lines: int, columns: int, coloured: b
 
 
 def _runs(top: NDArray[np.int64], bottom: NDArray[np.int64]) -> Text:
-    """Return one line in which adjacent characters of the same colours share a span."""
+    """Return one line in which adjacent characters with equal colours share a span."""
     changes = np.flatnonzero(np.diff(top) | np.diff(bottom)) + 1
     starts, styles = [0, *changes.tolist()], (top * LEVELS + bottom).tolist()
     spans = [
@@ -125,7 +125,7 @@ def round_up(value: float) -> float:
 
 
 class FullScale:
-    """Full-scale value that follows a signal's peak: up immediately, down after a delay."""
+    """Full-scale value that follows a signal's peak: up immediately, and down after a delay."""
 
     def __init__(self, smallest: float, patience: float = 3.0) -> None:
         self._smallest = smallest

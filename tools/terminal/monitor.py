@@ -33,10 +33,11 @@ from softfinger.tools.terminal.status import describe
 from softfinger.tools.terminal.stream_state import Commander, StreamReader, StreamState, printable
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
-STEP_ANGLE = math.radians(5.0)  # rad, object rotation per arrow key press
-_STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # (upper force limit [N], step below it [N])
-_ACCUMULATION_TIME = 1.0  # s, time within which key presses add up
-_CONFIRMATION_TIME = 3.0  # s, time limit for the second d that confirms disarming
+STEP_ANGLE = math.radians(5.0)  # rad, object rotation per press of an arrow key
+# (upper limit of a force range [N], step in this range [N]).
+_STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
+_ACCUMULATION_TIME = 1.0  # s, interval within which key presses add up
+_CONFIRMATION_TIME = 3.0  # s, time limit for the second press of d, which confirms disarming
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
@@ -49,7 +50,7 @@ class HandKeys:
         self._commander = commander
         self._target: float | None = None  # object angle [rad]
         self._chosen = math.nan  # grasp force [N]
-        self._pressed = -math.inf  # time of this page's last force change
+        self._pressed = -math.inf  # time of the last force change made on this page
         self._asked = -math.inf  # time of the first d key during a grip
 
     def press(self, key: str, now: float) -> None:
@@ -93,7 +94,7 @@ class HandKeys:
         """Change the force by one step, and apply it to the current grip, if any."""
         present = self.force(now)
         if not math.isfinite(present):
-            self._commander.refuse(now, "grasp: the hand's settings are not known yet")
+            self._commander.refuse(now, "grasp: the hand's settings have not arrived yet")
             return
         step = next(step for limit, step in _STEPS if present + 0.01 * sign <= limit)
         target = round(step * (round(present / step) + sign), 3)
@@ -111,7 +112,7 @@ class HandKeys:
             self._commander.send(now, label, "grasp", force=self._chosen)
 
     def _rotate(self, step: float, now: float) -> None:
-        """Rotate by one step from the last target, not from the current angle; presses add up."""
+        """Rotate by one step from the last target, not the current angle, so presses add up."""
         reply, pose = self._commander.reply, self._feed.state.object
         refused = reply is not None and not reply.ok
         if self._target is None or refused or self._feed.mode not in ("rotating", "holding"):
@@ -135,12 +136,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "change the force. If the output is not a terminal, print a plain line every second."
     )
     add_stream(parser, addresses, client=True)
-    parser.add_argument("--plain", action="store_true", help="print plain lines, not the page")
+    parser.add_argument(
+        "--plain", action="store_true", help="print plain lines instead of the page"
+    )
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when this pipe closes
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until the q key, a signal, the duration's end or the daemon's end.
+    """Run until the q key is pressed, a signal arrives, the duration is over or the daemon ends.
 
     Returns 1 if no stream was received. Raises KeyFileError.
     """
@@ -199,7 +202,8 @@ class _MonitorStop(StopCondition):
         self.terminal: Terminal | None = None
         self._no_wait: bool = args.no_wait
         self._keys: Path | None = args.keys
-        self.beside = args.lifeline is not None  # started by the daemon, in the same process group
+        # True if started by the daemon, in the same process group.
+        self.beside = args.lifeline is not None
         self._wait_until = time.monotonic() + WAIT_MAX
 
     def __enter__(self) -> Self:
@@ -242,7 +246,8 @@ def _run_page(
         while not ending.is_met:
             with terminal:
                 _page_loop(page, terminal, keyboard, subscriber, commander, ending)
-            if ending.suspend and not ending.is_met:  # After Ctrl-Z, the shell gets the terminal.
+            # After Ctrl-Z, the shell takes over the terminal.
+            if ending.suspend and not ending.is_met:
                 ending.suspend = False
                 os.kill(os.getpid(), signal.SIGSTOP)
     except TerminalGone:

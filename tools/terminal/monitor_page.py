@@ -36,7 +36,7 @@ CENTRE = 34  # columns, width of the numbers
 MAP_LINES = 11  # height of each map at the minimum page size
 OLD_AGE = 1.0  # s, age above which a frame is marked as old
 REPLY_TIME = 12.0  # s, time for which a reply is shown
-DELAY_MIN = 0.05  # s, delay above which a message is shown
+DELAY_MIN = 0.05  # s, delay above which a message is displayed
 
 GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
 KEY = "bold #56b4e9"
@@ -63,8 +63,8 @@ _KEYS = {
     "q": "quit",
 }
 _KEYS_EXPLAINED = (
-    ("w", "restarts the profile's task, while disarmed"),
-    ("+ -", "increase or reduce the force, also of a current grip"),
+    ("w", "restarts the profile's task (only while disarmed)"),
+    ("+ -", "increase or reduce the force, including that of the current grip"),
 )
 
 # (label, field, factor, decimals, unit, field of the standard deviation)
@@ -85,7 +85,7 @@ _ROWS = (
 
 @dataclass
 class MonitorPage:
-    """Page that shows a `StreamState`; ``now`` is monotonic time [s]."""
+    """Page that shows a `StreamState`; ``now`` is the monotonic time [s]."""
 
     feed: StreamState
     address: str
@@ -93,7 +93,7 @@ class MonitorPage:
     keys: bool = True  # True if a keyboard is available
     guarded: bool = False  # True if subscribed with access keys
     force: float = math.nan  # N, force requested by the grasp key
-    explains: bool = False  # True to show explanations instead of the numbers
+    explains: bool = False  # True if explanations are shown instead of the numbers
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
 
     def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
@@ -131,7 +131,7 @@ class MonitorPage:
             badge = _BADGES["disarmed"]
         left = Text.assemble((" softfinger ", "bold"), (f" {feed.mode.upper() or '—'} ", badge))
         if status == "waiting":
-            right = Text("○ no stream yet ", WARN)
+            right = Text("○ no stream has arrived yet ", WARN)
         elif status == "live":
             right = Text.assemble(("● live ", GOOD), (f"{format_value(feed.rate, 0)} Hz ", DIM))
         else:
@@ -157,8 +157,8 @@ class MonitorPage:
                 Text(what + " (or it requires --keys)" * (not self.guarded), WARN), width
             )
         if feed.state.schema != SCHEMA:
-            what = f" the stream has schema {feed.state.schema}, this page knows {SCHEMA}"
-            return Text(what + "and shows the fields that it knows", WARN)
+            what = f" the stream has schema {feed.state.schema}, this page supports {SCHEMA}"
+            return Text(what + "and shows only known fields", WARN)
         lately = feed.waited(now)
         if lately > DELAY_MIN:
             what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"
@@ -269,7 +269,7 @@ class MonitorPage:
         return line.append(" µs", DIM)
 
     def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
-        """Draw the commander, the last reply, texts that did not fit their line, and events."""
+        """Draw the commanding client, the last reply, texts too long for their line, and events."""
         who = truncated(Text(self.feed.commander(now)), 16)
         title = Text(f"events ─ {who} commands the hand" if who else "events")
         full: list[Text] = []
@@ -300,7 +300,7 @@ class MonitorPage:
         return lines + [Text() for _ in range(count - len(lines))]
 
     def _footer(self, width: int) -> Text:
-        """List the keys. On a narrow terminal, list only those useful in the current mode."""
+        """List the keys; on a narrow terminal, only those that are useful in the current mode."""
         if not self.keys:
             return Text(" no keyboard input: send commands with softfinger send", DIM)
         force = f"{self.force:.3g} N" if math.isfinite(self.force) else "N"
@@ -329,7 +329,7 @@ def _named(keys: dict[str, str]) -> Text:
 
 
 def _heights(width: int, height: int) -> tuple[int, int]:
-    """Return the number of lines for each map and for the events at this page size."""
+    """Return the numbers of lines for each map and for the events at this page size."""
     spare = height - HEIGHT
     widest = (width - CENTRE - 2) // 4  # A map has twice as many columns as lines.
     maps = max(MAP_LINES, min(widest, MAP_LINES + (2 * spare + 2) // 3))

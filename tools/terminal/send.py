@@ -18,7 +18,7 @@ from softfinger.tools.arguments import add_daemon, client_keys, command_address,
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
-_UNITS = {  # allowed units per key; numbers without a unit are in SI units
+_UNITS = {  # accepted units for each key; numbers without a unit are in SI units
     "force": {"N": 1.0, "mN": 1e-3},
     **dict.fromkeys(("angle", "left", "right"), _ANGLES),
 }
@@ -26,8 +26,8 @@ _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle=RAD (a streamed
 setpoint), move left=RAD right=RAD, release, set compliance=RAD/NM, demo (restart the profile's
 task), stop, clear, status. Numbers are in SI units or carry a unit: force=10N, angle=8deg or 8°.
-Exit status: 0 done, 1 refused, 2 no answer or invalid words, 3 stop or disarm was received, but the
-servos have not confirmed yet that torque is off."""
+Exit status: 0 done, 1 refused, 2 no reply or invalid arguments, 3 stop or disarm was received, but
+the servos have not confirmed torque off yet."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,7 +1,7 @@
 """Collect the live page's data from the daemon's sockets, without drawing it.
 
-Message contents are not trusted. Fields that are missing or have the wrong type become NaN or
-empty. Messages that cannot be decoded are counted and skipped.
+The contents of messages are not trusted. Fields that are missing or have the wrong type become NaN
+or empty. Messages that cannot be decoded are counted and skipped.
 """
 
 from __future__ import annotations
@@ -41,19 +41,20 @@ from softfinger.daemon.wire.local_stop import stop_locally
 RECENT_TIME = 3.0  # s, time window for the sum of waits for a busy machine
 EVENT_COUNT_MAX = 200  # number of stored events
 GLOSSARY = (  # meanings of the terms on the pages
-    ("d", "displacement of the object's face into the tip"),
-    ("θ", "tilt of the object's face against the tip"),
+    ("d", "displacement of the tip by the object's face"),
+    ("θ", "tilt of the object's face relative to the tip"),
     ("force", "F(d, θ), contact force on the tip, normal to the face"),
     ("energy", "U(d, θ), elastic energy in the tip"),
     ("±", "one standard deviation"),
-    ("map age", "time since the newest pressure map was measured"),
-    ("joint, goal", "present and requested angle; positive closes"),
-    ("current, bound", "motor current, and the limit that its goal allows"),
+    ("map age", "age of the newest pressure map"),
+    ("joint, goal", "current and goal angle; positive when closing"),
+    ("current, bound", "motor current and its limit in the current goal"),
     ("object", "angle and width of the object between the tips"),
 )
-# Fraction of the requested force above which the grip is reported as raised.
+# Relative force increase above which the page reports that the grip force was raised.
 _INCREASED_RATIO = 1.01
-_DRAIN_COUNT_MAX = 4000  # messages read per call, limited so that a flood cannot block drawing
+# Maximum number of messages read per call, so that a flood of messages cannot block drawing.
+_DRAIN_COUNT_MAX = 4000
 _MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid has 131 kB
 
 
@@ -96,7 +97,7 @@ class ShownFrame(NamedTuple):
 
 
 class ShownEvent(NamedTuple):
-    """One ``hand/event``, prepared for drawing."""
+    """A single ``hand/event``, prepared for drawing."""
 
     timestamp: float  # Unix time [s], NaN if unknown
     level: str
@@ -115,7 +116,8 @@ class StreamState:
     """Process stream messages and store the data that a page shows.
 
     In all methods ``now`` is monotonic time [s]. ``events`` are sorted by time of occurrence. After
-    a late subscription this differs from the order of arrival, in which `news` returns them.
+    a late subscription, this order differs from the order of arrival, in which `news` returns the
+    events.
     """
 
     def __init__(self) -> None:
@@ -126,8 +128,8 @@ class StreamState:
         self.events: list[ShownEvent] = []
         self._news: deque[ShownEvent] = deque(maxlen=EVENT_COUNT_MAX)
         self._event_times: deque[tuple[float, float]] = deque(maxlen=2 * EVENT_COUNT_MAX)
-        self.times: schema.LoopStatistics | None = None  # statistics for all ticks so far
-        # s, time to a servo's temperature limit, below which a warning is shown
+        self.times: schema.LoopStatistics | None = None  # statistics of all previous ticks
+        # s; a warning is shown if a servo reaches its temperature limit sooner
         self.heat_warning_time = 0.0
         self._lease_holder = "", -math.inf  # holder of the command lease, end of the lease [s]
         self._lease = math.nan  # s, lease duration
@@ -273,7 +275,7 @@ class StreamState:
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
 
     def waited(self, now: float) -> float:
-        """Return the time for which a simulated hand recently waited for a busy machine [s]."""
+        """Return the time for which a simulated hand has recently waited for a busy machine [s]."""
         while self._waits and self._waits[0][0] < now - RECENT_TIME:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)
@@ -312,9 +314,10 @@ class _Pending:
     socket: zmq.Socket[bytes]
     attempts: Attempts
     sent: float
-    late: dict[str, Any] | None = None  # refusal as late, stored until the command is sent again
+    # Refusal because of lateness, stored until the command is sent again.
+    late: dict[str, Any] | None = None
     again_at: float = 0.0  # time of the next attempt
-    warned: bool = False  # True once a message about the missing reply was shown
+    warned: bool = False  # True once a message about the missing reply has been shown
 
 
 class Commander:
@@ -322,10 +325,11 @@ class Commander:
 
     Each command uses its own request socket, so a missing reply does not delay other commands. If
     the same user runs the daemon on this machine, a stop bypasses the requests of all clients. The
-    daemon replies on the next tick. If the daemon is stalled, the wait for this reply is short.
+    daemon replies on the next tick. If the daemon is stalled, the client waits for this reply only
+    briefly.
     """
 
-    OPEN_LIMIT = 8  # maximum number of open commands; others are dropped, except stop
+    OPEN_LIMIT = 8  # maximum number of open commands; further commands are dropped, except stop
 
     def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
         self._context = context
@@ -337,7 +341,7 @@ class Commander:
     def send(self, now: float, label: str, command: str, **fields: float) -> None:
         """Send ``command`` with ``fields``; label its reply with ``label``."""
         if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
-            self.refuse(now, f"{label}: dropped, the daemon doesn't answer")
+            self.refuse(now, f"{label}: discarded because the daemon does not respond")
             return
         if (
             command == "stop"
@@ -354,7 +358,7 @@ class Commander:
         self._pending.append(_Pending(label, request, attempts, now))
 
     def refuse(self, now: float, why: str) -> None:
-        """Show the reason why a command was not sent or failed."""
+        """Show the reason why a command failed or was not sent."""
         self.reply = ShownReply(now, False, why)
 
     def collect(self, now: float) -> None:
@@ -366,7 +370,7 @@ class Commander:
                 if each.attempts.remaining():
                     each.late = None
                     each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
-                else:  # The process was suspended in the meantime.
+                else:  # The process was suspended while waiting.
                     self._end(each, now, each.late)
                 continue
             try:
@@ -376,8 +380,8 @@ class Commander:
                 if overdue or (not each.warned and now - each.sent >= SILENCE_TIME):
                     each.warned = True
                     timeout = f"{REPLY_TIMEOUT:g} s"
-                    so_far = f"within {timeout}" if overdue else f"yet, {timeout} at most"
-                    self.refuse(now, f"{each.label}: no answer from {self._address} {so_far}")
+                    so_far = f"within {timeout}" if overdue else f"yet, waiting up to {timeout}"
+                    self.refuse(now, f"{each.label}: no reply from {self._address} {so_far}")
                 if overdue:
                     self._close(each)
                 continue
@@ -406,5 +410,5 @@ def judge(now: float, label: str, record: Any) -> ShownReply:
             return ShownReply(now, False, f"{label}: {UNCONFIRMED_TEXT}")
         return ShownReply(now, True, f"{label}: ok")
     why = text(record, "error") or "invalid answer"
-    named = why.split(":")[0] == label.split()[0]  # True if the message names the command
+    named = why.split(":")[0] == label.split()[0]  # True if the message contains the command
     return ShownReply(now, False, why if named else f"{label}: {why}")

@@ -1,6 +1,7 @@
 """Control the terminal for a full-screen page: screen modes, key decoding, output, restoring.
 
-A redraw sends all changed lines in a single write, which is fast over ssh and avoids flicker.
+A redraw sends all changed lines in a single write operation, which is fast over ssh and avoids
+flicker.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from rich.text import Text
 
 from softfinger.daemon.errors import SoftfingerError
 
-with contextlib.suppress(ModuleNotFoundError):  # Windows supports only `monitor --plain`
+with contextlib.suppress(ModuleNotFoundError):  # only `monitor --plain` is supported on Windows
     import termios
     import tty
 
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, bracketed paste
-_LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # begins with CAN to end a partial sequence
+# Begins with CAN, which ends a partial sequence.
+_LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # synchronised update, if supported by the terminal
 
 _COLOUR_SYSTEMS = {
@@ -45,7 +47,7 @@ _KEY = re.compile(
 
 
 class TerminalGone(SoftfingerError):
-    """The terminal is not writable, or a signal interrupted a blocked write."""
+    """The terminal is not writable, or a signal has interrupted a blocked write."""
 
 
 class KeyDecoder:
@@ -82,13 +84,14 @@ class Terminal:
         self._console = Console()
         name = None if self._console.no_color else self._console.color_system
         self._colours = _COLOUR_SYSTEMS.get(name) if name else None
-        self.coloured = name in ("truecolor", "256")  # 16 colours are too few for a map.
+        self.coloured = name in ("truecolor", "256")  # A map requires more than 16 colours.
 
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
             self._attributes = termios.tcgetattr(self._keyboard)
-            tty.setcbreak(self._keyboard)  # This also discards keys that were typed earlier.
-            if not self._suspendable:  # Ctrl-Z would also suspend the daemon with torque on.
+            tty.setcbreak(self._keyboard)  # This call also discards keys that were typed earlier.
+            # Otherwise, Ctrl-Z would also suspend the daemon while the torque is on.
+            if not self._suspendable:
                 ours = termios.tcgetattr(self._keyboard)
                 ours[6][termios.VSUSP] = b"\0"
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, ours)

@@ -43,7 +43,7 @@ def wrapped(line: Text, columns: int) -> list[Text]:
 
 
 def justified(left: Text, right: Text, width: int) -> Text:
-    """Place ``left`` and ``right`` at the ends of a line with ``width`` columns."""
+    """Place ``left`` and ``right`` at the two ends of a line with ``width`` columns."""
     return Text.assemble(left, " " * max(1, width - left.cell_len - right.cell_len), right)
 
 

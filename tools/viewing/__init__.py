@@ -1,1 +1,1 @@
-"""The command `view`: show the stream or a recording on a web page, and serve it to Foxglove."""
+"""Implement `view`, which shows the stream or a recording on a web page and in Foxglove."""

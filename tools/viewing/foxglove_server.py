@@ -29,7 +29,8 @@ from softfinger.tools.terminal.stream_state import number
 from softfinger.tools.viewing.hand_drawing import COLOURS, DrawnPart, hand_parts
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
-ORIGINS = ("https://app.foxglove.dev", "file://")  # Foxglove in the browser and on the desktop
+# Origins of Foxglove's web and desktop applications.
+ORIGINS = ("https://app.foxglove.dev", "file://")
 PROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
 CLIENT_COUNT_MAX = 8
 SCENE = "hand/scene"
@@ -37,8 +38,8 @@ _FRAME = "hand"  # coordinate frame [m]: x from the left to the right pivot, y a
 _LIST = {"type": "array", "items": {"type": "object", "properties": {}}}
 _ENTITIES = {"type": "object", "properties": {"deletions": _LIST, "entities": _LIST}}
 _HEAD = struct.Struct("<BIQ")  # message header: kind, subscription, time [ns]
-_EVENT_COUNT = 50  # events stored for new subscribers, the same number as in the daemon
-_QUEUE_LENGTH = 500  # messages queued for a client; excess messages are dropped
+_EVENT_COUNT = 50  # number of events stored for new subscribers, as in the daemon
+_QUEUE_LENGTH = 500  # maximum number of messages queued for a client; excess messages are dropped
 _SEND_TIMEOUT = 2.0  # s, timeout for a client to accept a message
 
 

@@ -44,7 +44,7 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
 
 
 class DrawnPart(NamedTuple):
-    """Part of a picture, empty if it is currently absent."""
+    """Part of a picture; empty if the part is currently absent."""
 
     lines: list[tuple[str, float, FloatArray]]  # (colour name, width [m], points [n, 2] [m])
     texts: list[tuple[str, FloatArray, str]]  # (colour name, position [2], text)
@@ -57,7 +57,7 @@ class FingerLines(NamedTuple):
     base: FloatArray
     skin: FloatArray
     face: FloatArray | None  # end points of the contact line on the object's face
-    # Point where the tip pushes on the object, unit vector of the push direction.
+    # Point at which the tip pushes on the object, and unit vector in the push direction.
     push: FloatArray | None
 
 
@@ -106,8 +106,8 @@ def held_outline(
 ) -> FloatArray:
     """Return the held object's closed outline [m], shape [5, 2], with the left finger first.
 
-    The position across the faces follows from the joint angles and contacts. Along the faces, the
-    object is assumed to be centred on the contacts.
+    The position across the faces is computed from the joint angles and contacts. Along the faces,
+    the object is assumed to be centred on the contacts.
     """
     a, tips = hand.tip_radius, hand.tips(q)
     angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])
@@ -179,11 +179,12 @@ def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
     return part
 
 
-# Picture coordinates are in cells from the corner of the first cell: x along the columns, y along
-# the rows. In the sensor's axes, the footprint for displacement d and outward normal n is an
-# ellipse with centre h·(n_x, n_y), h = a − d, and semi-axes ρ n_z along the tilt and ρ across it,
-# ρ² = 2ad − d². The pressure centroid is at (a − d/3)·(n_x, n_y). This position is exact for any
-# constant modulus and a close approximation for a measured material law.
+# Picture coordinates are measured in cells from the corner of the first cell, with x along the
+# columns and y along the rows. In the sensor's axes, the footprint for displacement d and outward
+# normal n is an ellipse. With h = a − d and ρ² = 2ad − d², its centre is h·(n_x, n_y), and its
+# semi-axes are ρ n_z along the tilt and ρ across the tilt. The pressure centroid is at (a −
+# d/3)·(n_x, n_y). This position is exact for any constant modulus and a close approximation for a
+# measured material law.
 
 
 def grid_of(frame: TactileFrame) -> SensorGrid | None:

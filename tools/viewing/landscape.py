@@ -1,4 +1,4 @@
-"""Read the hand's settings from ``hand/settings``, and draw its energy landscape U(d, θ).
+"""Read the settings in ``hand/settings``, and draw the tip's energy landscape U(d, θ).
 
 If a key comes from another version and cannot be read, its default value is used, so that the
 remaining data can be shown.
@@ -23,8 +23,8 @@ from softfinger.kinematics.contact.table_record import TableError
 from softfinger.tools.terminal import heatmap
 
 WIDTH, HEIGHT = 240, 200  # pixels of the landscape
-THETA_END = 45.0  # degrees, range of θ per side
-_TOLERANCE = 1e-6  # relative error of the table for the picture
+THETA_END = 45.0  # degrees, maximum |θ|
+_TOLERANCE = 1e-6  # relative tolerance of the table for the picture
 
 
 class Landscape(NamedTuple):
@@ -58,7 +58,7 @@ def landscape(settings: Settings) -> Landscape | None:
 
 
 def fingers_of(settings: Settings) -> list[str]:
-    """Return the hand's fingers, left first."""
+    """Return the names of the hand's fingers, left finger first."""
     return [name for name in FINGERS if name in settings.scene.fingers]
 
 

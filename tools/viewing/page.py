@@ -1,9 +1,9 @@
 """Serve the ``softfinger view`` page, its pictures and its commands on the loopback interface.
 
-One thread serves the pages. The main thread reads the stream or plays a recording, and creates each
-picture once for all pages. A page requests the next picture after drawing the last one, so a slow
-page skips pictures without delaying the others. The terminal prints a token. Pages with this token
-may send commands, and each page is a separate client.
+A single thread serves the pages. The main thread reads the stream or plays a recording, and creates
+each picture once for all pages. A page requests the next picture after drawing the last one, so a
+slow page skips pictures without delaying the others. The terminal prints a token. Pages with this
+token may send commands, and each page is a separate client.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ _HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in GLOSSAR
 _WEB = Path(__file__).with_name("web")
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
-_NICENESS = 5  # lower priority than all real-time threads
-_WAITING_COUNT_MAX = 40  # commands awaiting a reply, all pages combined
+_NICENESS = 5  # lower than the priority of any real-time thread
+_WAITING_COUNT_MAX = 40  # maximum number of commands awaiting a reply, for all pages together
 _REQUEST_TIMEOUT = 5.0  # s, timeout for a request's header, long enough for a busy browser
-_NAME_LENGTH_MAX = 40  # characters shown of a command name
+_NAME_LENGTH_MAX = 40  # maximum number of displayed characters of a command name
 _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
-_BUFFER_SIZE = 256 << 10  # bytes queued for a page or a Foxglove client
+_BUFFER_SIZE = 256 << 10  # bytes, maximum size of the data queued for a page or a Foxglove client
 _MESSAGE_SIZE_MAX = 65536  # bytes, size limit for messages from a page or a Foxglove client
 _HEADERS = {
     "Cache-Control": "no-store",  # The page may contain a token, which changes at each start.
@@ -89,11 +89,11 @@ class Site:
     """Serve the page, its pictures and commands, and Foxglove clients.
 
     Requests must name this server as their host. A browser's requests must also come from this
-    server's pages. These rules block DNS rebinding, where the host has another name, and requests
-    from foreign pages, which have another origin. Pages with the ``token`` may send commands
-    through ``send``. All pages may control a recording's playback through ``wish``. If other
-    machines can reach the server, the token is required even for watching. A browser then obtains
-    the token with a one-time code.
+    server's pages. The first rule blocks DNS rebinding, in which the host has another name. The
+    second rule blocks requests from other sites' pages, which have another origin. Pages with the
+    ``token`` may send commands through ``send``. All pages may control a recording's playback
+    through ``wish``. If other machines can reach the server, the token is required even for
+    watching. A browser then obtains the token with a one-time code.
     """
 
     def __init__(
@@ -119,7 +119,8 @@ class Site:
         self._ended = asyncio.Event()
         self._hosts: set[str] = set()  # this server's valid host names
         self._at_once = asyncio.Semaphore(_WAITING_COUNT_MAX)
-        self.waiting: list[asyncio.Future[_Published]] = []  # pages waiting for the next picture
+        # Pages that are waiting for the next picture.
+        self.waiting: list[asyncio.Future[_Published]] = []
         self.record: Callable[[], str] = lambda: ""  # function that starts or ends a recording
         # Function that receives the string with which a page requests each picture.
         self.wish: Callable[[str], None] = lambda _: None
@@ -180,13 +181,13 @@ class Site:
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
-        # Here each request contains a secret, so the host may have any name.
+        # In this case each request contains a secret, so any host name is accepted.
         if self._announce is not None:
             here = True
             if not self._allows(request):
                 return self._exchange(connection, request)
         if not here or origins not in known:
-            return connection.respond(403, "only for pages of this machine")
+            return connection.respond(403, "only pages served from this machine may connect")
         if upgrade and path in self._routes:
             return None
         if upgrade or path != "/":
@@ -200,9 +201,12 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Redirect a browser that has the one-time code to the page with the token, or refuse."""
+        """Redirect browsers with the one-time code to the page with the token; refuse others."""
         if not self._code or not _has(request, "code", self._code):
-            said = "This page needs the newest address that softfinger view prints; each works once"
+            said = (
+                "Open this page with the newest address printed by softfinger view; each "
+                "address works only once"
+            )
             return connection.respond(403, said)
         self.announce()
         response = connection.respond(303, "")
@@ -224,7 +228,7 @@ class Site:
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Send a page the next picture each time it requests one, with the rows that it lacks.
+        """Send a page the next picture each time it requests one, together with the missing rows.
 
         A new scene is sent before the picture.
         """
@@ -241,11 +245,11 @@ class Site:
             await page.send(f'{picture[:-1]},"rows":[{",".join(fresh)}]}}')
 
     async def _command(self, page: ServerConnection) -> None:
-        """Execute the commands of a page that has the token, and send the replies."""
+        """Execute commands from a page that has the token, and send the replies."""
         assert page.request is not None
         allowed = self._send is not None and self._allows(page.request)
         async for text in page:
-            answer = "✗ needs the token that the terminal prints"
+            answer = "✗ commands require the token printed in the terminal"
             if allowed:
                 async with self._at_once:
                     answer = await self._in_thread(text)
@@ -268,13 +272,15 @@ class Site:
     def _answer(self, text: str | bytes) -> str:
         """Send the request ``text`` to the daemon, which checks it; return a line about the result.
 
-        A command other than stop is dropped if its picture (``seen``, monotonic s) is too old.
+        A command other than stop is dropped if the user's picture (time ``seen``, monotonic [s]) is
+        too old.
         """
         try:
             asked = json.loads(text)
             name = str(asked["command"])[:_NAME_LENGTH_MAX]
             age = time.monotonic() - float(asked.pop("seen", "nan"))
-            # This call fails for values that msgpack can't represent: deep nesting, long integers.
+            # This call fails for values that msgpack cannot represent, such as deep nesting and
+            # long integers.
             msgpack.packb(asked)
         except _NO_COMMAND:
             return '✗ invalid command: expected a JSON object with "command", not nested deeply'
@@ -283,7 +289,7 @@ class Site:
         if name != "stop" and math.isnan(age):
             return f'✗ {name}: expected "seen", the time of its picture'
         if name != "stop" and not age < self._stale:
-            return f"✗ {name}: dropped, the page is {age:.0f} s behind"
+            return f"✗ {name}: discarded because the page is {age:.0f} s behind"
         try:
             remaining = self._stale if name == "stop" else self._stale - age
             assert self._send is not None
@@ -371,13 +377,13 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
                 secret = f"/?token={token}" if away else ""
                 print(f"view: ws://{address}{secret} for Foxglove; layout: {LAYOUT}")
             if live and not away:
-                print(f"view: http://{address}/?token={token} to see and command the hand")
+                print(f"view: http://{address}/?token={token} to view and command the hand")
             if away:
                 site.announce()
             else:
-                print(f"view: http://{address}/ to see it", flush=True)
+                print(f"view: http://{address}/ to view the hand", flush=True)
             if foxglove is None and not away and not arguments.no_browser:
-                # Omit the token, because other users may see the browser's command line.
+                # Omit the token, because other users may be able to see the browser's command line.
                 webbrowser.open(f"http://{address}/")
             ending.begin()
             source()
@@ -385,7 +391,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
             recorder.close()
             site.end()
             serving.join()
-    _say(f"{pictures.seen} states seen, {pictures.unreadable} messages could not be read")
+    _say(f"{pictures.seen} states received, {pictures.unreadable} messages could not be read")
     if pictures.seen == 0:
         raise ViewError(f"{arguments.file or arguments.address}: received nothing to show")
 

@@ -40,16 +40,16 @@ if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
 TOPICS = (*StreamState().topics, schema.TRUTH)
-SECONDS = 60.0  # s, duration of the history that a newly opened page receives
+SECONDS = 60.0  # s, duration of the history sent to a newly opened page
 STEP = 0.1  # s, time between plot rows
-_TRAIL_LENGTH = 60  # rows in a trail on the landscape
-_EVENT_COUNT = 50  # number of displayed events
+_TRAIL_LENGTH = 60  # number of rows in a trail on the landscape
+_EVENT_COUNT = 50  # maximum number of displayed events
 _WARNING_TIME = 5.0  # s, display time of a warning
 _LIMIT_FRACTION = 0.8  # fraction of a limit above which a value is reported
 _DARK_SIGMA = 2.0  # standard deviations of cell noise; lower pressures are drawn as zero
 _FULL_SCALE_MIN = 10.0  # standard deviations of cell noise, minimum full scale
-_OLD_TIME = 0.35  # s without a message, after which the last message is shown as old
-_OLD_PERIODS = 4.0  # the same limit in stream periods; the longer time applies
+_OLD_TIME = 0.35  # s, age above which the last message is shown as old
+_OLD_PERIODS = 4.0  # the same limit in stream periods; the longer of both times applies
 _NUMBER_MAX = 1e6  # limit for drawn numbers, because messages may contain any value
 _DEGREE = math.degrees(1.0)
 
@@ -90,8 +90,8 @@ _HEADLINE = (  # title, decimals, plotted fields
     ("Displacement d", 2, "left.d right.d"),
 )
 _SERVOS = ("q", "current")  # fields that are missing in a hand without servos
-_DEVIATED = ("force", "d", "theta")  # finger fields for which {}_std is also drawn
-_OTHERS = {  # names and colours of lines that are not for a finger
+_DEVIATED = ("force", "d", "theta")  # finger fields for which {}_std is drawn as well
+_OTHERS = {  # names and colours of lines that do not belong to a finger
     "object.angle": ("object", OBJECT),
     "object.width": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
@@ -105,7 +105,7 @@ _FACTORS |= {
     for path, factor in _FACTORS.items()
     if path.rpartition(".")[2] in _DEVIATED
 }
-_COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # after number, time and mode
+_COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # columns after number, time and mode
 _values = attrgetter(*_FACTORS)
 
 
@@ -130,8 +130,8 @@ class Pictures:
     """Process untrusted messages, and pass the scene and each picture to ``publish``.
 
     ``watched`` returns True if a page is open. ``say`` is called for messages that cannot be read.
-    Times are the machine's times for a ``live`` stream and the messages' times for a recording.
-    ``foxglove`` also receives the messages.
+    Times are taken from the machine's clock for a ``live`` stream, and from the messages for a
+    recording. ``foxglove`` also receives the messages.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Pictures:
         self._begin_rows()
 
     def _begin_rows(self) -> None:
-        """Discard the rows; pages then also drop the older rows."""
+        """Discard all rows; the pages then drop them as well."""
         self._first = self._number
         self._past: deque[tuple[HandState, Row]] = deque(maxlen=round(SECONDS / STEP))
 
@@ -384,11 +384,13 @@ class Pictures:
             if ratio >= _LIMIT_FRACTION
         ]
         if self.states and state.schema != schema.SCHEMA:
-            notes.append(f"the stream has schema {state.schema}, this page knows {schema.SCHEMA}")
+            notes.append(
+                f"the stream has schema {state.schema}, this page supports {schema.SCHEMA}"
+            )
         return notes
 
     def _force_increase(self) -> str:
-        """Describe the grip's goal if the daemon has raised the force."""
+        """Describe the grip's goal if the daemon has increased the force."""
         grip = self.feed.grip()
         return grip if "raised" in grip else ""
 

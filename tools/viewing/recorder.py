@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 class PageRecorder:
     """Run one `softfinger record` process at a time, in the current folder.
 
-    ``show`` is called with a map. It contains the ``file`` and start time ``since`` (Unix time [s])
-    of the running recording, or the reason if the recording ``failed``. Without a recording, the
-    map is empty.
+    ``show`` is called with a map that contains the running recording's ``file`` and its start time
+    ``since`` (Unix time [s]). If the recording failed, the map contains the reason as ``failed``.
+    Without a recording, the map is empty.
     """
 
     def __init__(self, address: str, keys: str, show: Callable[[dict[str, Any]], None]) -> None:
@@ -32,7 +32,7 @@ class PageRecorder:
         try:
             from softfinger.tools.processes.child_processes import RecorderError, RecorderProcess
         except ImportError:  # The system has no termios.
-            return "✗ record: only on Linux and macOS; use softfinger record"
+            return "✗ record: available only on Linux and macOS; use softfinger record instead"
         with self._lock:
             if self._process is not None:
                 return f"✓ {self._end()}"

@@ -25,10 +25,11 @@ from softfinger.tools.terminal.stream_state import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
 _SILENCE_TIME = 2.0  # s, time without messages before a notice is printed
-_DRAW_PAUSE_MAX = 1.0  # s, maximum pause between pictures if drawing is slow
+_DRAW_PAUSE_MAX = 1.0  # s, maximum time between pictures if drawing is slow
 _MARK_COUNT_MAX = 2_000  # maximum number of marks shown for a recording
 _SPEED_RANGE = 0.1, 10.0
-# messages queued between reads, enough for 2 s of state and truth at 1 kHz, with frames.
+# Maximum number of messages queued between reads; enough for 2 s of states, truth and frames at 1
+# kHz.
 _QUEUE_LENGTH = 5_000
 
 
@@ -64,9 +65,9 @@ def follow(
             if silent != (began - last > _SILENCE_TIME):
                 silent = not silent
                 where = waiting(arguments.address, arguments.keys)
-                say(where if silent else "the stream has begun")
+                say(where if silent else "the stream has started")
             pictures.draw()
-            # Use at most half of the CPU time, even on a slow machine.
+            # Even on a slow machine, use at most half of the CPU time.
             worked = time.thread_time() - worked
             rest = max(
                 1.0 / arguments.rate - (time.monotonic() - began), min(worked, _DRAW_PAUSE_MAX)
@@ -127,7 +128,7 @@ class Playback:
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
-        # A recording may contain the settings only once, so read them first.
+        # Read the settings first, because a recording may contain them only once.
         for message in islice(recording.messages([schema.SETTINGS]), 1):
             pictures.take(*message)
         while not ending.is_met:

@@ -11,20 +11,24 @@ from softfinger.tools.extras import require
 from softfinger.tools.stop_condition import StopCondition
 
 _EPILOG = """\
-Serves a page for browsers on this machine. The printed address with the token opens a page with
-buttons and sliders, on which the space key stops the hand; without the token the page only shows.
-With --foxglove, the page also serves Foxglove's protocol, by default at ws://127.0.0.1:8765. The
-printed line names the layout file. Open recordings in Foxglove directly.
-Ends with Ctrl-C, or after --duration.
-From another machine, use ssh -L 9090:127.0.0.1:9090 with the printed port, or --host ADDRESS in a
+Serves a web page for browsers on this machine. The printed address with the token opens a page with
+buttons and sliders, where the space key stops the hand. Without the token, the page only displays.
+With --foxglove, the stream is also served to Foxglove, by default at ws://127.0.0.1:8765; the
+printed line gives the layout file. Recordings can be opened directly in Foxglove.
+The server stops on Ctrl-C, or after --duration.
+From another machine, use ssh -L 9090:127.0.0.1:9090 with the printed port, or --host ADDRESS on a
 trusted network. Each address that is then printed opens the page in one browser.
-Exit status: 0, or 1 with the reason if nothing could be shown."""
+Exit status: 0 success; 1 nothing could be shown, with the reason."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument(
-        "file", type=Path, nargs="?", metavar="FILE.mcap", help="show a recording, not the stream"
+        "file",
+        type=Path,
+        nargs="?",
+        metavar="FILE.mcap",
+        help="show a recording instead of the stream",
     )
     add_stream(parser, addresses)
     parser.add_argument(
@@ -39,27 +43,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--host",
         default="127.0.0.1",
         metavar="ADDRESS",
-        help="serve on this address of the machine, 0.0.0.0 for all of them (default: 127.0.0.1, "
-        "for browsers on this machine only)",
+        help="address of this machine on which to serve, 0.0.0.0 for all addresses (default: "
+        "127.0.0.1, for browsers on this machine only)",
     )
-    parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
     parser.add_argument(
-        "--port", type=_any_port, metavar="N", help="the page's port (default: 9090 or a free port)"
+        "--no-browser",
+        action="store_true",
+        help="print the page's address without opening a browser",
+    )
+    parser.add_argument(
+        "--port",
+        type=_any_port,
+        metavar="N",
+        help="port of the page (default: 9090, or a free port)",
     )
     parser.add_argument(
         "--timeout",
         type=seconds,
         default=3.0,
         metavar="S",
-        help="drop a command this long after its picture; wait this long for the daemon's reply "
-        "(default 3)",
+        help="maximum age of a picture for which a command is still sent, and maximum time to "
+        "wait for the daemon's reply (default 3)",
     )
     parser.add_argument(
         "--rate",
         type=_rate,
         default=10.0,
         metavar="HZ",
-        help="largest number of pictures per second (default 10)",
+        help="maximum number of pictures per second (default 10)",
     )
 
 
@@ -74,7 +85,11 @@ def _rate(text: str) -> float:
 def run(arguments: argparse.Namespace) -> int:
     """Show the page until the end. Raises SoftfingerError if nothing can be shown."""
     if arguments.foxglove is not None and arguments.file is not None:
-        print("view: --foxglove serves only the stream, found FILE.mcap", file=sys.stderr)
+        print(
+            "view: --foxglove: found FILE.mcap, but only the live stream can be served; open "
+            "the file directly in Foxglove",
+            file=sys.stderr,
+        )
         return 2
     arguments.address, arguments.commands = arguments.address
     require("view")

@@ -1,4 +1,4 @@
-"""`softfinger emulate`: the simulated hand with servos and tactile boards on ptys.
+"""Implement `softfinger emulate`, the simulated hand with servos and tactile boards on ptys.
 
 This package handles ports, transmission times, framing and injected faults. The servos are in
 `servo_model`.

@@ -1,6 +1,6 @@
 """Emulate a hand in real time: simulated physics with servos and tactile boards on ptys.
 
-On a busy machine, the emulator and the daemon wait for each other unless the daemon's
+On a busy machine, the emulator and the daemon wait for each other, unless the daemon's
 ``loop.clock`` is ``real``; see `EmulatorClock`.
 
 One thread runs one event loop, which waits for bytes on the servo pty or for the next event. It
@@ -49,15 +49,15 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # s, maximum physics delay
-_REQUESTS = ("report", "forget", "place")  # control socket words other than faults
+_REQUESTS = ("report", "forget", "place")  # words on the control socket that are not faults
 # rad; 6 rad is beyond the joint stops.
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
-_TURN_CURRENT = 0.3  # A, motor current equivalent to turning by hand
+_TURN_CURRENT = 0.3  # A, motor current equivalent to turning a joint by hand
 _TURN_TIME = 1.0  # s
-_STALL_TIME = 0.05  # s, maximum pause counted by the hand's clock
-# s by which the hand's clock may be ahead of the daemon, which waits for replies.
+_STALL_TIME = 0.05  # s, longest time that one call adds to the hand's clock
+# s, maximum lead of the hand's clock over the daemon's, because the daemon waits for replies.
 _AHEAD_TIME = 0.002
-_POLL_INTERVAL = 0.0005  # s between checks for a new deadline
+_POLL_INTERVAL = 0.0005  # s, interval between checks for a new deadline
 # Default board, as in config/hil.toml.
 DEFAULT_BOARD = {
     "backend": "flexitac",
@@ -74,19 +74,20 @@ class EmulatorError(SoftfingerError):
 
 
 class EmulatorClock:
-    """Clock of the emulated hand: real time from 0, excluding interruptions of its process.
+    """Clock of the emulated hand: real time from 0, without interruptions of the emulator process.
 
-    Otherwise, a process that was stopped for a minute would have to simulate that minute and could
-    not reply in the meantime. A daemon whose own clock waits for a busy machine sets deadlines.
-    While this daemon uses the ``servos`` and their torque is on, the emulator clock advances from
-    one deadline to the next by the same amount as the daemon clock, to within `_AHEAD_TIME`.
+    If interruptions were included, a process that was stopped for a minute would have to simulate
+    that minute and could not reply in the meantime. A daemon whose own clock pauses while the
+    machine is busy sets deadlines. While such a daemon uses the ``servos`` and their torque is on,
+    the emulator clock advances from one deadline to the next by the same amount as the daemon
+    clock, within `_AHEAD_TIME`.
     """
 
     pauses_when_late = False
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
-        self.held = False  # the last returned time was limited by the deadline
+        self.held = False  # True if the deadline limited the last returned time
         self._deadline = deadline
         self._seen = 0.0
         self._bound = math.inf  # time after which the clock waits for the next deadline
@@ -127,9 +128,9 @@ class EmulatorClock:
 class EmulatedServos:
     """Emulated servo options that are not part of the settings."""
 
-    baud: int = 0  # 0: reply immediately at any rate
+    baud: int = 0  # 0: reply immediately at any baud rate
     factory: bool = False  # factory defaults except for IDs and baud rate
-    ids: tuple[int, ...] | None = None  # replace the IDs in the settings; may be equal
+    ids: tuple[int, ...] | None = None  # replacements for the IDs in the settings; IDs may be equal
 
 
 class Emulator:
@@ -278,7 +279,7 @@ class Emulator:
         start = self.clock.now()
         if servos is not None:
             due = min(due, servos.next_event())
-        # No event becomes due while the hand's clock is held, so avoid a busy loop.
+        # No event becomes due while the hand's clock is paused, so avoid a busy loop.
         wait = max(due - start, _POLL_INTERVAL if self.clock.held else 0.0)
         ready = [key for key, _ in self._selector.select(wait)]
         t = self.clock.now()
@@ -361,7 +362,7 @@ class Emulator:
             except PlateError as error:
                 return f"error: {error}"
             if missing := presses.keys() - self._sources.keys():
-                return f"error: press: no sensor under the {missing.pop()} tip"
+                return f"error: press: the scene has no sensor under the {missing.pop()} tip"
             for finger, sequence in presses.items():
                 plate = self._plates.setdefault(finger, Plate())
                 plate.go(sequence, now)
@@ -377,17 +378,20 @@ class Emulator:
     def turn(self, words: Sequence[str]) -> str:
         """Turn joints as if by hand: ``left=closed`` (to its stop), ``open`` or ``zero``.
 
-        The joints are held until the servos are written to. The reply is ``error: `` with a reason,
-        or JSON with the remaining time as from :meth:`press`. Without words, only this reply is
-        returned.
+        The joints are held until a client writes to the servos. The reply is ``error: `` with a
+        reason, or JSON with the remaining time as from :meth:`press`. Without words, only this
+        reply is returned.
         """
         now = self.clock.now()
         turns = [word.partition("=") for word in words]
         for finger, _, pose in turns:
             if finger not in FINGERS or pose not in _TURN_GOALS or self._servos is None:
-                return f"error: turn: expected left or right={'|'.join(_TURN_GOALS)}, and servos"
+                return (
+                    f"error: turn: expected left or right={'|'.join(_TURN_GOALS)}; the scene "
+                    "must have servos"
+                )
             if self._servos.bus.servos[FINGERS.index(finger)].torque_on:
-                return f"error: turn: torque of the {finger} servo is on"
+                return f"error: turn: torque is on in the {finger} servo, expected torque off"
         for finger, _, pose in turns:
             joint = FINGERS.index(finger)
             self.hand.drive(
@@ -434,7 +438,7 @@ class Emulator:
 
 
 def with_board(settings: Settings) -> Settings:
-    """Return ``settings`` with the default board if the tactile backend has no framing."""
+    """Return ``settings``, with the default board if the tactile backend has no framing."""
     if settings.tactile.backend in (*ENCODERS, "none"):
         return settings
     tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})

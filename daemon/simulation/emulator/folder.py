@@ -29,7 +29,7 @@ _REPLY_SIZE_MAX = 1 << 17
 _CLIENT_COUNT_MAX = 8  # simultaneous clients
 _CLIENT_TIMEOUT = 10.0  # s, client timeout, long enough for a busy machine
 _MOTIONS = ("press", "turn")
-_QUERY_INTERVAL = 0.1  # s, time between queries about a plate's or joint's motion
+_QUERY_INTERVAL = 0.1  # s, interval between queries about the motion of a plate or joint
 
 
 class FolderError(SoftfingerError):
@@ -44,7 +44,7 @@ class LinkFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Create and lock the folder. Raises FolderError if it is in use or unusable."""
+        """Create and lock the folder. Raises FolderError if the folder is in use or unusable."""
         self.path = path
         self._links: dict[Path, str] = {}
         try:
@@ -58,7 +58,7 @@ class LinkFolder:
             link = path / name
             if link.exists() and not link.is_symlink():
                 self.close()
-                raise FolderError(f"{link}: exists and is not a link; move it elsewhere")
+                raise FolderError(f"{link}: exists but is not a link; move it elsewhere")
 
     def _take(self, path: Path) -> int:
         while True:
@@ -70,7 +70,7 @@ class LinkFolder:
                 os.close(lock)
                 raise FolderError(
                     f"{self.path}: in use by another emulator (process {holder or 'unknown'}); "
-                    "end it or choose another --dir"
+                    "end that emulator or select another --dir"
                 ) from None
             # The previous holder may have removed the file between the open and the lock.
             with contextlib.suppress(FileNotFoundError):
@@ -97,7 +97,7 @@ class LinkFolder:
                 (self.path / name).unlink()
 
     def close(self) -> None:
-        """Remove the lock and the links whose targets have not changed."""
+        """Remove the lock, and the links whose targets have not changed."""
         for link in list(self._links):
             self.unlink(link.name)
         with contextlib.suppress(OSError):
@@ -107,7 +107,7 @@ class LinkFolder:
 
 
 def find_ports(folder: Path) -> dict[str, Path]:
-    """Return the links to ports in ``folder`` by their names."""
+    """Return the port links in ``folder`` by name."""
     return {name: folder / name for name in LINKS if (folder / name).is_symlink()}
 
 
@@ -124,7 +124,10 @@ class ControlPort:
     def __init__(
         self, folder: Path, handle: Callable[[str], str], selector: selectors.BaseSelector
     ) -> None:
-        """Bind the socket. Raises FolderError if a file of another type has its name."""
+        """Bind the socket.
+
+        Raises FolderError if there is a file of another type with the socket's name.
+        """
         self._handle = handle
         self._selector = selector
         self._folder = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -181,20 +184,20 @@ class ControlPort:
 
 
 def carry_out(folder: Path, text: str) -> str:
-    """Send ``text`` to the emulator in ``folder``, wait until motions arrive; return the reply.
+    """Send ``text`` to the emulator in ``folder``, wait until motions end, and return the reply.
 
     The reply is empty unless a report was requested.
 
     Raises
     ------
     NoEmulator
-        If no emulator runs there, or it does not answer.
+        If no emulator runs there, or if it does not reply.
     Refused
         If the emulator rejects the text; the message lists the expected words.
     """
     reply = send_words(folder, text)
-    # The motion is timed by the emulated hand's clock, which stops while the emulator is
-    # suspended, so ask again for the remaining time.
+    # The emulated hand's clock times the motion. This clock stops while the emulator is suspended,
+    # so ask again for the remaining time.
     kind = text.partition(" ")[0]
     while kind in _MOTIONS and reply.startswith("{"):
         left = json.loads(reply)["wait"]
@@ -240,5 +243,5 @@ def _directory(folder: Path) -> Iterator[int]:
 
 
 def _address(folder: int) -> str:
-    """Return the address via the folder's descriptor, because paths are limited to 107 bytes."""
+    """Return the socket's address via the folder's descriptor; paths are limited to 107 bytes."""
     return f"/proc/self/fd/{folder}/{_CONTROL}"

@@ -1,4 +1,4 @@
-"""Simulate a plate on a stage that presses a tip with given depth, tilt and speed.
+"""Simulate a plate on a stage that presses against a tip with given depth, tilt and speed.
 
 The plate allows calibration to be tried without hardware: the sensor measures the plate instead of
 the object, and the true contact is known. The plate is frictionless and does not load the finger
@@ -20,10 +20,10 @@ from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
 
-_CLEARANCE = 1e-3  # m above the tip where the plate tilts and waits
+_CLEARANCE = 1e-3  # m, distance from the tip at which the plate tilts and waits
 _LIFT_SPEED = 0.02  # m/s
 _FILL_TIME = 0.1  # s, inflation time of a bladder
-_PAUSE = 1.0  # s without contact between presses
+_PAUSE = 1.0  # s, pause without contact between presses
 
 _UNITS = {
     "depth": {"mm": 1e-3, "m": 1.0},
@@ -38,7 +38,7 @@ _NUMBER = re.compile(r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)(.*)")
 
 
 class PlateError(SoftfingerError, ValueError):
-    """Raised for invalid or impossible presses. The message states the expected form or range."""
+    """Raised for invalid or impossible presses. The message gives the expected format or range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +58,14 @@ class PlatePress:
 
     @property
     def is_clear(self) -> bool:
-        """True if the plate lifts off and stays there."""
+        """True if the plate lifts off and stays clear of the tip."""
         return self.d <= 0.0 and self.pressure == 0.0 and self.hold == math.inf
 
     def __str__(self) -> str:
         if self.pressure > 0.0:
             return f"{self.pressure / 1e3:g} kPa on all cells"
         if self.d <= 0.0:
-            return "clear of the tip"
+            return "the plate does not touch the tip"
         return f"{self.d * 1e3:.3f} mm at {math.degrees(self.theta):.2f}°, {self.force:.3f} N"
 
 
@@ -74,8 +74,8 @@ def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, lis
 
     Each press has either a depth (0 lifts off), a force or a pressure (uniform, like a bladder).
     Optional words are tilt, speed, hold, and tip (left, right or both; default both). If ``hold``
-    is not given, the last press stays and the others last one second. Forces are ``scale`` times
-    the ``table`` forces. Raises PlateError.
+    is not given, the last press is held and each of the others lasts one second. Forces are
+    ``scale`` times the ``table`` forces. Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
     each = [part.split() for part in text.split(",")]
@@ -110,7 +110,7 @@ def _value(name: str, text: str) -> float:
     if not math.isfinite(value) or (name != "tilt" and value < 0.0):
         raise PlateError(f"press: {name}={text}: expected a number with {' or '.join(units)}")
     if name == "speed" and value == 0.0:
-        raise PlateError("press: speed: expected above 0")
+        raise PlateError("press: speed: expected a number above 0")
     return value
 
 
@@ -140,12 +140,12 @@ class Plate:
         self._d = [-_CLEARANCE]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
-        ]  # starting at each knot: the press, and True if the plate is stationary
+        ]  # for the interval from each knot: the press, and True if the plate is stationary
         self._reported = -1
         self.arrives = 0.0  # arrival time of the sequence's last press
 
     def go(self, presses: Sequence[PlatePress], t: float) -> None:
-        """Lift off and perform ``presses``, starting at ``t``."""
+        """Lift off, then perform ``presses``, starting at ``t``."""
         d, (press, _) = max(self(t).d, -_CLEARANCE), self._doing[self._leg(t)]
         self._t, self._d, self._doing, self._reported = [t], [d], [], -1
         self._add((d + _CLEARANCE) / _LIFT_SPEED, -_CLEARANCE, press)

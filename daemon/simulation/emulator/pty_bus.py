@@ -1,8 +1,9 @@
 """Provide a servo bus on a pseudo-terminal, served by the caller's event loop.
 
-This module manages the terminal and the transmission times. A paced reply is sent when its last
-byte would arrive at the client's baud rate, including the return delay. Unpaced replies are sent
-immediately. Transmission times are absolute, so interruptions of this process do not accumulate.
+This module manages the terminal and the transmission times. A paced reply is sent at the time when
+its last byte would arrive at the client's baud rate, including the return delay. Unpaced replies
+are sent immediately. Transmission times are absolute, so interruptions of this process do not
+accumulate.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control char
 _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _READ_SIZE = 4096
-_READS_PER_TURN = 4  # maximum reads per turn, to leave time for other tasks
-# s of silence that end a packet. It is longer than 1.5 ms because this process may be delayed.
+_READS_PER_TURN = 4  # maximum number of reads per turn, which leaves time for other tasks
+# s, duration of silence that ends a packet. It exceeds 1.5 ms because this process may be delayed.
 _GAP_TIME = 0.02
 # s, typical pseudo-terminal latency from a write to the reader's wake-up. A paced bus subtracts it
 # in both directions, because the simulated wire has its own transmission time.
 PASSAGE_TIME = 15e-6
-# s by which a reading may be older than its reply, because servos also measure at their own
-# intervals. This allows the physics to be computed outside the exchange.
+# s, maximum age of a reading when its reply is sent. Real servos also measure at their own
+# intervals. This tolerance allows the physics to be computed outside the exchange.
 _LAG_TIME = 0.0005
 
 
@@ -79,14 +80,14 @@ class PtyServoBus:
         self._baud = baud
         self._spin = spin
         self._clock = clock
-        self._free_at = -math.inf  # the wire is busy until this time
+        self._free_at = -math.inf  # time until which the wire is busy
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
         self._arrives = -math.inf  # arrival time of the last reply
         self.plug()
 
     def fileno(self) -> int:
-        """Return the file descriptor to wait for, or -1 while unplugged."""
+        """Return the file descriptor to wait for, or -1 while the port is unplugged."""
         return self._master
 
     @property
@@ -197,7 +198,7 @@ class PtyServoBus:
                 return
             while now < due:
                 before, now = now, self._clock()
-                if now == before:  # The hand's clock is held.
+                if now == before:  # The hand's clock is paused.
                     return
             self._write(heapq.heappop(self._due)[2])
 

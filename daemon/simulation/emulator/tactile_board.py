@@ -25,9 +25,10 @@ from softfinger.daemon.simulation.faults import BOARD_FAULTS, WELL
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
-_TTY_SIZE_MAX = 2048  # unread bytes; must be less than 4095, the maximum that a tty reports
+# limit on unread bytes; must be less than 4095, the maximum that a tty reports
+_TTY_SIZE_MAX = 2048
 _DRAIN = 4096
-_RETRY_TIME = 5e-4  # s until the source is polled again for a late frame
+_RETRY_TIME = 5e-4  # s, interval at which the source is polled for a late frame
 _NOISE_LENGTH = 64  # bytes, longest noise burst between frames
 
 
@@ -42,7 +43,8 @@ class FrameWriter:
     """The board's end of a pty. Frames are sent completely or not at all.
 
     A pty buffers tens of kilobytes. If there is no reader, frames are dropped early so that the
-    next client does not receive old frames. A board with a closed port behaves the same way.
+    next client does not receive old frames. A real board whose port is closed behaves in the same
+    way.
     """
 
     def __init__(self) -> None:
@@ -79,7 +81,7 @@ class FrameWriter:
             return b""
 
     def close(self) -> None:
-        """Close both ends; a client then gets a read error."""
+        """Close both ends; a client's next read then fails."""
         for end in (self._master, self._slave):
             with contextlib.suppress(OSError):
                 os.close(end)
@@ -113,7 +115,7 @@ class TactileBoard:
         delay: float,
         seed: int = 1,
     ) -> None:
-        """Create a board; frame k is due at k/rate + delay [Hz, s], and ``seed`` is for faults."""
+        """Create a board with fault ``seed``; frame k is due at k/rate + delay [Hz, s]."""
         self._source = source
         self._encoder = encoder
         self._requested = not encoder.request
@@ -123,7 +125,7 @@ class TactileBoard:
         self._random = np.random.default_rng(seed)
         self.plug()
         self._seq = -1
-        self._frozen: NDArray[np.uint16] | None = None  # image repeated by a frozen board
+        self._frozen: NDArray[np.uint16] | None = None  # image that a frozen board repeats
         self._due = -math.inf
         self.sent = 0  # frames
 
@@ -134,7 +136,7 @@ class TactileBoard:
         self.plugged = True
 
     def unplug(self) -> None:
-        """Remove the port, so that a client gets a read error; the board continues."""
+        """Remove the port, so that a client's reads fail; the board continues running."""
         if self.plugged:
             self._writer.close()
         self.plugged = False
@@ -152,11 +154,11 @@ class TactileBoard:
 
     @property
     def dropped(self) -> int:
-        """Number of frames not read in time."""
+        """Number of frames dropped because no client read them in time."""
         return self._writer.dropped
 
     def fileno(self) -> int:
-        """Return a file descriptor that is readable when :meth:`hear` must be called."""
+        """Return a file descriptor that becomes readable when :meth:`hear` must be called."""
         return self._writer.fileno()
 
     def hear(self) -> None:
@@ -237,9 +239,9 @@ def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.
 def encode_glove(
     counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0, values: int = 32
 ) -> bytes:
-    """Encode number + 11, high and low half of each count + 11, and newline; counts saturate.
+    """Encode number + 11, the halves of each count (high, low) + 11, and newline; counts saturate.
 
-    Each half has ``values`` possible values: 32, or 64 with a 12-bit converter.
+    Each half takes one of ``values`` values: 32, or 64 with a 12-bit converter.
     """
     counts = np.minimum(counts, values * values - 1)
     halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)
@@ -247,7 +249,7 @@ def encode_glove(
 
 
 def encoder_for(backend: str, full_count: int) -> Encoder:
-    """Return the framing of a backend's board with the maximum count ``full_count``."""
+    """Return the framing used by a backend's board with the maximum count ``full_count``."""
     if backend == "glove" and 1023 < full_count <= 4095:
         return Encoder(partial(encode_glove, values=64), b"a")
     return ENCODERS[backend]

@@ -2,10 +2,10 @@
 
 With smooth forces, the integration error is small and decreases with the step size. With non-smooth
 forces (for example, when a light object hits the stiff rim of the backing plate) or an excessively
-long step, the energy could increase by more than the work of the motors and loads. The guard then
-removes the excess from the kinetic energy. If the kinetic energy is too small for this, the motion
-stops at an earlier point of the step. Without damping, the energy should be constant; in this case,
-the method's small drift is allowed in smooth steps.
+long step, the energy could increase by more than the work of the motors and loads. In these cases,
+the guard removes the excess from the kinetic energy. If the kinetic energy is smaller than the
+excess, the motion stops at an earlier point of the step. Without damping, the energy should be
+constant; the method's small drift is then allowed in smooth steps.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Pla
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth undamped steps
-_ROUNDING = 3e-13  # relative rounding error of energy; d is a small difference of lengths
+# relative rounding error of the energy, large because d is a small difference of lengths
+_ROUNDING = 3e-13
 HALVINGS = 12  # maximum number of halvings of a step
 
 
@@ -68,7 +69,7 @@ def is_on_rim(plant: Plant) -> bool:
 
 @inner_kernel
 def open_guard(plant: Plant) -> None:
-    """Accept the current energy if it was changed since the last step."""
+    """Accept the current energy if it was changed from outside since the last step."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy
@@ -164,7 +165,7 @@ def allow_changed_energy(plant: Plant) -> None:
 
 @inner_kernel
 def allow_relaxed_energy(plant: Plant) -> None:
-    """Update the energies after tip relaxation, which also changes the allowed energy."""
+    """Update the energies after tip relaxation; the limit changes by as much as the energy."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.energy_limit += energy - plant.energy
     plant.energy = energy

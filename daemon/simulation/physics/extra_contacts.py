@@ -1,19 +1,19 @@
-"""Evaluate contacts that occur only in some scenes: object on palm, and tip on tip.
+"""Evaluate contacts that occur only in some scenes: object on palm and tip on tip.
 
-Their rows are added to the step matrix (`solver`).
+The rows of these contacts are added to the step matrix (`solver`).
 
-The palm is a plane along x. Each corner of the object, or the lowest point of a disc, has two
-springs. The first pushes a corner below the palm up, with viscous damping that never pulls. The
-second acts along the palm and models Coulomb friction: it sticks until its force would exceed the
-friction coefficient times the normal force, and then slips. A resting object therefore does not
-creep.
+The palm is a plane parallel to the x axis. Each corner of the object, or the lowest point of a
+disc, has two springs. The first spring pushes up a corner that is below the palm, with viscous
+damping that never pulls. The second spring acts along the palm and models Coulomb friction: it
+sticks until its force would exceed the friction coefficient times the normal force, and then slips.
+Therefore, a resting object does not creep.
 
-Two equal hemispheres meet on the plane midway between their centres. Each is compressed as if by a
-rigid plane, with d = a − D/2, where D is the distance between the centres. The energy is the sum
-for both tips, U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With
-different tilts, the real interface would bulge towards the softer tip, so this energy is slightly
-too high (second order in the difference of cos² θ). The plane sticks equally to both tips: each
-shears by half the relative sliding of their surfaces, minus its tan θ ḋ.
+Two equal hemispheres meet on the plane midway between their centres. Each tip is compressed as if
+by a rigid plane, with d = a − D/2, where D is the distance between the centres. The total energy of
+both tips is U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With
+different tilts, a real contact surface would bulge towards the softer tip, so this energy is
+slightly too high (second order in the difference of cos² θ). The plane sticks equally to both tips:
+each tip shears by half of the relative sliding of their surfaces, minus its tan θ ḋ.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
 
 STIFFNESS = 1e5  # N/m per corner, normal to the palm and along it
-LOSS = 1e-3  # s, damping over stiffness
+LOSS = 1e-3  # s, ratio of damping to stiffness
 # Tip radii; the tip-to-tip contact is evaluated if half the centre distance is below this.
 _DISTANCE_MAX = 1.5
 
 
 @inner_kernel
 def palm_is_far(plant: Plant, now: Motion) -> bool:
-    """Return True if the object cannot reach the palm within a step."""
+    """Return True if the object can't reach the palm within a step."""
     p = plant.parameters
     height = now.position[3] - p.palm - p.extent
     rate = now.velocity[3]
@@ -64,9 +64,10 @@ def palm_is_far(plant: Plant, now: Motion) -> bool:
 def touch_palm(
     plant: Plant, now: Motion, stage: Stage, nx: float, ny: float, is_first: bool
 ) -> None:
-    """Add the palm's forces on the object; (nx, ny) is the object's n.
+    """Add the palm's forces on the object; (nx, ny) is the normal n of the object's faces.
 
-    The first stage also limits the shears by friction and sets the rows in the full matrix.
+    In the first stage, this function also limits the shears by friction and sets the rows in the
+    full matrix.
     """
     if palm_is_far(plant, now):
         for corner in range(CORNERS):
@@ -167,7 +168,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
     for finger in range(2):
         tip = stage.on_tip[finger]
         side = 1.0 - 2.0 * finger
-        ux = plant.fingers[finger].cosine  # The axis and e are mirrored for the right tip.
+        ux = plant.fingers[finger].cosine  # For the right tip, the finger axis and e are mirrored.
         uy = -side * plant.fingers[finger].sine
         tip.sine = ux * ey - uy * ex
         tip.cosine = ux * ex + uy * ey
@@ -214,7 +215,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
 def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
     """Add the tip-to-tip torques if the tips are close or there is no object.
 
-    The first stage also sets their rows in the full matrix.
+    In the first stage, this function also sets their rows in the full matrix.
     """
     near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
     touching = near and tip_on_tip(plant, table, now, stage)
@@ -242,7 +243,7 @@ def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_f
 
 @inner_kernel
 def clear_extra(plant: Plant) -> None:
-    """Remove the extra rows from the matrix."""
+    """Clear the extra rows of the matrix."""
     for number in range(EXTRA_ROWS):
         plant.extra[number].stiffness = 0.0
         plant.extra[number].damping = 0.0

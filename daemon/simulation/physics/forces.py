@@ -1,6 +1,6 @@
 """Compute the forces for a state: motors, weight, loads, friction and end stops.
 
-The contacts are evaluated from here; their forces are computed in `tip` and `extra_contacts`.
+This module calls `tip` and `extra_contacts`, which evaluate the contacts and their forces.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from softfinger.kinematics.contact.table_record import Table
 
 @inner_kernel
 def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
-    """Return a servo's motor current command [A], within all limits.
+    """Return a servo's motor current command [A], limited by all of the servo's limits.
 
     The limit due to the supply voltage, scaled by the PWM limit, decreases linearly from the stall
     current at standstill to 0 at no-load speed.
@@ -54,8 +54,8 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 def set_motor_slopes(plant: Plant, g: float) -> None:
     """Set the motor torque derivatives (angle and velocity), divided by (τ + g).
 
-    The derivatives are 0 unless the motors are stiff for a step ``g``. They are upper bounds, since
-    the current may enter or leave its limits within the step.
+    The derivatives are 0 unless the motors are stiff relative to a step ``g``. They are upper
+    bounds, since the current may enter or leave its limits within the step.
     """
     p, goals = plant.parameters, plant.goals
     constant = p.torque_constant
@@ -105,7 +105,7 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 @inner_kernel
 def friction_level(plant: Plant, finger: int, rate: float, current: float) -> float:
-    """Return the friction torque [N·m] at which a joint slips for a motor ``current`` and load.
+    """Return the friction torque [N·m] at which a joint slips at a motor ``current`` and load.
 
     The base, Stribeck and load terms follow Rhoban's model M4, which was identified for servos of
     this type (arXiv 2410.08650). The gear torque is |external − motor|.
@@ -130,10 +130,10 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
         torque = f z/z_p    ż = q̇ while |z| ≤ z_p
 
     Below f, the bristles are elastic, so a constant or oscillating load below f does not cause
-    drift. The number of bristles is proportional to f. New bristles are undeflected and are added
-    halfway through the step on average. Removed bristles take their energy with them. A change in f
-    therefore never adds energy. The damping of a stuck joint is half the critical damping, and the
-    sum of bristle torque and damping is limited to f.
+    drift. The number of bristles is proportional to f. New bristles are undeflected; on average,
+    they are added halfway through the step. The energy of removed bristles is lost. Therefore, a
+    change in f never adds energy. The damping of a stuck joint is half the critical damping, and
+    the sum of bristle torque and damping is limited to f.
     """
     p, gears = plant.parameters, plant.gears[finger]
     rate = now.velocity[finger]
@@ -191,9 +191,9 @@ def place_finger(plant: Plant, finger: int, q: float) -> None:
 
 @inner_kernel
 def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
-    """Evaluate the contacts of ``now`` into ``stage`` and all forces except the motor forces.
+    """Evaluate all contacts and forces, except the motor forces, in state ``now``; fill ``stage``.
 
-    The drag is viscous friction divided by velocity. The forces already include this friction.
+    The drag is viscous friction divided by velocity. The forces already include viscous friction.
     """
     p, forces = plant.parameters, plant.forces
     nx = math.cos(now.position[4])
@@ -232,7 +232,7 @@ def evaluate_state(plant: Plant, table: Table) -> None:
 
 @inner_kernel
 def script_x(plant: Plant, t: float) -> float:
-    """Return x [m] of a scripted object at ``t``; it moves left, back, and then right."""
+    """Return x [m] of a scripted object at ``t``; the object moves left, back, and then right."""
     p = plant.parameters
     x: float = p.script_x
     left = p.script_travel[0]

@@ -1,4 +1,4 @@
-"""Compute contact geometry of the object outline: nearest point, and backing plate rim.
+"""Compute the contact geometry of the object outline: its nearest point, and the backing plate rim.
 
 The object is a rigid convex polygon or a disc.
 """
@@ -62,11 +62,11 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
 
 @inner_kernel
 def rim_on_plane(p: Parameters, tip: TipContact) -> float:
-    """Evaluate both rim ends on a plane; return the larger depth [m], negative for a gap.
+    """Evaluate both rim ends on a plane; return the larger depth [m], which is negative for a gap.
 
     The depths are d − a(1 ∓ sin θ). Each end has its own spring, so that energy and forces are
-    smooth even if the plate lies flat on the face. If there is contact, the rim energy and its
-    derivatives are set.
+    smooth even if the plate lies flat on the face. If the rim is in contact, its energy and the
+    energy's derivatives are set.
     """
     d = tip.d
     sine = tip.sine

@@ -69,10 +69,10 @@ def bounded(value: float, limit: float) -> float:
 
 @inner_kernel
 def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
-    """Add the motors to the load; set the currents of ``k``, excluding the effect of the solution.
+    """Add the motors to the load; set the currents of ``k``, without the effect of the solution.
 
-    A current lags behind its reference: i' = (r(q, ω) − i)/τ. Its k decreases by (r_q g + r_ω) g/(τ
-    + g) per unit of acceleration; the matrix contains this term.
+    A current lags behind its reference: i' = (r(q, ω) − i)/τ. Its rate k decreases by (r_q g + r_ω)
+    g/(τ + g) per unit of acceleration; the matrix contains this term.
     """
     p = plant.parameters
     lag = p.electric_time
@@ -89,7 +89,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
 
 @inner_kernel
 def finish_stage(plant: Plant, k: Motion, g: float) -> None:
-    """Solve for the velocities in ``k`` and add their effect to its other rates."""
+    """Solve for the velocities in ``k`` and add their effect to the other rates in ``k``."""
     solve(plant, k)
     if plant.has_extra_rows:
         add_extra_shears(plant, k, g)
@@ -161,7 +161,7 @@ def second_stage(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def advance_state(plant: Plant, h: float) -> None:
-    """Advance the state to y + h (3 k1 + k2)/2, except for held parts."""
+    """Advance the state to y + h (3 k1 + k2)/2, except for parts that are held fixed."""
     p, state, first, second = plant.parameters, plant.state, plant.first, plant.second
     for j in range(2):
         state.shear[j] += h * (1.5 * first.shear[j] + 0.5 * second.shear[j])
@@ -174,7 +174,7 @@ def advance_state(plant: Plant, h: float) -> None:
             continue
         displacement = h * (1.5 * first.position[j] + 0.5 * second.position[j])
         change = h * (1.5 * first.velocity[j] + 0.5 * second.velocity[j])
-        # A step that would move a tip by more than a quarter of its radius is too long. Limiting
+        # The step is too long if it would move a tip by more than a quarter of its radius. Limiting
         # the displacement can only remove energy.
         limit = 0.25 * p.radius
         if j < 2:
@@ -242,7 +242,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
     row.t = due
     for finger in range(2):
         now, before = sensed_contact_of(plant, finger), plant.sensed_contact[finger]
-        # Do not interpolate between contacts with different bodies.
+        # Do not interpolate between two contacts with different bodies.
         same = senses_other_tip(plant, finger) == (plant.on_other_tip[finger] != 0)
         fraction = back if same else 0.0
         row.d[finger] = now.d - fraction * (now.d - before.d)
@@ -281,7 +281,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
-    # Use a record from here on, because array arguments cost a reference count per call.
+    # Pass a record from here on, because each array argument costs a reference count per call.
     data = tables[0]
     h = p.step
     g = _GAMMA * h
@@ -318,7 +318,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             if changed == 2:
                 limit_energy(plant, data)
             elif changed == 1:
-                # New bristles of the slowed gears are also undeflected.
+                # The new bristles of the slowed gears are also undeflected.
                 store_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:

@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 FloatTriple = Annotated[FloatArray, 3]
 FloatFive = Annotated[FloatArray, 5]
-Flags = Annotated[NDArray[np.int64], 2]  # 0 or 1 per finger
+Flags = Annotated[NDArray[np.int64], 2]  # 0 or 1 for each finger
 
 # Object shapes.
 NO_OBJECT = 0
@@ -45,7 +45,7 @@ class Motion(Record):
 
     position: FloatFive  # [rad], [rad], [m], [m], [rad]
     velocity: FloatFive
-    shear: Pair  # d_t of tips on object [m]
+    shear: Pair  # d_t of each tip on the object [m]
     extra_shear: Shears  # [m]
     bristles: Pair  # gear bristle deflection [rad]
     current: Pair  # [A]
@@ -75,7 +75,7 @@ class Edge(Record):
 
 
 class Parameters(Record):
-    """Parameters fixed by the settings."""
+    """Parameters that the settings define."""
 
     step: float  # sub-step [s]
     sample_period: float  # [s]
@@ -88,16 +88,16 @@ class Parameters(Record):
     shear_stiffness: float  # shear stiffness relative to the spring model
     shear_coupling: float  # coupling of d_t with d and θ: 1 for springs, 0 for bristles
     creep: float  # fraction of a stuck shear that relaxes per sub-step
-    micro_slip: bool  # the footprint edge slips first
+    micro_slip: bool  # True if the edge of the footprint slips first
     tips_relax: bool
     relaxation: FloatTriple  # Prony term stiffnesses relative to the long-term stiffness
-    relaxation_step: FloatTriple  # fraction of each term that relaxes per sub-step
+    relaxation_step: FloatTriple  # fraction of each Prony term that relaxes per sub-step
     rim_stiffness: float  # [N/m]
     tolerance: float  # relative energy gain allowed in smooth steps
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
     offset: float  # tip offset from the finger axis [m]
-    finger_present: Flags  # the finger is in the scene
+    finger_present: Flags  # True if the finger is in the scene
     shape: int  # object shape
     half_width: float  # [m]
     half_height: float  # [m]
@@ -112,14 +112,14 @@ class Parameters(Record):
     table_force: float  # Coulomb friction between table and object [N]
     table_torque: float  # Coulomb friction torque between table and object [N·m]
     table_speed: float  # speed below which table friction is viscous [m/s]
-    table_spin: float  # angular speed below which it is viscous [rad/s]
+    table_spin: float  # angular speed below which table friction is viscous [rad/s]
     palm: float  # y of the palm [m]
     palm_friction: float
     joint_inertia: float  # [kg·m²]
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
     stribeck: float  # additional friction at standstill [N·m]
-    load_friction: Pair  # friction per gear torque, and additional part at standstill
+    load_friction: Pair  # ratio of friction to gear torque, and its addition at standstill
     stribeck_speed: float  # speed at which additional friction decreases to 1/e [rad/s]
     presliding: float  # slip deflection of the bristles [rad]
     torque_constant: float  # [N·m/A]
@@ -168,15 +168,15 @@ class Gears(Record):
 
     deflection: float  # bristle deflection at the start of the step [rad]
     level: float  # friction level at the start of the step [N·m]
-    limited_deflection: float  # last evaluated deflection after limiting [rad]
-    friction: float  # last evaluated friction level [N·m]
+    limited_deflection: float  # deflection in the last evaluation, after limiting [rad]
+    friction: float  # friction level in the last evaluation [N·m]
     stiffness: float  # bristle stiffness in the step matrix [N·m/rad]
 
 
 class TipContact(Record):
     """Contact of one tip with the object or the other tip.
 
-    Rows are d, θ, d_t. Columns are q, x, y, φ, or q1, q2 for a tip-to-tip contact.
+    The rows are d, θ, d_t. The columns are q, x, y, φ, or q1, q2 for a tip-to-tip contact.
     """
 
     d: float  # normal displacement, negative for a gap [m]
@@ -184,15 +184,15 @@ class TipContact(Record):
     sine: float  # sin θ
     cosine: float
     tangent: float  # tan θ, 0 for bristles and beyond the soft hemisphere
-    gain: float  # force relative to a plane, due to w(θ) and face curvature
+    gain: float  # ratio of the force to that on a plane, due to w(θ) and face curvature
     curvature: float  # curvature of the touched surface [1/m]
-    travel: float  # possible increase in d during this step [m]
+    travel: float  # largest possible increase in d during this step [m]
     rate_d: float  # [m/s]
     rate_theta: float  # [rad/s]
     slip_rate: float  # tangential velocity of the surface relative to the tip [m/s]
     shear: float  # d_t after limiting [m]
     shear_variance: float  # shear variance of the layers [m²]
-    shear_rate: float  # rate of d_t if there is no slip [m/s]
+    shear_rate: float  # rate of d_t without slip [m/s]
     force: float  # total force on the tip base, the sum over a pressure grid [N]
     energy: float  # elastic energy [J]
     normal: float  # N [N]
@@ -213,7 +213,7 @@ class Stage(Record):
 
     on_object: Annotated[Records[TipContact], 2]
     on_tip: Annotated[Records[TipContact], 2]
-    extra_rate: Shears  # extra shear rates if there is no slip [m/s]
+    extra_rate: Shears  # extra shear rates without slip [m/s]
 
 
 class ExtraRow(Record):
@@ -222,7 +222,7 @@ class ExtraRow(Record):
     row: FloatFive
     stiffness: float
     damping: float
-    shear: int  # 1 + index of its extra shear, 0 if none
+    shear: int  # 1 + index of the row's extra shear, 0 if it has none
 
 
 class Factors(Record):
@@ -238,14 +238,14 @@ class Plant(Record):
     parameters: Parameters
     goals: Goals
     state: Motion
-    # Current contact of each tip, the stronger one if there are two.
+    # Current contact of each tip, or its stronger contact if it has two.
     sensed_contact: Annotated[Records[TipContact], 2]
     on_other_tip: Flags  # 1 if this contact is with the other tip
     step_count: int  # number of completed sub-steps
     sample_count: int  # number of samples taken
     energy: float  # kinetic, elastic and gravitational [J]
-    energy_limit: float  # energy limit, from the work done on the hand [J]
-    limited_step_count: int  # number of sub-steps limited by energy
+    energy_limit: float  # energy limit, given by the work done on the hand [J]
+    limited_step_count: int  # number of sub-steps that the energy guard has limited
     last_state: Motion  # state before the step
     stage_state: Motion  # state of the second stage
     first: Motion  # k1 of the step
@@ -255,7 +255,7 @@ class Plant(Record):
     gears: Annotated[Records[Gears], 2]
     forces: FloatFive  # generalised forces, excluding the motors
     drag: FloatFive  # ratio of friction to velocity
-    external: Pair  # last evaluated contact torque on each joint [N·m]
+    external: Pair  # contact torque on each joint in the last evaluation [N·m]
     load: FloatFive  # right-hand side of the step equations
     motor_by_q: Pair  # motor torque derivatives for the matrix
     motor_by_rate: Pair
@@ -265,7 +265,7 @@ class Plant(Record):
     relaxation_state: Annotated[FloatArray, 2, 3]  # state of each tip's Prony terms [N]
     relaxation_factor: Pair  # tip force relative to its long-term force
     palm_energy: float  # [J]
-    tips_may_touch: bool  # the tip-to-tip contact was evaluated
-    has_extra_rows: bool  # extra rows may be active in this step
+    tips_may_touch: bool  # True if the tip-to-tip contact was evaluated
+    has_extra_rows: bool  # True if extra rows may be active in this step
     extra: Annotated[Records[ExtraRow], EXTRA_ROWS]
     factors: Factors

@@ -1,4 +1,4 @@
-"""Define shapes of the simulated object: outline, inertia and table friction radius."""
+"""Define the shapes of the simulated object: outline, inertia and radius for table friction."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Shape:
 
     @property
     def extent(self) -> float:
-        """Maximum distance of a point from the centre."""
+        """Maximum distance of an outline point from the centre."""
         return self.roundness or float(np.hypot(*self.corners.T).max())
 
     @property
     def half_width(self) -> float:
-        """Half the width at the centre height."""
+        """Half of the width at the height of the centre."""
         x, y = np.vstack((self.corners, self.corners[:1])).T
         across = [
             x[k] - y[k] * (x[k + 1] - x[k]) / (y[k + 1] - y[k])
@@ -58,7 +58,7 @@ class Shape:
 
 
 def shape_of(settings: Settings) -> Shape:
-    """Create the object in the settings with the function registered in `daemon.backends`."""
+    """Create the configured object with the function registered in `daemon.backends`."""
     simulation = settings.simulation
     found = backend("shapes", simulation.object_shape)
     shape: Shape = found.load()(simulation, *found.options(settings.plugins.tables))
@@ -68,20 +68,23 @@ def shape_of(settings: Settings) -> Shape:
 def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
     """Create a convex polygon with 3 to 8 ``corners`` [n, 2] in m, counter-clockwise.
 
-    The corners may have any origin; the shape is then centred on its centre of mass. The area
-    integrals are closed-form sums over the triangles between the centre and each edge. Raises
-    ValueError for other outlines.
+    The corners may refer to any origin; they are shifted so that the centre of mass is at 0. The
+    area integrals are closed-form sums over the triangles between the centre and each edge. Raises
+    ValueError if the outline is not such a polygon.
     """
     points = np.array(corners, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or not 3 <= len(points) <= CORNERS:
         raise ValueError(f"found corners {points.shape}, expected 3 to {CORNERS} pairs")
     if not np.isfinite(points).all():
-        raise ValueError("found a corner that is not a number")
+        raise ValueError("found a corner that is not finite, expected finite numbers")
     along = np.roll(points, -1, axis=0) - points
     turns = _cross(along, np.roll(along, -1, axis=0))
     whole = np.arctan2(turns, (along * np.roll(along, -1, axis=0)).sum(axis=1)).sum()
     if not ((turns > 0.0).all() and whole < 3.0 * math.pi):
-        raise ValueError("found corners that aren't convex and counter-clockwise")
+        raise ValueError(
+            "found a polygon that is not convex or not counter-clockwise, expected a convex "
+            "polygon with its corners in counter-clockwise order"
+        )
     areas = _cross(points, np.roll(points, -1, axis=0))
     points -= ((points + np.roll(points, -1, axis=0)) * areas[:, None]).sum(axis=0) / (
         3.0 * areas.sum()
@@ -97,7 +100,7 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
 
 
 def rectangle(simulation: SimulationSettings) -> Shape:
-    """Create a box with the width and height in the settings."""
+    """Create a box with the configured width and height."""
     return polygon(_trapezoid(simulation, 0.0))
 
 
@@ -111,13 +114,13 @@ def wedge(simulation: SimulationSettings) -> Shape:
     if 2.0 * abs(leaning) >= width:
         raise ValueError(
             f"the faces of the wedge meet: found simulation.object_width {width:g} m, expected "
-            f"above {2.0 * abs(leaning):.3g} m for its object_taper and object_height"
+            f"above {2.0 * abs(leaning):.3g} m with this object_taper and object_height"
         )
     return polygon(_trapezoid(simulation, leaning))
 
 
 def disc(simulation: SimulationSettings) -> Shape:
-    """Create a disc with the radius in the settings."""
+    """Create a disc with the configured radius."""
     radius = simulation.object_radius
     square = radius * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)

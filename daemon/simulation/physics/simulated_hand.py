@@ -50,18 +50,18 @@ _MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
 STANDARD_GRAVITY = 9.80665  # m/s²
 STEP_MAX = 0.25e-3  # s
 STEP_MIN = 0.05e-3  # s
-PHASE_MAX = 0.25  # rad, maximum phase of the fastest oscillation per sub-step
+PHASE_MAX = 0.25  # rad, maximum phase angle of the fastest oscillation in one sub-step
 ELECTRIC_TIME = 1e-3  # s, lag of the servo current behind its reference
 FULL_EFFORT_ERROR = 0.27  # rad, position error at which the loop commands the stall current
 TABLE_SPEED = 0.0005  # m/s, speed below which table friction is viscous
-STOP_CLEARANCE = 0.05  # rad between the commanded range and the mechanical end stops
+STOP_CLEARANCE = 0.05  # rad, distance from the commanded range to the mechanical end stops
 STOP_STIFFNESS = 500.0  # N·m/rad
-RIM_STIFFNESS = 1e6  # N/m, backing plate against the object
-COMPRESSION_DEPTH = 0.4  # fraction of the tip radius, depth of the scripted compression
+RIM_STIFFNESS = 1e6  # N/m, stiffness of the backing plate against the object
+COMPRESSION_DEPTH = 0.4  # depth of the scripted compression as a fraction of the tip radius
 
 
 def geometry_of(settings: Settings) -> HandGeometry:
-    """Return the hand geometry from the settings."""
+    """Return the hand geometry defined by the settings."""
     hand = settings.hand
     return HandGeometry(
         hand.pivot_separation, hand.finger_length, hand.finger_offset, settings.tip.radius
@@ -69,7 +69,7 @@ def geometry_of(settings: Settings) -> HandGeometry:
 
 
 def stiff_step(settings: Settings, table: ContactTable) -> float:
-    """Return the sub-step [s] for the fastest oscillation of the object on deeply pressed tips."""
+    """Return the sub-step [s] for the fastest oscillation of an object on fully compressed tips."""
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius, table.header.deepest)
     c = table(d, 0.0)
@@ -146,7 +146,7 @@ def _object(p: Parameters, settings: Settings) -> None:
     p.table_torque = p.table_force * shape.mean_radius
     p.table_speed = TABLE_SPEED
     p.table_spin = TABLE_SPEED / shape.mean_radius
-    # A single finger can't hold an object, so the object is then fixed to the test bench.
+    # A single finger can't hold an object, so in this case the object is fixed to the test bench.
     p.object_held = (
         shape.kind == NO_OBJECT
         or len(settings.scene.fingers) == 1
@@ -171,7 +171,7 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # Critical damping for the joint with its position loop.
+    # This gives critical damping of the joint with its position loop.
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
@@ -194,7 +194,7 @@ def _script(p: Parameters, settings: Settings) -> None:
 
 
 class SimulatedHand:
-    """Two fingers with joints and soft tips and an object between them, in one plane.
+    """Two fingers with joints and soft tips, and an object between them, all in one plane.
 
     The tips touch the object, or each other if the object is not between them. If a tip has two
     contacts, its sensor measures the stronger contact. The object may lie on the palm.
@@ -204,8 +204,8 @@ class SimulatedHand:
     joints stay at ``settings.hand.open_angle``. In this case, if ``simulation.compression_speed``
     is above 0, the object moves back and forth between both tips and compresses each by 0.4 radii.
 
-    The array attributes are views of the state with shape (2,), left first. They are valid until
-    the next ``advance``.
+    The array attributes are views of the state with shape (2,), left finger first. They are valid
+    until the next call of ``advance``.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class SimulatedHand:
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         goals.stiffness[:] = goals.duty[:] = 1.0
-        # Store all samples that may be in transit to a sensor's reader.
+        # The buffer holds all samples that may be in transit to a sensor's reader.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLE_COUNT
         self._ring = np.zeros(stored, Sample.dtype)
@@ -276,8 +276,8 @@ class SimulatedHand:
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
         self.torque_on = goals.torque_on  # 1 if the servo's torque is on
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
-        # Faults of each finger's tactile sensor and servo, left first. They do not change the
-        # physics.
+        # Faults of each finger's tactile sensor and servo, left finger first. They do not change
+        # the physics.
         self.measurement_faults = MeasurementFaults(), MeasurementFaults()
         self.servo_heat = ServoHeat.of(settings), ServoHeat.of(settings)
         self._run(0)
@@ -288,7 +288,7 @@ class SimulatedHand:
         return self.start + self._done * self.step
 
     def advance(self, t: float) -> None:
-        """Advance to the last sub-step at or before ``t`` [s] unless it has already passed."""
+        """Advance to the last sub-step at or before ``t`` [s], unless it has already passed."""
         if t > self._torque_until:
             self._advance(self._torque_until)
             self.torque_on[:] = 0
@@ -319,7 +319,7 @@ class SimulatedHand:
     ) -> None:
         """Set a servo's mode, torque, goal angle [rad] and goal current [A].
 
-        Mode numbers are those of Dynamixel: 0 current, 3 position, 5 current-based position. Raises
+        The mode numbers are Dynamixel's: 0 current, 3 position, 5 current-based position. Raises
         ValueError for another mode or a non-finite goal.
         """
         if mode not in _MODES:
@@ -343,7 +343,7 @@ class SimulatedHand:
         return scale * self.current.item(joint)
 
     def hold_torque_until(self, t: float) -> None:
-        """Switch off torque of both servos at ``t`` [s]; infinity cancels this."""
+        """Switch the torque of both servos off at ``t`` [s]; infinity cancels this."""
         self._torque_until = t
 
     def apply_load(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
@@ -360,7 +360,7 @@ class SimulatedHand:
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
 
     def apply_fault(self, event: FaultEvent) -> bool:
-        """Begin a load or a measurement fault, or end the latter; return False for other faults."""
+        """Begin or end a load or measurement fault; return False for other faults."""
         kind, part = event.kind, event.part
         if part == OBJECT:
             self.load(**{kind: event.value})
@@ -383,12 +383,13 @@ class SimulatedHand:
     def sample(self, number: int) -> Sample:
         """Return sample ``number``, which is valid until a newer sample replaces it.
 
-        Raises LookupError if it has not been taken yet or has been overwritten.
+        Raises LookupError if the sample has not been taken yet or has been overwritten.
         """
         row = self._rows[number % len(self._rows)]
         if row.number != number:
             raise LookupError(
-                f"sample {number} is no longer stored; {self.sample_count} were taken"
+                f"sample {number} is no longer stored; only the latest of {self.sample_count} "
+                "samples are kept"
             )
         return row
 

@@ -45,7 +45,7 @@ def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract g K r from the load, with first-stage K and positions and shears r of ``k``."""
+    """Subtract g K r from the load; K is the first stage's, r are positions and shears in ``k``."""
     for finger in range(2):
         tip = plant.stages[0].on_object[finger]
         rows, stiffness = tip.rows, tip.stiffness
@@ -110,7 +110,7 @@ def factorise(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def solve(plant: Plant, k: Motion) -> None:
-    """Solve for the load and set the velocities of ``k``, which are 0 for held parts."""
+    """Solve for the load and set the velocities in ``k``, which are 0 for parts held fixed."""
     full, out = plant.factors.lower, k.velocity
     for i in range(5):
         value = plant.load[i]
@@ -135,7 +135,7 @@ def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract the extra rows' g K r from the load; r are positions and extra shears of ``k``."""
+    """Subtract the extra rows' g K r from the load; r are positions and extra shears in ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.stiffness == 0.0:

@@ -4,48 +4,50 @@ All elastic forces are the gradient of a single energy, so the contact can't cre
 
     U = w(θ) κ [ U₀(d, θ) + F(d, θ) (sin θ d_t + s cos θ d_t²/d) ] + U_rim(d, θ)
 
-U₀ and F are energy and force from the contact table for a plane face. With a constant modulus E, F
-= πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1, the second term is then πE(d² d_t tan θ + d
-d_t²), the tangential energy of the parallel-distributed model. For other materials, F introduces
-their effective modulus. w(θ) is 1 on the soft hemisphere and fades to 0 towards the side of the
-finger. U_rim is a stiff spring between the rim of the backing plate and the object. A plane reaches
-the rim at d = a(1 − |sin θ|), the end of the soft range. Beyond a slightly smaller d, a(1 − √(sin²
-θ + 0.03²)), U₀ is continued linearly in d, and F is constant.
+U₀ and F are the energy and the force on a plane face, from the contact table. With a constant
+modulus E, F = πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1, the second term then becomes πE(d²
+d_t tan θ + d d_t²), the tangential energy of the parallel-distributed model. For other materials, F
+introduces their effective modulus. w(θ) is 1 on the soft hemisphere and fades to 0 towards the side
+of the finger. U_rim is a stiff spring between the rim of the backing plate and the object. A plane
+reaches the rim at d = a(1 − |sin θ|), which is the end of the soft range. Beyond a slightly smaller
+d, a(1 − √(sin² θ + 0.03²)), U₀ is continued linearly in d, and F is constant.
 
 This is the contact law ``simulation.tip_law = "springs"``. With ``"bristles"``, the term sin θ d_t
 is omitted. The tangential force T = 2 s F cos θ d_t/d (2πE s d d_t for a constant E) then comes
 from a bristle at the centre of the contact. Tilt and compression do not bend this bristle, and d_t
 only follows the sliding motion at that point. The upright force, the force at d_t = 0 and the
-sensor are the same for both laws. The bristles therefore allow a controller that compensates the
-springs' tangential terms to be tested on a tip without these terms.
+sensor readings are the same for both laws. A controller that compensates the springs' tangential
+terms can therefore be tested with ``"bristles"``, a tip without these terms.
 
 The tip touches the nearest point of the object. On a face, the contact direction is the face
-normal. At a corner, it is the line to the corner, as for a plane normal to that line. On a disc, it
-is the line to the centre. The axis of a disc is normal to the hand plane, so its face is curved
-about one axis with radius R. To leading order in d, the contact of the spring model differs from
-that with the tangent plane in two ways. The footprint is narrower along the tilt by κ² = R/(R + a),
-since the curvatures add to 1/a + 1/R, and force and energy are κ times those of the plane for any
-θ. For a constant modulus, a = 20 mm and d up to 8 mm, integrals over the springs agree with this to
-within 1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9 % for R = 10 mm.
-The sensor frame is computed from these springs (`sensor.sensor_model`), so its sum differs by the
-same amount. The force of a solid tip is proportional to d^(3/2) and √κ, as in Hertz's theory for a
-sphere on a cylinder in the limit of small d. Its frame is the plane's frame multiplied by this
-factor.
+normal. At a corner, the direction is that of the line to the corner, as for a plane normal to that
+line. On a disc, it is the line to the centre. A disc's axis is normal to the hand plane, so its
+face is curved about one axis only, with radius R. To leading order in d, the spring model's contact
+with a disc differs in two ways from its contact with the tangent plane. First, the footprint is
+narrower along the tilt by the factor κ² = R/(R + a), because the curvatures add to 1/a + 1/R.
+Second, force and energy are κ times those of the plane for any θ. For a constant modulus, a = 20 mm
+and d up to 8 mm, integrals over the springs agree with these factors to within 1.6 % upright and
+4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9 % for R = 10 mm. The sensor frame is
+computed from the springs (`sensor.sensor_model`), so the sum of its cells differs from the force by
+the same amount. The force of a solid tip is proportional to d^(3/2) and √κ, as in Hertz's theory
+for a sphere on a cylinder in the limit of small d. The frame of a solid tip is that of a plane
+multiplied by √κ.
 
 Coulomb friction limits d_t to the range between the two shears at which |T| = μN. If the model's
 ratio |T|/N can't reach μ (with a constant E and s = 1, its maximum at θ = 0 is 1), the tip slips at
 the maximum ratio. Damping is viscous and proportional to the stiffness of the soft part, so it
-increases with the contact.
+increases as the contact grows.
 
-The shear of a stuck tip may relax by creep and by micro-slip. Both are off by default; a tip then
-sticks or slips as a whole and has no memory. Micro-slip is the behaviour of springs with individual
-Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed by w = ℓ − h, has the pressure
-Ew/ℓ. When the face has moved by u, the spring has the shear traction Eu/ℓ and slips if u > μw. All
-layers w = 0 … d are equally stiff, since r dr = −ℓ dℓ. Starting from zero shear, this gives
+The shear of a stuck tip may relax by creep and by micro-slip. Both are off by default. In this
+case, a tip sticks or slips as a whole and has no memory. Micro-slip occurs because each spring has
+its own Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed by w = ℓ − h, has the
+pressure Ew/ℓ. When the face has moved by u, the spring has the shear traction Eu/ℓ and slips if u >
+μw. All layers w = 0 … d are equally stiff, since r dr = −ℓ dℓ. Starting from zero shear,
+integration gives
 
     T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
 
-and the whole tip slips at u = μd. This is an Iwan model with uniformly distributed limits. Its
+where the whole tip slips at u = μd. This is an Iwan model with uniformly distributed limits. Its
 layers scale with the footprint. Their mean is the tip's d_t, and their variance adds to d_t² in the
 tip energy.
 """
@@ -70,13 +72,14 @@ from softfinger.kinematics.contact.lookup import lookup_at, normal_at, stiffness
 from softfinger.kinematics.contact.table_record import Table
 
 D_MIN = 1e-9  # m, minimum d for a contact
-_FADE_FROM = 1.15  # rad, start of the fade of w(θ)
-_FADE_TO = 1.35  # rad, end of the fade, where w(θ) = 0
+_FADE_FROM = 1.15  # rad, angle above which w(θ) decreases
+_FADE_TO = 1.35  # rad, angle at which w(θ) becomes 0
 # Fraction of the radius, minimum distance from the tip centre to a corner.
 _CORNER_DISTANCE_MIN = 1e-3
 _FRICTION_TOLERANCE = 5e-13  # relative tolerance for the friction limit
 _RELAXATION_MIN = 0.02  # minimum relaxation factor, for tips with delayed recovery
-_RIM_ROUNDING = 0.03  # fraction of the radius from the end of the soft range to the rim at θ = 0
+# fraction of the radius, distance from the end of the soft range to the rim at θ = 0
+_RIM_ROUNDING = 0.03
 
 
 @inner_kernel
@@ -93,9 +96,9 @@ def fade(theta: float) -> tuple[float, float]:
 
 @inner_kernel
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
-    """Return the maximum ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ with maximum ratio.
+    """Return the maximum ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of maximum ratio.
 
-    ζ is the shear relative to the shear at which T = 0.
+    Here, ζ is measured from the shear at which T = 0.
     """
     if friction <= 0.0 or n0 <= 0.0:
         return 0.0
@@ -108,7 +111,7 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
 
 @inner_kernel
 def clear_contact(tip: TipContact) -> None:
-    """Clear a tip's contact, except for d, θ and the gain."""
+    """Clear a tip's contact, but keep d, θ and the gain."""
     tip.force = 0.0
     tip.energy = 0.0
     tip.rim = 0.0
@@ -166,7 +169,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     stiffness_d = 0.0
     stiffness_theta = 0.0
     stiffness_t = 0.0
-    ahead = 0.0  # possible increase in soft stiffness during this step
+    ahead = 0.0  # largest possible increase in soft stiffness during this step
     if gain > 0.0:
         inverse_cosine = 1.0 / cosine
         leaning = sine * inverse_cosine
@@ -219,7 +222,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # shear at which T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # Most steps are far from slip, which two comparisons detect.
+        # Most steps are far from slip. Two comparisons detect this case.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction
@@ -252,8 +255,9 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     else:
         shear = 0.0
 
-    # Damping: a separating tip must not pull, and shear damping stays within friction. A stuck tip
-    # does not slide, except for the spring term tan θ ḋ, which keeps the virtual work consistent.
+    # Damping must not make a separating tip pull, and shear damping must not exceed friction. A
+    # stuck tip does not slide, apart from the spring model's term tan θ ḋ, which keeps the virtual
+    # work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
     loss = p.loss
@@ -287,7 +291,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
 
 @inner_kernel
 def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: float) -> None:
-    """Set row ``r`` over (q, x, y, φ)."""
+    """Set row ``r``, the derivatives with respect to (q, x, y, φ)."""
     tip.rows[r, 0] = q
     tip.rows[r, 1] = x
     tip.rows[r, 2] = y
@@ -298,8 +302,8 @@ def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: flo
 def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
     """Add the rim stiffness to a tip that may reach the rim in this step.
 
-    The rim row is at most the d row plus a times the θ row, so twice each stiffness is an upper
-    bound.
+    The rim depth's row is at most the sum of the d row and a times the θ row, so twice each
+    stiffness is an upper bound.
     """
     hard = 2.0 * p.rim_stiffness
     tip.stiffness[ALONG_D] += hard
@@ -310,7 +314,7 @@ def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
 def touch_object(
     plant: Plant, table: Table, tip: TipContact, finger: int, now: Motion, nx: float, ny: float
 ) -> None:
-    """Evaluate a finger's ``tip`` on the object in ``now``; (nx, ny) is the object's n."""
+    """Evaluate a finger's ``tip`` on the object in state ``now``; (nx, ny) is the face normal n."""
     p = plant.parameters
     its = plant.fingers[finger]
     rx = its.x - now.position[2]
@@ -333,7 +337,8 @@ def touch_object(
     tip.sine = sine
     tip.cosine = cosine
 
-    # Rows over (q, x, y, φ). The contact point is ``distance`` · m away from the tip centre.
+    # Derivatives with respect to (q, x, y, φ). The contact point is ``distance`` · m away from the
+    # tip centre.
     px = rx + distance * mx
     py = ry + distance * my
     rotation_m = my * px - mx * py
@@ -345,8 +350,8 @@ def touch_object(
     y_rate = now.velocity[3]
     rotation_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
-    # The integrator matrix uses the stiffness at the end of the step to be correct during an
-    # impact. Damping uses the current stiffness.
+    # The integrator matrix uses the stiffness at the end of the step, so that it is correct during
+    # an impact. Damping uses the current stiffness.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
         tip.gain = fade(theta)[0] * p.factor * plant.relaxation_factor[finger]
@@ -441,8 +446,8 @@ def relax_tips(plant: Plant) -> None:
     """Advance each tip's relaxation on the object by one sub-step and set its factor ρ.
 
     ρ = 1 + Σ r_i (1 − h_i/F∞) with ḣ_i = (F∞ − h_i)/τ_i scales all tip forces, where F∞ is the
-    long-term force. A suddenly pressed tip is initially stiffer by Σ r_i. A suddenly released tip
-    recovers with a delay.
+    long-term force. A tip that is loaded suddenly is initially stiffer by Σ r_i. A tip that is
+    unloaded suddenly recovers with a delay.
     """
     p = plant.parameters
     for finger in range(2):

@@ -1,1 +1,1 @@
-"""Simulated pressure sensor: readings, imperfections and frame arrival times."""
+"""Simulate the pressure sensor: readings, imperfections and frame arrival times."""

@@ -1,14 +1,14 @@
 """Model the simulated pressure sensor: convert a contact to the counts sent by a board.
 
-`simulated_tactile` handles delayed and lost frames. The imperfections have the usual forms; the
+`simulated_tactile` handles delayed and lost frames. The imperfections are standard models; the
 profiles ``velostat`` and ``capacitive`` use them.
 
 `sensing.pressure_grid` computes the pressure of a plane face; this module computes the pressure of
 a cylindrical face, as on a disc. Both use the same spring model: above each point of the base, the
 face compresses a vertical spring whose length is the height of the hemisphere. An estimator that
-assumes a plane face sees a narrower footprint and therefore underestimates d: it finds 0.72 of the
-true value for R = a, and 0.83 for R = 2a. Its θ is 1 % to 12 % too small (the error increases with
-d), and its gain is above 1, which compensates the force.
+assumes a plane face interprets the narrower footprint as a smaller d: it finds 0.72 of the true
+value for R = a, and 0.83 for R = 2a. Its θ is 1 % to 12 % too small (the error increases with d),
+and its gain is above 1, which compensates for the underestimated force.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, coun
 FloatArray = NDArray[np.float64]
 
 PLAY_COUNT = 4
-_FINENESS = 60.0  # minimum number of model points per tip radius
+_FINENESS = 60.0  # minimum number of sample points per tip radius
 
 
 class SensorModel:
     """Pressure sensor under one simulated tip, with the board's range and imperfections.
 
     ``gain`` is the ratio of the reading to the material's pressure. ``dead`` lists the cells (row,
-    col) that always read 0. Models with the same arguments and calls give the same frames.
+    col) that always read 0. Two models with the same arguments and calls produce the same frames.
     """
 
     def __init__(
@@ -119,7 +119,8 @@ class SensorModel:
         """Write the counts of the next frame to ``out``, contiguous uint16 [rows, cols].
 
         ``d`` [m] ≤ 0 means no contact. Tilts [rad] are as in :meth:`SensorGrid.pressure`. ``t`` [s]
-        is the frame time, for creep, response and drift. ``curvature`` is as in :meth:`press`.
+        is the frame time, which is used for creep, response and drift. ``curvature`` is as in
+        :meth:`press`.
         """
         self.press(d, tilt_x, tilt_y, t, curvature)
         self.read(out)
@@ -138,7 +139,7 @@ class SensorModel:
 
         ``curvature`` [1/m] is the face curvature in the plane of ``tilt_x``, 0 for a plane. The
         face is a cylinder with its axis along the finger's y. All pressures are multiplied by
-        ``fraction``. For a solid tip, the curvature only acts through this factor, and the frame
+        ``fraction``. For a solid tip, the curvature acts only through this factor, and the frame
         also shows the ``shear`` [N] along x, applied at height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
@@ -169,10 +170,10 @@ class SensorModel:
 
     @cached_property
     def _points(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Sample points: position across the cylinder axis, and hemisphere height [m].
+        """Sample points: their positions across the cylinder axis, and the hemisphere heights [m].
 
-        Both have the shape [lines, points per line]; the height is 0 beyond the rim. The other two
-        results are the matrices that average over cells, including blur, along y and x.
+        Both arrays have the shape [lines, points per line]; the height is 0 beyond the rim. The
+        other two results are matrices that average over cells along y and x, including blur.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -210,7 +211,7 @@ class SensorModel:
         return np.asarray(along_y @ pressure @ along_x)
 
     def press_evenly(self, pressure: float) -> None:
-        """Replace the last press with a uniform pressure [Pa], as from a bladder."""
+        """Replace the last press with a uniform pressure [Pa], as exerted by a bladder."""
         self._pressure[:] = pressure
 
     def read(
@@ -242,7 +243,7 @@ class SensorModel:
         count(signal, self._sensitivity > 0.0, self._ends, out)
 
 
-# --- effects of a soft, resistive sensor: in place, on arrays [rows, cols] -----------------------
+# --- effects of a soft, resistive sensor, computed in place on arrays [rows, cols] ---------------
 
 
 def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
@@ -250,10 +251,10 @@ def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
 
     This is a Prandtl-Ishlinskii model: the output of a cell is the mean of PLAY_COUNT generalised
     play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each operator follows an
-    increasing pressure p immediately. It follows a decreasing pressure only when its state is above
-    (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. The loading curve is therefore the
-    pressure itself, the unloading curve ends at (1 + excess) p, loops are closed, inner loops lie
-    inside outer loops, and zero pressure always reads 0.
+    increasing pressure p immediately. An operator follows a decreasing pressure only when its state
+    is above (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. The loading curve is
+    therefore the pressure itself, the unloading curve ends at (1 + excess) p, loops are closed,
+    inner loops lie inside outer loops, and zero pressure always reads 0.
     """
     widths = 2.0 * excess * (np.arange(PLAY_COUNT) + 0.5) / PLAY_COUNT
     np.minimum(state, (1.0 + widths)[:, None, None] * pressure, out=state)
@@ -272,7 +273,7 @@ def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) ->
     lagged: FloatArray = state[1]
     ratio = elapsed / time
     decay = math.exp(-ratio)
-    # Mean decay over the interval; for short intervals it is 1 − r/2 + …
+    # Mean decay over the interval, which is 1 − r/2 + … for short intervals.
     mean = -math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0
     lagged *= decay
     lagged += (mean - decay) * before + (1.0 - mean) * pressure
@@ -296,7 +297,7 @@ def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float)
 def drift(
     value: FloatArray, deviation: float, time: float, elapsed: float, normals: FloatArray
 ) -> None:
-    """Advance the zero or gain drift, modelled as an Ornstein-Uhlenbeck process.
+    """Advance the zero drift or gain drift, modelled as an Ornstein-Uhlenbeck process.
 
     ``value`` starts at 0 after a tare, and its standard deviation approaches ``deviation`` with the
     correlation time ``time`` [s]. ``normals`` are standard normal numbers.
@@ -307,9 +308,9 @@ def drift(
 
 
 def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: FloatArray) -> None:
-    """Compute the crosstalk of each line as ``fraction`` of its mean signal.
+    """Compute the crosstalk of each line as a ``fraction`` of its mean signal.
 
-    The cells of a resistive matrix share drive and sense lines, and current leaks along these
+    The cells of a resistive matrix share drive lines and sense lines, and current leaks along these
     lines. The results are written to ``rows`` [rows] and ``cols`` [cols].
     """
     np.multiply(fraction, signal.mean(axis=1), out=rows)

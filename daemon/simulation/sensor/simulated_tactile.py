@@ -36,11 +36,11 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
 
 
 class StageTouch(NamedTuple):
-    """Contact of a tip with something other than the object at one instant."""
+    """Contact of a tip, at one instant, with a body other than the object."""
 
     d: float  # m
     theta: float  # rad
-    pressure: float  # if above 0, uniform pressure on all cells instead [Pa]
+    pressure: float  # if above 0, uniform pressure on all cells that replaces the contact [Pa]
 
 
 class SimulatedTactile:
@@ -50,8 +50,8 @@ class SimulatedTactile:
     the hand's start. It arrives ``simulation.tactile_delay`` later, with an additional delay, or
     not at all (see :class:`Arrivals`). As on hardware, the sample time is unknown; it is assumed to
     be ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is computed,
-    and only when requested; ``seq`` also counts the other frames. The hand's ``measurement_faults``
-    are applied.
+    and only on request; ``seq`` also counts the frames that are not computed. The hand's
+    ``measurement_faults`` are applied to the frames.
 
     If ``stage`` is set, it replaces the contact with the object. It is a function of the time since
     the hand's start [s].
@@ -80,7 +80,7 @@ class SimulatedTactile:
         self._relaxation = list(
             zip(simulation.tip_relaxation, simulation.tip_relaxation_times, strict=True)
         )
-        # Lagged plate force of each term [N].
+        # lagged plate force of each Prony term [N]
         self._relaxation_state = [0.0] * len(self._relaxation)
         self._pressed = -1  # number of the newest sample applied to the cells
         self._frame: Frame | None = None
@@ -99,7 +99,7 @@ class SimulatedTactile:
         self.latest()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame, or None before the first frame or if not open."""
+        """Return the newest frame, or None before the first frame or if the sensor is not open."""
         now = self._clock.now()
         if self._open and self._arrivals.take(now):
             self._hand.advance(now)
@@ -107,7 +107,7 @@ class SimulatedTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return the numbers of ``frames`` received and ``missed`` since opening.
+        """Return the number of ``frames`` received and of frames ``missed`` since opening.
 
         ``resyncs`` and ``skipped_bytes`` are always 0.
         """
@@ -125,7 +125,7 @@ class SimulatedTactile:
 
     def _read(self, number: int, arrival: float) -> None:
         """Compute a sample's frame if the plant still stores it, and make it the newest."""
-        # Cells with memory also depend on samples whose frame is not computed.
+        # If readings depend on earlier contacts, samples whose frame is not computed also matter.
         first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
             self._press(each)
@@ -139,7 +139,7 @@ class SimulatedTactile:
         self._frame = Frame(number + 1, t + self._early, arrival, valid=True, data=data)
 
     def _counts(self, t: float) -> NDArray[np.uint16]:
-        """Return the readings at ``t`` [s], or the next frame during a replay fault."""
+        """Return the readings at ``t`` [s], or the next replayed frame during a replay fault."""
         last = round(self._faults("replay", t) / self._period)
         if last == 0 or not self._given:
             self._replayed = None
@@ -181,7 +181,8 @@ class SimulatedTactile:
             shear = float(sample.tangential[finger]) * (1.0 - d / self._radius)
             self._model.press(d, theta, 0.0, number * self._period, curvature, factor, shear)
             return True
-        # Remove the curvature part of the factor, which the sensor model computes itself.
+        # Remove the effect of curvature from the factor, because the sensor model computes this
+        # effect.
         factor *= math.sqrt(1.0 + curvature * self._radius)
         # Force is proportional to d². If half the tip is beyond the face edge, the force is halved.
         relaxation_factor = float(sample.relaxation_factor[finger])
@@ -191,11 +192,11 @@ class SimulatedTactile:
 
 
 class Arrivals:
-    """Arrival times of a sensor's frames 0, 1, ….
+    """Arrival times of the frames 0, 1, … of a sensor.
 
-    Frame k is sampled at start + k · period and due ``delay`` [s] later. It is lost with
-    probability ``dropped``. Otherwise, it is late by a uniformly distributed time of up to
-    ``jitter`` [s]. Frames never overtake each other.
+    Frame k is sampled at start + k · period and is due ``delay`` [s] later. It is lost with
+    probability ``dropped``. A frame that is not lost is late by a uniformly distributed time of up
+    to ``jitter`` [s]. Frames never overtake each other.
     """
 
     # Allow for clock rounding errors, so that a frame due now counts as arrived.
@@ -219,7 +220,7 @@ class Arrivals:
         self.number = -1  # number of the newest frame
         self.arrival = start  # arrival time of the newest frame [s]
         self.arrived = 0  # frames
-        self.missed = 0  # number of lost frames before the newest
+        self.missed = 0  # number of frames lost before the newest frame
         self._next = -1
         self.next_arrival = start + delay  # arrival time of the next frame [s]
         self._plan()

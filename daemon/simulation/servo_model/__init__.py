@@ -1,5 +1,5 @@
-"""Emulated Dynamixel servos: registers, their effects, and bus packets.
+"""Emulate Dynamixel servos: registers, their effects, and bus packets.
 
-Input and output are bytes with times; there is no port. This package shares only the control table
-and the CRC with the client.
+The input and output are bytes with times, so no port is needed. The only code that this package
+shares with the client is the control table and the CRC.
 """

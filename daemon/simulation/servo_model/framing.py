@@ -1,6 +1,6 @@
 """Implement Dynamixel Protocol 2.0 framing on the servo side: byte stuffing, packets and parser.
 
-This module shares only the CRC with the client, so that tests against the client are meaningful.
+The only code shared with the client is the CRC, so that tests against the client are meaningful.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BULK_READ: Final = 0x92
 BULK_WRITE: Final = 0x93
 FAST_BULK_READ: Final = 0x9A
 
-# Error numbers in a status packet; the additional bit 7 (ALERT) indicates a hardware error.
+# Error numbers in a status packet. In addition, bit 7 (ALERT) indicates a hardware error.
 OK: Final = 0x00
 RESULT_FAIL: Final = 0x01
 INSTRUCTION_ERROR: Final = 0x02
@@ -76,7 +76,7 @@ def old_pings(data: bytes) -> list[int]:
 
 
 class Packet(NamedTuple):
-    """Received packet. ``valid`` is False if only its CRC is wrong."""
+    """Received packet. ``valid`` is False if the CRC is wrong but everything else is correct."""
 
     id: int
     instruction: int
@@ -96,8 +96,8 @@ class PacketParser:
     """Packet parser that behaves like a real servo.
 
     A packet is discarded if a header occurs inside it (FF FF FD not followed by FD, which stuffing
-    prevents), or if it is interrupted by more than ``gap`` seconds of silence. A packet sent
-    without stuffing is therefore never executed.
+    prevents), or if it is interrupted by more than ``gap`` seconds of silence. Therefore, a packet
+    sent without stuffing is never executed.
     """
 
     def __init__(self, gap: float = 0.0015) -> None:

@@ -30,9 +30,10 @@ class FreeJoints:
         self.q: FloatArray = np.zeros(count)  # rad; may be written to position the joints
         self.dq: FloatArray = np.zeros(count)  # rad/s
         self.current: FloatArray = np.zeros(count)  # A
-        # Torque on, signed current, angle, current limit.
+        # True if torque is on, signed current, angle, and current limit of each joint.
         self._goals = [(False, 0.0, 0.0, 0.0)] * count
-        self._tuned = [(1.0, 0.0, 1.0)] * count  # stiffness, damping, duty; see `tune`
+        # stiffness, damping and duty of each joint; see `tune`
+        self._tuned = [(1.0, 0.0, 1.0)] * count
 
     def measured_current(self, joint: int) -> float:
         """Return the measured current; see :meth:`JointPlant.measured_current`."""

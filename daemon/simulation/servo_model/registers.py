@@ -1,4 +1,4 @@
-"""Define an emulated servo's registers: access rights, defaults, ranges and invalid writes.
+"""Define an emulated servo's registers: access rights, defaults, ranges and rejected writes.
 
 :mod:`simulation.servo_model.servo` implements the effects of writes.
 """
@@ -24,7 +24,7 @@ _LIMITS = {
     reg.GOAL_CURRENT: reg.CURRENT_LIMIT,
     reg.GOAL_VELOCITY: reg.VELOCITY_LIMIT,
 }
-_PAIRS = {  # lower limit → upper limit
+_PAIRS = {  # addresses of lower limits and their upper limits
     reg.MIN_POSITION_LIMIT: reg.MAX_POSITION_LIMIT,
     reg.MIN_VOLTAGE_LIMIT: reg.MAX_VOLTAGE_LIMIT,
 }
@@ -33,7 +33,10 @@ _UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One register. ``low`` and ``high`` are its limits according to the table alone."""
+    """One register.
+
+    ``low`` and ``high`` are the limits in the manual's table; other registers may narrow them.
+    """
 
     address: int
     size: int
@@ -164,13 +167,13 @@ class ControlTable:
         return value
 
     def set(self, address: int, value: int) -> None:
-        """Store a value regardless of access rights; excess bits are truncated."""
+        """Store a value regardless of access rights; bits that do not fit are dropped."""
         item = self.at[address]
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
 
     def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
-        """Restore factory defaults from address ``first`` upwards, except for items at ``keep``.
+        """Restore factory defaults from address ``first`` on, except for the items in ``keep``.
 
         If ``first`` is `control_table.RAM`, this has the effect of a power-up.
         """
@@ -192,17 +195,17 @@ class ControlTable:
         return self.memory[pointer] | self.memory[pointer + 1] << 8
 
     def read(self, address: int, length: int) -> bytes:
-        """Return the bytes of a table range with indirect data resolved."""
+        """Return the bytes of an address range, with indirect data resolved."""
         return bytes(self.memory[self.resolve(i)] for i in range(address, address + length))
 
     def reads(self, address: int, length: int, first: int, last: int) -> bool:
-        """Return True if the range includes any byte of ``first`` … ``last``."""
+        """Return True if the range includes any address from ``first`` to ``last``."""
         return any(first <= self.resolve(i) <= last for i in range(address, address + length))
 
     # --- writing ---------------------------------------------------------------------------------
 
     def plan(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
-        """Return the effect of a write: error number, and items with their new values.
+        """Return the effect of a write: an error number, and the items with their new values.
 
         The error is DATA_LENGTH for a partially written item, ACCESS for a read-only or undefined
         byte, and DATA_RANGE for a value outside the item's range. After an error, the write must
@@ -259,5 +262,5 @@ class ControlTable:
 
     @property
     def shut_down(self) -> bool:
-        """True while a hardware error in the shutdown mask keeps torque off."""
+        """True while a hardware error included in the shutdown mask keeps torque off."""
         return bool(self.memory[reg.HARDWARE_ERROR_STATUS] & self.memory[reg.SHUTDOWN])

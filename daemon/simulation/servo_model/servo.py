@@ -2,11 +2,11 @@
 
 The model includes torque, operating modes, limits, profiles, bus watchdog, hardware errors,
 shutdown and reboot. Packets are handled in :mod:`simulation.servo_model.servo_bus`. PWM mode, which
-is not used by any known client, is rejected as out of range. The integral gain and startup from a
-RAM backup have no effect.
+no known client uses, is rejected as out of range. The integral gain and startup from a RAM backup
+have no effect.
 
-Two details are not specified in the manuals. Here, a write that violates any rule does not change
-any register, and switching torque on after a shutdown is rejected with RESULT_FAIL.
+The manuals do not specify two details. In this emulation, a write that violates any rule leaves all
+registers unchanged, and switching torque on after a shutdown is rejected with RESULT_FAIL.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
 
 REBOOT_TIME = 0.34  # s without a reply
 JUMP_COUNTS = 130  # counts (0.2 rad at the shaft), jump of the encoder zero
-FAR_GOAL = 0.05  # rad, minimum distance of a far goal from the angle at torque on
+FAR_GOAL = 0.05  # rad, distance from the angle at torque on beyond which a goal counts as far
 _WATCHED_REGISTERS = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 _TUNING_REGISTERS = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
 _CLEAR_FIRMWARE = 42
@@ -40,7 +40,7 @@ _CLEAR_KEY = b"\x01DXL\x22"
 
 
 def prepared(model: ServoModel, mode: int) -> dict[int, int]:
-    """Return the EEPROM values required by the daemon: no return delay, and the mode."""
+    """Return the EEPROM values that the daemon requires: a return delay of 0, and the mode."""
     needed = {reg.RETURN_DELAY_TIME: 0}
     return needed | {reg.OPERATING_MODE: mode} if mode in model.modes else needed
 
@@ -67,19 +67,21 @@ class EmulatedServo:
     ) -> None:
         self.model = model
         self.firmware = model.firmware if firmware is None else firmware
-        self.fast_reads = model.fast_read(self.firmware)  # supports fast sync and fast bulk read
+        # True if the firmware supports fast sync read and fast bulk read
+        self.fast_reads = model.fast_read(self.firmware)
         self.table = ControlTable(model, self.firmware)
         self._memory = self.table.memory
         self.silent = self.frozen = self.refuses = False
         self.health = ServoHealth(model, heat)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self.recorder = BusRecorder(t)
-        self._watched = 0.0  # last restart time of the watchdog
+        self._watched = 0.0  # time of the last watchdog restart
         self._booted = t
         self._boot_at = -math.inf  # end of a reboot
         self._next_step = math.inf
         self._next_sense = t
-        self._registered: tuple[int, bytes] | None = None  # write waiting for an action
+        # write that waits for an action instruction
+        self._registered: tuple[int, bytes] | None = None
         for address, value in eeprom.items():
             self.table.set(address, value)
         self._start(t)
@@ -92,12 +94,12 @@ class EmulatedServo:
 
     @property
     def shadow(self) -> int:
-        """Second ID, whose instructions are executed without a reply; 253 and above disable it."""
+        """Secondary ID, whose instructions are executed without a reply; disabled from 253 on."""
         return self._memory[reg.SHADOW_ID]
 
     @property
     def old_protocol(self) -> bool:
-        """True if set to Protocol 1.0, for which this emulator only supports ping."""
+        """True if the servo is set to Protocol 1.0, of which this emulator only supports ping."""
         return self._memory[reg.PROTOCOL_TYPE] == 1
 
     @property
@@ -128,7 +130,7 @@ class EmulatedServo:
 
     @property
     def watchdog(self) -> float:
-        """Bus watchdog time [s]; 0 while it is off or has stopped the motor."""
+        """Bus watchdog time [s]; 0 while the watchdog is off or has stopped the motor."""
         ticks = self._memory[reg.BUS_WATCHDOG]
         return ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else 0.0
 
@@ -152,7 +154,7 @@ class EmulatedServo:
         self.recorder.heard(t, self._memory[reg.TORQUE_ENABLE] != 0)
 
     def next_event(self) -> float:
-        """Return the time [s] of the next required :meth:`act` call."""
+        """Return the time [s] at which :meth:`act` must be called next."""
         due = min(self._next_step, self._next_sense)
         if self._boot_at > -math.inf:
             return min(due, self._boot_at)
@@ -231,7 +233,7 @@ class EmulatedServo:
         return self.write(address, data, t)
 
     def reboot(self, t: float) -> None:
-        """Switch torque off, and restart with power-up RAM values after REBOOT_TIME."""
+        """Switch torque off, and restart after REBOOT_TIME with the RAM values of a power-up."""
         self.table.set(reg.TORQUE_ENABLE, 0)
         self._joint.drive()
         self._next_step = math.inf
@@ -363,7 +365,7 @@ class EmulatedServo:
     # --- internal events -------------------------------------------------------------------
 
     def _stop(self) -> None:
-        """Apply a bus watchdog stop: hold the present position with torque still on."""
+        """Apply a bus watchdog stop: hold the current position with torque still on."""
         table = self.table
         if self.mode == reg.CURRENT_MODE:
             table.set(reg.GOAL_CURRENT, 0)
@@ -396,7 +398,7 @@ class BusRecorder:
     """
 
     def __init__(self, t: float) -> None:
-        self._goals: dict[int, tuple[int, int]] = {}  # register → minimum and maximum counts
+        self._goals: dict[int, tuple[int, int]] = {}  # minimum and maximum counts of each register
         self._refused = 0
         self._torque_on = 0  # number of torque-on events
         self._torque_t: float | None = None
@@ -408,7 +410,7 @@ class BusRecorder:
         self._fired_t: float | None = None
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
-        """Record a write, except for goals near the present angle while torque is off."""
+        """Record a write, except for goals near the current angle while torque is off."""
         goals = _WATCHED_REGISTERS & values.keys()
         self._refused += refused and bool(goals)
         for address in goals:
@@ -419,7 +421,7 @@ class BusRecorder:
             self._goals[address] = min(least, value), max(greatest, value)
 
     def torque_on(self, t: float, joint: ServoJoint, mode: int, position: int) -> None:
-        """Record torque on at time t with the goal ``position`` [counts]."""
+        """Record that torque is on at time t, with the goal ``position`` [counts]."""
         self._torque_on += 1
         self._torque_t = self._last = t
         if mode in POSITION_MODES:
@@ -460,5 +462,5 @@ class BusRecorder:
 
 
 def _away(joint: ServoJoint, position: int) -> float:
-    """Return the distance between a goal and the present joint angle [rad]."""
+    """Return the distance between a goal and the current joint angle [rad]."""
     return abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))

@@ -3,8 +3,8 @@
 Input and output are bytes with times, so tests and fuzzers need no port;
 :mod:`simulation.emulator.pty_bus` adds the pseudo-terminal. In group reads, each servo replies
 after the previous one in the list, so servos after a missing servo stay silent. Control table
-backups, which are not used by any known client, return an instruction error. Servos that are set to
-Protocol 1.0 reply only to its ping.
+backups, which no known client uses, return an instruction error. Servos that are set to Protocol
+1.0 reply only to a Protocol 1.0 ping.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _ITEM = struct.Struct("<BHH")  # ID, address, length
 
 
 class TimedReply(NamedTuple):
-    """Bytes to send ``delay`` [s] after the wire is free; ``late`` delays only this reply."""
+    """Bytes to send ``delay`` [s] after the wire is free, plus ``late`` [s] for this reply only."""
 
     delay: float
     data: bytes
@@ -51,7 +51,7 @@ class TimedReply(NamedTuple):
 
 
 class ServoBus:
-    """Servos that share one wire and one plant. They do not reply to corrupted packets."""
+    """Servos that share one wire and one plant. The servos do not reply to corrupted packets."""
 
     def __init__(
         self,
@@ -64,10 +64,10 @@ class ServoBus:
         self.plant = plant
         self.faults = FaultSource(seed)
         self.parser = PacketParser()
-        self.lag = 0.0  # s by which a reading may be older than its reply
+        self.lag = 0.0  # s, maximum age of a reading when its reply is sent
         self.packets = 0  # number of packets received
         self._now = -math.inf
-        self._due = -math.inf  # time before which no servo has an event
+        self._due = -math.inf  # time of the next servo event, or an earlier time
 
     @classmethod
     def from_settings(
@@ -80,7 +80,7 @@ class ServoBus:
         factory: bool = False,
         t: float = 0.0,
     ) -> ServoBus:
-        """Create the servos in the settings, one per joint, left first.
+        """Create the configured servos, one per joint, left finger first.
 
         ``baud`` > 0 and ``ids`` replace the baud rate and the IDs in the settings. If ``factory``
         is True, all other registers have their factory defaults. Raises ValueError if the model
@@ -127,7 +127,7 @@ class ServoBus:
         self._now = t
 
     def next_event(self) -> float:
-        """Return the time of the next servo event [s], which may be early but never late."""
+        """Return the time of the next servo event [s], or an earlier time."""
         return self._due
 
     # --- bytes -----------------------------------------------------------------------------
@@ -173,7 +173,7 @@ class ServoBus:
         ]
 
     def fault(self, kind: str, value: float, t: float) -> None:
-        """Start a fault; ``value`` is a probability for LINE_FAULTS, an ID for SERVO_FAULTS."""
+        """Start a fault; ``value`` is a probability for LINE_FAULTS and an ID for SERVO_FAULTS."""
         self._due = -math.inf
         if kind in LINE_FAULTS:
             setattr(self.faults.rates, kind.replace("-", "_"), value)
@@ -189,7 +189,7 @@ class ServoBus:
                 self.fault(kind, servo.id, t)
 
     def report(self, t: float) -> list[dict[str, Any]]:
-        """Return each servo's state and record."""
+        """Return each servo's state and bus record."""
         self.advance(t)
         return [servo.report(t) for servo in self.servos]
 
@@ -205,18 +205,19 @@ class ServoBus:
         if packet.id == BROADCAST:
             return self._broadcast(packet, servos, t)
         if instruction == framing.STATUS:
-            return []  # reply of another servo, or an echo
+            return []  # the reply of another servo, or an echo
         # Status return level: 0 replies only to pings, 1 also to reads, 2 to all instructions.
         needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)
         replies = []
         for servo in servos:
             if servo.id == packet.id:
-                # The reply uses the level, delay and ID from before the instruction.
+                # The reply uses the return level, delay and ID that were set before the
+                # instruction.
                 level = servo.table.get(reg.STATUS_RETURN_LEVEL)
                 delay, name = servo.return_delay, servo.id
                 error, data = _execute(servo, instruction, packet.parameters, t)
                 if level >= needed:
-                    # The reply uses the alert bit from after the instruction.
+                    # The reply uses the alert bit as it is after the instruction.
                     status = framing.status(name, error | servo.alert, data)
                     replies.append(TimedReply(delay, status))
             elif servo.shadow == packet.id:
@@ -361,10 +362,10 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
 
 
 def _at_once(replies: list[TimedReply]) -> list[TimedReply]:
-    """Merge the replies of servos with the same ID into one corrupted reply; 0 bits win.
+    """Merge the replies of servos with the same ID into one corrupted reply; 0 bits dominate.
 
-    Servos never start at exactly the same time, so even identical replies collide. Here, each reply
-    begins one byte after the previous one.
+    Servos never start at exactly the same time, so even identical replies collide. In this model,
+    each reply begins one byte after the previous one.
     """
     if len(replies) < 2:
         return replies

@@ -3,7 +3,7 @@
 `ServoJoint` converts counts to angles (turns, homing offset, drive direction), follows the profile,
 drives the plant according to the operating mode, and writes the present values to the control
 table. `ServoHealth` models heat (`ServoHeat`), supply voltage and overload. The manuals do not
-specify the time to overload; here, it is OVERLOAD_TIME of current at the configured limit.
+specify the time to overload; in this model, it is OVERLOAD_TIME of current at the configured limit.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
 STEP_TIME = 0.001  # s, time step for trajectories and velocity mode
-OVERLOAD_TIME = 2.0  # s at the current limit until overload
-SENSE_INTERVAL = 0.010  # s between checks of heat, voltage and overload
+OVERLOAD_TIME = 2.0  # s, time at the current limit until an overload error
+SENSE_INTERVAL = 0.010  # s, interval between checks of heat, voltage and overload
 _VOLTAGE = 0  # bit in the hardware error status
 POSITION_MODES = (
     reg.POSITION_MODE,
@@ -35,7 +35,7 @@ _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 
 
 class ServoJoint:
-    """Joint ``joint`` of ``plant``, driven by a servo with control table ``table``."""
+    """Joint number ``joint`` of ``plant``, driven by a servo with the control table ``table``."""
 
     def __init__(
         self,
@@ -55,12 +55,12 @@ class ServoJoint:
         self.stuck: int | None = None  # reading of a stuck encoder [counts]
         self.shift = 0  # encoder zero error [counts]
         self._turns = 0  # full turns subtracted from the position
-        self._load = scale.direction / model.stall_current  # load per ampere, with servo sign
+        self._load = scale.direction / model.stall_current  # load per ampere, with the servo's sign
         self._speed = scale.direction * reg.VELOCITY_UNIT / scale.velocity / model.no_load_speed
 
     @property
     def sign(self) -> int:
-        """-1 in reverse drive mode."""
+        """Sign of the servo's counts: -1 in reverse drive mode, otherwise 1."""
         return -1 if self._memory[reg.DRIVE_MODE] & 1 else 1
 
     @property
@@ -90,7 +90,7 @@ class ServoJoint:
         return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
 
     def position(self) -> int:
-        """Return the present position in counts, as in register 132."""
+        """Return the current position in counts, as in register 132."""
         within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
         return self.sign * within + self._table.get(reg.HOMING_OFFSET)
 
@@ -100,13 +100,13 @@ class ServoJoint:
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_current(self, counts: int) -> float:
-        """Return a goal current [A], positive when closing; the sign of a limit has no meaning."""
+        """Return a goal current [A], positive when closing; ignore the sign of a current limit."""
         return self._scale.amperes(self.sign * counts)
 
     # --- trajectory --------------------------------------------------------------------------
 
     def hold(self) -> None:
-        """End the trajectory at the present position."""
+        """End the trajectory at the current position."""
         self.profile.hold(self.position())
 
     def aim(self) -> None:
@@ -213,12 +213,12 @@ ROOM_TEMPERATURE = 25.0  # °C
 _THERMOMETER_LAG = 4.0  # s
 _CONVECTION = 0.006  # 1/K, relative increase in cooling with temperature difference
 _STEP_MAX = 1.0  # s, maximum step
-# counts; without this tolerance, square root rounding would prevent arrival.
+# counts; without this tolerance, rounding of the square root would prevent arrival.
 _ARRIVAL_TOLERANCE = 1e-6
 
 
 class Profile:
-    """Velocity- or time-based trajectory to a goal, with its position and velocity.
+    """Velocity-based or time-based trajectory to a goal, with its current position and velocity.
 
     A limit of 0 means no limit.
     """
@@ -247,7 +247,7 @@ class Profile:
             self.hold(target)
 
     def aim_in(self, target: float, duration: float, ramp: float) -> None:
-        """Set a target to reach in ``duration`` [s] with ramps of ``ramp`` [s] (time-based)."""
+        """Set a target to reach in ``duration`` [s], with ramps of ``ramp`` [s] (time-based)."""
         if duration <= 0.0:
             self.hold(target)
             return
@@ -304,7 +304,7 @@ class ServoHeat:
 
     @classmethod
     def of(cls, settings: Settings) -> Self:
-        """Create the thermal model for the servo in the settings, at ambient temperature."""
+        """Create the thermal model for the configured servo, at ambient temperature."""
         simulation = settings.simulation
         heat = cls(by_name(settings.servos.model), *simulation.servo_heat)
         heat.ambient = simulation.ambient
@@ -348,13 +348,13 @@ class ServoHealth:
         self.recover()
 
     def recover(self) -> None:
-        """Cool the motor and restore the supply."""
+        """Cool the motor to ambient temperature and restore the supply voltage."""
         self.heat.cool()
         self.supply = self._model.supply
 
     @property
     def voltage(self) -> float:
-        """Supply voltage minus the voltage drop due to the servo current [V]."""
+        """No-load supply voltage minus the voltage drop caused by the servo current [V]."""
         return self.supply - reg.SAG * self._current
 
     def restart(self) -> None:

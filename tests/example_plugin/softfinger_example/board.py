@@ -1,4 +1,4 @@
-"""Tactile board whose cells all show the same alternating count."""
+"""Tactile board whose cells all report the same alternating count."""
 
 import numpy as np
 from pydantic import Field
@@ -16,7 +16,7 @@ class PulseSettings(Section):
 
 
 class PulsingBoard:
-    """Board that generates a frame every 1/rate s, on demand."""
+    """Board that generates frames on demand, one every 1/rate s."""
 
     Settings = PulseSettings
 
@@ -30,12 +30,12 @@ class PulsingBoard:
         self._frame: Frame | None = None
 
     def open(self) -> None:
-        """Start with a frame of zeros."""
+        """Start with an all-zero frame."""
         self._start = self._clock.now()
         self._frame = Frame(1, self._start, self._start, True, np.zeros(self._shape, np.uint16))
 
     def latest(self) -> Frame | None:
-        """Return the latest due frame."""
+        """Return the most recent frame that is due."""
         frame = self._frame
         if frame is not None:
             number = 1 + int((self._clock.now() - self._start) / self._period)
@@ -50,5 +50,5 @@ class PulsingBoard:
         return {"frames": 0 if self._frame is None else self._frame.seq}
 
     def close(self) -> None:
-        """Deliver no further frames."""
+        """Stop delivering frames."""
         self._frame = None

@@ -6,7 +6,7 @@ from softfinger.daemon.types import Goal, Reading
 
 
 class FollowingServos:
-    """Servos without bus and motor: the last goal is the measured position."""
+    """Servos without a bus or motors; the measured position is the last goal."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._clock = clock
@@ -14,7 +14,7 @@ class FollowingServos:
         self._on = False
 
     def connect(self) -> None:
-        """Do nothing, as there is no bus."""
+        """Do nothing, because there is no bus."""
 
     def read(self, reading: Reading) -> None:
         """Return the current angles, with zero velocity."""
@@ -43,5 +43,5 @@ class FollowingServos:
         return {}
 
     def close(self) -> None:
-        """Do nothing, as nothing is open."""
+        """Do nothing, because there is no port to close."""
         self._on = False
