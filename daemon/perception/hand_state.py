@@ -9,7 +9,8 @@ D_BIAS          m      d bias in frames, e.g. from a zero offset    sensor warm-
 ANGLE_BIAS      rad    angle bias in frames                         image shift
 MODULUS         –      ln of tip modulus relative to the settings   (constant in a grip)
 GAIN            –      ln of sensor gain                            temperature
-TORQUE          –      relative error of the torque constant        (constant in a grip)
+TORQUE          –      torque constant in the settings over the     (constant in a grip)
+                       true one, minus 1
 ANGLE, TAPER    rad    angle and taper of the object faces          rolling
 LATENCY         s      frame age beyond `tactile.latency`           (constant in a grip)
 FRICTION        N·m    mean joint torque not explained by the       slow drift
@@ -44,13 +45,13 @@ HISTORY_TIME = 0.5  # s of stored joint motion; older frames are treated as this
 CURRENT_OFF_TIME_MAX = 0.1  # s, maximum time for which a current may differ from its goal
 LAW_POINTS = 17  # nodes in d from 0 to the radius
 
-GATE = 3.0  # standard deviations at which an innovation is clipped
+GATE = 3.0  # standard deviations beyond which the effect of an innovation is reduced
 OUTLIER_GATE = 5.0  # standard deviations beyond which a deviation is a fault
 MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
 MODEL_ERROR_TIME = 0.1  # s, correlation time of these errors
 TORQUE_NOISE = 0.05  # N·m, of a moving joint: its friction changes with place and time
 
-# Random walks during a grip, per √s. docs/estimation.md gives the sources.
+# Random walks during a grip, per √s
 _WALK_CLOSING = 2e-5  # m, for d1 + d2; small because the object width is constant
 _WALK_SIDEWAYS = 3e-4  # m, for d1 − d2; the object can move between the tips
 _WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # m, for d1 − d2 if frames do not measure d independently
@@ -163,9 +164,10 @@ def predicted_variance(h: HandFilter) -> float:
 def correct(h: HandFilter, channel: int, innovation: float, variance: float, gate: float) -> None:
     """Update the state with one scalar measurement, using `slopes`, then set the slopes to 0.
 
-    ``variance`` is the noise variance. The innovation is clipped at ``gate`` standard deviations
-    (Huber) and ignored if it is not finite. `grasp.nis` averages the normalised innovation squared
-    of each ``channel``.
+    ``variance`` is the noise variance. It is increased if the innovation exceeds ``gate`` standard
+    deviations, so that the innovation equals ``gate`` standard deviations. An innovation that is
+    not finite is ignored. `grasp.nis` averages the normalised innovation squared of each
+    ``channel``, limited to ``gate`` squared.
     """
     expected = predicted_variance(h)
     square = innovation * innovation
