@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from softfinger.daemon.control.grip_kernels import ROTATION_MIN
 from softfinger.daemon.control.setpoint import Setpoint, SetpointState
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
@@ -55,7 +56,7 @@ class Fingers:
         """
         settings, present_angle = self._settings, self.pose.angle
         rotation = self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1]
-        joint_ratio = 1.0 / max(rotation, 0.1)
+        joint_ratio = 1.0 / max(rotation, ROTATION_MIN)
         low, high = -math.inf, math.inf
         for index, sense in ((0, 1.0), (1, -1.0)):
             contact, q = self._contacts[index], self.reading.q[index]

@@ -29,7 +29,7 @@ import math
 from softfinger.daemon.control import grip_kernels as kernels
 from softfinger.daemon.control.grip_kernels import GripState
 from softfinger.daemon.control.setpoint import Setpoint
-from softfinger.daemon.control.slip_monitor import set_law
+from softfinger.daemon.control.slip_monitor import configure
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import ObjectPose, Reading
@@ -49,12 +49,9 @@ class Grip:
         self.force = Setpoint(dt, control.smooth_time, state.force)  # mean tip force [N]
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # object angle [rad]
         self.slip = state.slip
-        self.commanded = 0.0  # commanded force [N]
         self.commanded_max = math.inf  # set by `limit_force` [N]
-        self.target = 0.0  # commanded force, increased if necessary to prevent slip [N]
-        self.has_slipped = False  # the object has rotated in the grip on this tick
         self.target_angle = math.nan  # target object angle [rad], NaN if not steered
-        set_law(state.slip.law, settings)
+        configure(state.slip, settings)
         law = state.law
         law.dt = dt
         law.force_gain = control.force_gain
@@ -75,6 +72,21 @@ class Grip:
         law.dither_torque, law.dither_time = control.dither_torque, control.dither_time
         law.dither_rate = 2.0 * math.pi * control.dither_frequency
         state.joint_stiffness = control.joint_stiffness
+
+    @property
+    def commanded(self) -> float:
+        """Commanded force [N]."""
+        return self._state.commanded
+
+    @property
+    def target(self) -> float:
+        """Commanded force, increased if necessary to prevent slip [N]."""
+        return self.force.target
+
+    @property
+    def has_slipped(self) -> bool:
+        """True if the object has rotated in the grip on this tick."""
+        return self.slip.has_turned
 
     @property
     def is_blind(self) -> bool:
@@ -115,10 +127,10 @@ class Grip:
         force = min(force, self.commanded_max)
         if force < self.commanded:
             self.slip.needed_force *= force / self.commanded
-        self.commanded = self._state.commanded = force
+        self._state.commanded = force
         self._state.dither_elapsed = 0.0
         needed_force = min(self.slip.needed_force, self.slip.force_limit)
-        self.target = self.force.target = max(force, needed_force)
+        self.force.target = max(force, needed_force)
         change_min = max(0.1 * force, 0.5 * self._control.grip_raise_max)
         change = max(abs(force - self.force.value), change_min)
         self._state.force_rate = change / self._control.force_time
@@ -135,8 +147,7 @@ class Grip:
         load = self.slip.assumed_load
         if not law.has_shear and law.object_load == 0.0:  # friction may hide this load
             load = max(load, law.joint_friction / max(grasp.load_arm, 0.5 * law.width))
-        spare = law.friction * (1.0 - law.margin) - grasp.shear
-        return max(load / max(spare, 0.3 * law.friction), self.slip.needed_force)
+        return max(load / self.slip.usable_friction, self.slip.needed_force)
 
     def steer(self, present: float, angle: float) -> None:
         """Rotate the object from its ``present`` angle to ``angle`` [rad] and hold it there."""
@@ -165,7 +176,7 @@ class Grip:
         if self._single_finger is not None:
             return self._single_torque(reading, False)
         dq1, dq2 = reading.dq
-        torque1, torque2, self.target, self.has_slipped = kernels.grip_torques(
+        return kernels.grip_torques(
             self._state.array,
             self._grasp.array,
             self.force.windows,
@@ -174,7 +185,6 @@ class Grip:
             (dq1, dq2),
             holding,
         )
-        return torque1, torque2
 
     def hold_goal(self, reading: Reading) -> tuple[float, float]:
         """Return joint torques [N·m] while frames are late: hold the force and end any rotation.

@@ -15,6 +15,7 @@ from softfinger.daemon.control import setpoint, slip_monitor
 from softfinger.daemon.control.setpoint import SetpointState
 from softfinger.daemon.control.slip_monitor import SlipState, mean
 from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.hand_state import GATE
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
 from softfinger.kinematics.hand.upright import upright_spring
@@ -22,14 +23,12 @@ from softfinger.kinematics.hand.upright import upright_spring
 FloatArray = NDArray[np.float64]
 
 _TORQUE_ERROR_SIGMA = 2.0  # torque-constant standard deviations included in the force limit
-_ARM_MIN = 0.1  # fraction of the finger length
 _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # Hz, integral control of the tip force difference
 _DISTRIBUTE_ANGLE = 3e-3  # rad, maximum object rotation due to this control
-_DEAD_BAND = 3.0  # angle standard deviations, dead band at standstill
 _DITHER_STEP_MAX = 0.05  # s, maximum dither time step after a delayed tick
 _STIFFNESS_MIN = 100.0  # N/m, lower bound because gains are divided by stiffness
-_ROTATION_MIN = 0.1  # minimum object rotation per antisymmetric joint angle
+ROTATION_MIN = 0.1  # minimum object rotation per antisymmetric joint angle
 
 
 class GripLaw(Record):
@@ -112,8 +111,8 @@ def grip_torques(
     angle: float,
     dq: tuple[float, float],
     holding: bool,
-) -> tuple[float, float, float, bool]:
-    """Return both joint torques [N·m], the target force [N], and True if the object slipped.
+) -> tuple[float, float]:
+    """Return both joint torques [N·m].
 
     ``angle`` is the object angle [rad] (NaN if unknown) and ``dq`` are the joint velocities
     [rad/s]. ``holding`` is True in a settled grip, where only loads move the joints.
@@ -137,8 +136,7 @@ def grip_torques(
     load = grasp.load_arm * g.slip.load
     g.grip_force = min(grip_force, _force_limit(g, load, mean(grasp.moment_arm)))
     if g.law.is_blind and not g.is_steering:
-        torque1, torque2 = _equal_torques(g, grasp, target, dq)
-        return torque1, torque2, g.force.target, g.slip.has_turned
+        return _equal_torques(g, grasp, target, dq)
     offset_rate = 0.0
     if g.is_steering:
         offset_rate = _steer(g, angle_windows, grasp, angle)
@@ -147,8 +145,7 @@ def grip_torques(
         _distribute(g, grasp)
     closing_rate = _closing_rate(grasp, g.force.speed, offset_rate)
     g.closing_friction = min(max(closing_rate / g.law.friction_speed, -1.0), 1.0)
-    torque1, torque2 = _torques(g, grasp, closing_rate, offset_rate, dq)
-    return torque1, torque2, g.force.target, g.slip.has_turned
+    return _torques(g, grasp, closing_rate, offset_rate, dq)
 
 
 @kernel
@@ -208,7 +205,7 @@ def _mean_stiffness(grasp: GraspState) -> float:
 def _rotation_per_offset(grasp: GraspState) -> float:
     """Return the derivative of the object angle with respect to the antisymmetric joint angle."""
     rotation_per_offset: float = grasp.jacobian_rotation[0] + grasp.jacobian_rotation[1]
-    return max(rotation_per_offset, _ROTATION_MIN)
+    return max(rotation_per_offset, ROTATION_MIN)
 
 
 @inner_kernel
@@ -233,7 +230,7 @@ def _force_limit(g: GripState, load: float, arm: float) -> float:
     """
     law = g.law
     force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * law.torque_error)
-    return force + (law.friction + load) / max(arm, _ARM_MIN * law.length)
+    return force + (law.friction + load) / max(arm, g.slip.law.arm_min)
 
 
 @inner_kernel
@@ -245,7 +242,7 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
     if not math.isnan(angle):
         error = target - angle
         if setpoint.has_arrived(g.angle):  # With the dead band, joints at rest do not follow noise.
-            noise = _DEAD_BAND * grasp.angle_std
+            noise = GATE * grasp.angle_std
             error -= min(max(error, -noise), noise)
         g.offset += g.law.rotate_bandwidth * error / rotation * g.law.dt
     g.offset += offset_rate * g.law.dt

@@ -27,7 +27,7 @@ cannot show a load above its friction, so the size of a sudden load is unknown. 
 torques jump in the same direction; in a twist, they jump in opposite directions. A sideways push
 looks like a twist.
 
-A force increase is held for _HOLD_TIME and then decreases by increase_max per _DECAY_TIME.
+A force increase is held for _SETTLING_TIME and then decreases by increase_max per _DECAY_TIME.
 
 Limits of the method:
 
@@ -46,14 +46,14 @@ import math
 
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import GRIP_FRACTION
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
 _AVERAGE_TIME = 0.1  # s; velocities fluctuate by one unit of 0.024 rad/s
-_SETTLING_TIME = 1.0  # s, settling time of the residual in a new hold
-_HOLD_TIME = 1.0  # s, duration of an increase after its cause has ended
+_SETTLING_TIME = 1.0  # s, settling time of the residual, for which an increase is also held
 _DECAY_TIME = 2.0  # s for a decrease by `grip_raise_max`; decay time of rotations
 _SUDDEN_SHARE = 0.7  # fraction of the usable friction force above which a sudden load counts
 _ROTATION_INCREASE = 0.5  # relative increase after an object rotation
@@ -61,13 +61,11 @@ _ROTATION_MARGIN = 1.5  # multiple of the rotation due to shear deformation
 _GATE = 4.0  # standard deviations beyond which a jump is not noise
 _JUMP_MIN = 0.01  # N·m, minimum torque jump
 _SHEAR_JUMP = 0.6  # N, minimum shear jump of solid tips: six standard deviations
-_YIELD_SPEED = 0.01  # rad/s, half a velocity unit
-_STANDSTILL = 1e-3  # rad from a stationary joint's average over _SETTLING_TIME, below one count
 _AGREEMENT = 0.25  # fraction of the mean that each joint and each tip must show
 _FRICTION_MAX = 0.3  # N·m; a larger torque during free approach is not friction
 _UNCONFIRMED_SHARE = 0.3  # fraction of the commanded force
 _RELAXATION_SHARE = 0.2  # fraction of the tip force that rubber may lose during a hold
-_ARM_MIN = 0.2  # fraction of the object width, minimum lever arm of the load
+ARM_MIN = 0.1  # fraction of the finger length, minimum moment arm
 _SPARE_MIN = 0.3  # minimum fraction of the friction that remains after rolling
 
 
@@ -76,6 +74,9 @@ class SlipLaw(Record):
 
     dt: float  # [s]
     width: float  # object width [m]
+    arm_min: float  # minimum moment arm [m]
+    yield_speed: float  # minimum speed change of a yielding joint [rad/s]
+    standstill: float  # maximum deviation of a stationary joint from its average [rad]
     force_max: float  # [N]
     friction: float  # Coulomb coefficient between tip and object
     margin: float  # fraction of friction that stays unused
@@ -106,20 +107,24 @@ class SlipState(Record):
     is_confirmed: bool  # the load may increase the force by more than _UNCONFIRMED_SHARE
     pull: float  # average pull measured by solid tips [N]
     twist: float  # average twist measured by solid tips [N]
+    usable_friction: float  # Coulomb coefficient less slip margin and rolling
     rotation_seen: Pair  # `unexplained_rotation` at the previous update [rad]
     rotation: Pair  # unexplained rotation per tip over the last _DECAY_TIME [rad]
     has_turned: bool  # the object has rotated in the grip on this tick
     reflex_triggered: bool  # sudden event on this tick
-    needed_force: float  # required force, held for _HOLD_TIME [N]
+    needed_force: float  # required force, held for _SETTLING_TIME [N]
     force_limit: float  # [N]
     idle_time: float  # time since the force was last required [s]
 
 
-def set_law(law: SlipLaw, settings: Settings) -> None:
-    """Fill ``law`` from the settings."""
-    control = settings.control
+def configure(s: SlipState, settings: Settings) -> None:
+    """Fill the constants from the settings."""
+    law, control = s.law, settings.control
     law.dt = 1.0 / settings.loop.rate
     law.width = settings.object.width
+    law.arm_min = ARM_MIN * settings.hand.finger_length
+    law.yield_speed = 0.5 * VELOCITY_UNIT / settings.servos.gear_ratio
+    law.standstill = 2.0 * math.pi / (COUNTS_PER_TURN * settings.servos.gear_ratio)
     law.force_max = GRIP_FRACTION * settings.safety.force_max
     law.friction, law.margin = control.tip_friction, control.slip_margin
     law.joint_friction = control.joint_friction
@@ -127,6 +132,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
     law.object_load = control.object_load
     law.has_shear = settings.tip.physics == "solid"
     law.increase_max, law.increase_ratio = control.grip_raise_max, control.grip_raise_share
+    s.usable_friction = max(1.0 - law.margin, _SPARE_MIN) * law.friction
 
 
 @inner_kernel
@@ -190,7 +196,7 @@ def update(
     is_held = holding and s.is_watched and grasp.load_arm > 0.0
     # Rolling uses part of the friction that grows with the grip force.
     spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
-    usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
+    s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
     sudden_min = _SUDDEN_SHARE * max(spare_friction, 0.0) * mean(grasp.normal)
     sudden = _detect_torque_jump(s, grasp, closing, dq, is_held, sudden_min)
     pull = max(abs(grasp.pull_shear) - grasp.shear * mean(grasp.normal), 0.0)
@@ -212,8 +218,8 @@ def update(
     s.assumed_load = max(s.load, pull, 0.5 * law.object_load)
     s.reflex_triggered = s.has_turned or sudden
     s.is_confirmed = s.is_confirmed or s.reflex_triggered
-    s.force_limit = _force_limit(s, commanded, 0.5 * law.object_load / usable_friction)
-    needed_force = s.assumed_load / usable_friction
+    s.force_limit = _force_limit(s, commanded, 0.5 * law.object_load / s.usable_friction)
+    needed_force = s.assumed_load / s.usable_friction
     if s.has_turned:
         turned_force = (1.0 + _ROTATION_INCREASE) * max(commanded, s.needed_force)
         needed_force = max(needed_force, turned_force)
@@ -225,13 +231,13 @@ def update(
 
 @inner_kernel
 def _update_needed_force(s: SlipState, needed_force: float, commanded: float) -> None:
-    """Hold a force increase for _HOLD_TIME, then let it decay."""
+    """Hold a force increase for _SETTLING_TIME, then let it decay."""
     if needed_force >= s.needed_force:
         s.needed_force = min(needed_force, s.force_limit)
         s.idle_time = 0.0
         return
     s.idle_time += s.law.dt
-    if s.idle_time > _HOLD_TIME:
+    if s.idle_time > _SETTLING_TIME:
         decrease = s.law.increase_max / _DECAY_TIME * s.law.dt
         s.needed_force = max(s.needed_force - decrease, needed_force)
         s.is_confirmed = s.is_confirmed and s.needed_force > commanded
@@ -260,7 +266,7 @@ def _detect_torque_jump(
     known_torque = closing * (s.friction if closing < 0.0 else s.law.joint_friction)
     deviation1 = grasp.torque_residual[0] - known_torque - s.residual[0]
     deviation2 = grasp.torque_residual[1] - known_torque - s.residual[1]
-    jump_min = _JUMP_MIN + s.friction * max(1.0 - s.holding_time / _SETTLING_TIME, 0.0)
+    jump_min = _JUMP_MIN + s.friction * (1.0 - s.holding_time / _SETTLING_TIME)
     sudden = False
     for k in range(2):  # pull, then twist
         sense = 1.0 - 2.0 * k
@@ -269,14 +275,15 @@ def _detect_torque_jump(
         last -= s.offset if k == 0 else clip(last, s.friction)
         agreement = min(deviation1 * deviation, sense * deviation2 * deviation)
         agrees = agreement > _AGREEMENT * deviation * deviation
-        yield1 = math.copysign(s.speed[0] - dq[0], deviation * (s.speed[0] - dq[0]))
-        yield2 = math.copysign(s.speed[1] - dq[1], sense * deviation * (s.speed[1] - dq[1]))
+        sign = math.copysign(1.0, deviation)
+        yield1 = sign * (s.speed[0] - dq[0])
+        yield2 = sense * sign * (s.speed[1] - dq[1])
         jumps = abs(deviation) > _GATE * math.sqrt(s.variance[k]) + jump_min
         grows = abs(last + deviation) > abs(last)
-        if is_held and agrees and jumps and grows and min(yield1, yield2) > _YIELD_SPEED:
+        if is_held and agrees and jumps and grows and min(yield1, yield2) > s.law.yield_speed:
             curvature = grasp.load_curvature if k == 0 else 0.0
             load, slope = load_of(last + deviation, grasp.load_arm, curvature)
-            hidden = s.friction / max(slope, _ARM_MIN * s.law.width)
+            hidden = s.friction / max(slope, s.law.arm_min)
             sudden = sudden or abs(load) + 0.5 * hidden > sudden_min
     weight = 1.0 if sudden else s.law.dt / _AVERAGE_TIME
     if not sudden:
@@ -316,7 +323,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     is_standing = True
     for k in range(2):
         s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING_TIME
-        is_standing = is_standing and abs(grasp.q[k] - s.q[k]) < _STANDSTILL
+        is_standing = is_standing and abs(grasp.q[k] - s.q[k]) < law.standstill
     if is_standing:
         s.offset += torque_change
     relaxation = _RELAXATION_SHARE * mean(grasp.normal) * mean(grasp.moment_arm)
@@ -333,9 +340,10 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
-    certain_load = load - (0.5 + max(1.0 - s.holding_time / _SETTLING_TIME, 0.0)) * hidden
-    hidden = s.friction / max(slope, _ARM_MIN * law.width)
-    s.load = min(max(4.0 * certain_load, 0.0), load + hidden, law.friction * s.force_limit)
+    # From half the hidden load to the hidden load, the estimate rises from 0 to |L| + hidden.
+    threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
+    hidden = s.friction / max(slope, law.arm_min)
+    s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)
 
 
 @inner_kernel

@@ -31,19 +31,24 @@ from softfinger.daemon.perception.hand_state import (
     FOOTPRINT,
     FRICTION,
     GAIN,
+    GATE,
     LATENCY,
     MODULUS,
+    OUTLIER_GATE,
     STATES,
     TAPER,
     TORQUE,
+    TORQUE_NOISE,
     D,
     HandFilter,
     HistoryRow,
     correct,
     interpolate,
+    is_held,
     predicted_variance,
     reset,
     reset_all,
+    walk_pair,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
@@ -52,17 +57,12 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
 
-GATE = 3.0  # standard deviations at which an innovation is clipped
 D_MIN = 1e-5  # m, minimum displacement of a tip in contact
-# A frame is an outlier if it exceeds _OUTLIER_GATE standard deviations and one of these limits.
+# A frame is an outlier if it exceeds OUTLIER_GATE standard deviations and one of these limits.
 ANGLE_JUMP = 0.12  # rad; correct frames deviate from the prediction by at most 0.04
 D_JUMP = 1e-3  # m
 REJECTED_MAX = 2  # consecutive rejected frames that are tolerated before a sensor fault
-_OUTLIER_GATE = 5.0
 _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must also show to confirm it
-_SPEED_SUPPORT = 0.1  # rad/s, joint speed that confirms a jump
-_CONTINUED_ROTATION = 0.06  # rad per frame, minimum step of a continuing rotation
-_RESTART_COUNT = 50  # consecutive rejected frames after which frames are accepted again
 _NORMAL_FORCE_MIN = 1.0  # N per tip; below this, an object may rock between the tips
 _RATE_INTERVAL_MIN = 0.005  # s, minimum interval for the rates of d and θ
 # A footprint that grows during the response time of the cells looks wider and flatter. These are
@@ -70,10 +70,7 @@ _RATE_INTERVAL_MIN = 0.005  # s, minimum interval for the rates of d and θ
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
 _SLOPE_SMOOTHING = 0.9  # low-pass coefficient per frame for ∂ ln F/∂d
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
-_AMPLITUDE_RANGE = 1e-3, 1e3  # bounds of the measured amplitude relative to the model
 _FIRST_D_ERROR = 0.5  # relative standard deviation of d at first contact
-_FIRST_ANGLE_ERROR = 1.0  # rad, standard deviation of the first angle
-_LOAD_STD = 0.05  # N·m, standard deviation due to a load on the object before it is gripped
 
 
 class FrameContact(NamedTuple):
@@ -157,15 +154,12 @@ def _set_angle_slopes(h: HandFilter, finger: int, sense: float, theta_rate: floa
 
 
 @inner_kernel
-def _set_d_slopes(h: HandFilter, finger: int, slope: float, d_rate: float) -> None:
+def _set_d_slopes(
+    h: HandFilter, finger: int, slope: float, bias_slope: float, d_rate: float
+) -> None:
     h.slopes[D + finger] = slope
+    h.slopes[D_BIAS + finger] = bias_slope
     h.slopes[LATENCY] = -slope * d_rate
-
-
-@inner_kernel
-def _set_footprint_slopes(h: HandFilter, finger: int, d_rate: float) -> None:
-    _set_d_slopes(h, finger, 1.0, d_rate)
-    h.slopes[D_BIAS + finger] = 1.0
 
 
 @kernel
@@ -226,19 +220,21 @@ def update(
     angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - rotation_since
     angle_innovation = face - (angle_at_scan + h.mean[ANGLE_BIAS + finger])
     d_innovation = d - (d_at_scan + h.mean[D_BIAS + finger])
-    is_held = tip.in_contact and other.in_contact and not cells_respond
-    if is_held and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN:
+    if (
+        is_held(h)
+        and not cells_respond
+        and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN
+    ):
         _set_angle_slopes(h, finger, sense, theta_rate)
-        angle_variance = predicted_variance(h) + theta_noise
+        angle_std = math.sqrt(predicted_variance(h) + theta_noise)
         h.slopes[:] = 0.0
-        _set_footprint_slopes(h, finger, d_rate)
-        d_variance = predicted_variance(h) + d_noise
+        _set_d_slopes(h, finger, 1.0, 1.0, d_rate)
+        d_std = math.sqrt(predicted_variance(h) + d_noise)
         h.slopes[:] = 0.0
-        speed = abs(tip.speed) + abs(other.speed)
+        # Two velocity units per joint
+        joints_move = abs(tip.speed) + abs(other.speed) > 4.0 * h.velocity_unit
         jump = d_innovation if is_fitted else 0.0
-        if _is_rejected(
-            h.grasp, finger, (angle_innovation, angle_variance), (jump, d_variance), speed
-        ):
+        if _is_rejected(h.grasp, finger, angle_innovation, angle_std, jump, d_std, joints_move):
             return False
     tip.tilt_y = found.tilt_y
     tip.gain_is_fixed = gain_is_fixed
@@ -257,25 +253,22 @@ def update(
         tip.log_slope = interpolate(stiffness / expected, tip.log_slope, smoothing)
         innovation = math.log(frame_force / (at_scan.relaxation * expected))
         innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
-        _set_d_slopes(h, finger, tip.log_slope, d_rate)
+        _set_d_slopes(h, finger, tip.log_slope, 0.0, d_rate)
         h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0
         _update_footprint(h, finger, innovation, d_noise * log_slope * log_slope)
     else:
-        _set_footprint_slopes(h, finger, d_rate)
+        _set_d_slopes(h, finger, 1.0, 1.0, d_rate)
         _update_footprint(h, finger, d_innovation, d_noise)
-    if is_fitted and not h.gain_is_known:
+    if is_fitted and not h.gain_is_known and gain > 0.0:
         # The errors of d and gain are correlated, and the footprint has already used the common
         # part.
         ratio = (covariance[0, 3] - systematic[0, 3]) / (d_noise * gain)
         gain_noise = (covariance[3, 3] - systematic[3, 3]) / (gain * gain)
         own_noise = max(gain_noise - ratio * ratio * d_noise, 0.0)
         d_residual = d - (h.mean[D + finger] - d_since + h.mean[D_BIAS + finger])
-        innovation = (
-            math.log(min(max(gain, _AMPLITUDE_RANGE[0]), _AMPLITUDE_RANGE[1])) - ratio * d_residual
-        )
+        innovation = math.log(gain) - ratio * d_residual
         innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
-        _set_d_slopes(h, finger, -ratio, d_rate)
-        h.slopes[D_BIAS + finger] = -ratio
+        _set_d_slopes(h, finger, -ratio, -ratio, d_rate)
         h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0
         variance = own_noise + _AMPLITUDE_ERROR * _AMPLITUDE_ERROR
         correct(h, AMPLITUDE + finger, innovation, variance, GATE)
@@ -297,22 +290,22 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
 
     If the other tip is not in contact, all states are reset.
     """
-    for state in (MODULUS, GAIN, TORQUE):
-        reset(h, state + finger, h.prior_mean[state + finger], h.prior_variance[state + finger])
-    reset(h, D_BIAS + finger, 0.0, 0.0)
-    reset(h, ANGLE_BIAS + finger, 0.0, 0.0)
+    for pair in (MODULUS, GAIN, TORQUE, D_BIAS, ANGLE_BIAS):
+        state = pair + finger
+        reset(h, state, h.prior_mean[state], h.prior_variance[state])
     h.grasp.rejected_count[:] = 0.0
     h.tip[finger].d_innovation = 0.0
     if h.tip[1 - finger].in_contact:
         return
     reset_all(h)
-    reset(h, ANGLE, face - 0.5 * sense * h.mean[TAPER], _FIRST_ANGLE_ERROR**2)
+    reset(h, ANGLE, face - 0.5 * sense * h.mean[TAPER], h.prior_variance[ANGLE])
     for k in range(2):
         measured = h.grasp.free_torque[k]
         if measured > 0.0:
             h.mean[FRICTION] += 0.5 * (measured - h.prior_mean[FRICTION])
             h.covariance[FRICTION, FRICTION] *= 0.5
-    h.covariance[FRICTION, FRICTION] += _LOAD_STD * _LOAD_STD
+    # A load may already act on the object.
+    h.covariance[FRICTION, FRICTION] += TORQUE_NOISE * TORQUE_NOISE
 
 
 @inner_kernel
@@ -348,12 +341,7 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
     h.tip[finger].d_innovation = d_innovation
     if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
         if d_innovation * other < 0.0:
-            sideways_variance = min(d_innovation * d_innovation, other * other)
-            for i in range(2):
-                for j in range(2):
-                    h.covariance[D + i, D + j] += (
-                        sideways_variance if i == j else -sideways_variance
-                    )
+            walk_pair(h, D, 0.0, min(abs(d_innovation), abs(other)), 1.0)
         elif h.tip[finger].gain_is_fixed:
             h.covariance[GAIN + finger, GAIN + finger] += innovation * innovation
     correct(h, FOOTPRINT + finger, innovation, noise, GATE)
@@ -363,39 +351,33 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
 def _is_rejected(
     grasp: GraspState,
     finger: int,
-    angle: tuple[float, float],
-    d: tuple[float, float],
-    speed: float,
+    angle_innovation: float,
+    angle_std: float,
+    d_innovation: float,
+    d_std: float,
+    joints_move: bool,
 ) -> bool:
-    """Return True if the frame of a held object is an outlier.
+    """Return True if the frame of a held object is an outlier, and count such frames.
 
-    ``angle`` and ``d`` are (innovation, variance); ``speed`` is the sum of both joint speeds
-    [rad/s]. A jump is an outlier unless the other tip or the joints confirm it. A rotation is
-    accepted if both tips show it and either the joints move or the rotation continues. A
-    displacement is accepted if the joints move or both tips show it: a blow presses the object into
-    one tip and away from the other. The first frame of a real jump is also rejected, because the
-    other tip's frame has not arrived yet.
+    A jump is an outlier unless the other tip or the joints confirm it. A rotation is accepted if
+    both tips show it and either the joints move or the rotation continues. A displacement is
+    accepted if the joints move or both tips show it: a blow presses the object into one tip and
+    away from the other. The first frame of a real jump is also rejected, because the other tip's
+    frame has not arrived yet.
     """
-    angle_innovation, angle_variance = angle
-    d_innovation, d_variance = d
-    other = grasp.angle_innovation[1 - finger]
+    other = 1 - finger
     last = grasp.angle_innovation[finger]
     grasp.angle_innovation[finger] = angle_innovation
     grasp.d_innovation[finger] = d_innovation
-    has_turned = abs(angle_innovation) > max(ANGLE_JUMP, _OUTLIER_GATE * math.sqrt(angle_variance))
-    has_moved = abs(d_innovation) > max(D_JUMP, _OUTLIER_GATE * math.sqrt(d_variance))
-    if has_moved:
-        other_d = abs(grasp.d_innovation[1 - finger])
-        has_moved = speed < _SPEED_SUPPORT and other_d < _JUMP_SUPPORT * abs(d_innovation)
-    if has_turned:
-        was_rejected = grasp.rejected_count[finger] > 0.0
-        continues = was_rejected and abs(angle_innovation - last) > _CONTINUED_ROTATION
-        both_show_it = (
-            angle_innovation * other > _JUMP_SUPPORT * angle_innovation * angle_innovation
-        )
-        has_turned = not (both_show_it and (speed > _SPEED_SUPPORT or continues))
-    if grasp.rejected_count[finger] >= _RESTART_COUNT or not (has_turned or has_moved):
-        grasp.rejected_count[finger] = 0.0
-        return False
-    grasp.rejected_count[finger] += 1.0
-    return True
+    angle_jumps = abs(angle_innovation) > max(ANGLE_JUMP, OUTLIER_GATE * angle_std)
+    d_jumps = abs(d_innovation) > max(D_JUMP, OUTLIER_GATE * d_std)
+    agreement = angle_innovation * grasp.angle_innovation[other]
+    angle_agrees = agreement > _JUMP_SUPPORT * angle_innovation * angle_innovation
+    d_agrees = abs(grasp.d_innovation[other]) >= _JUMP_SUPPORT * abs(d_innovation)
+    was_rejected = grasp.rejected_count[finger] > 0.0
+    continues = was_rejected and abs(angle_innovation - last) > 0.5 * ANGLE_JUMP
+    is_rejected: bool = (angle_jumps and not (angle_agrees and (joints_move or continues))) or (
+        d_jumps and not (d_agrees or joints_move)
+    )
+    grasp.rejected_count[finger] = grasp.rejected_count[finger] + 1.0 if is_rejected else 0.0
+    return is_rejected

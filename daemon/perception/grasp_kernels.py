@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.perception.frame_channels import GATE, REJECTED_MAX
+from softfinger.daemon.perception.frame_channels import ANGLE_JUMP, REJECTED_MAX
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.hand_state import (
     ANGLE,
@@ -26,16 +26,22 @@ from softfinger.daemon.perception.hand_state import (
     D_BIAS,
     FRICTION,
     GAIN,
+    GATE,
     LAW_POINTS,
+    MODEL_ERROR,
+    MODEL_ERROR_TIME,
     MODULUS,
+    OUTLIER_GATE,
     TAPER,
     TORQUE,
+    TORQUE_NOISE,
     TORQUES,
     D,
     HandFilter,
     TrackedTip,
     correct,
     interpolate,
+    is_held,
     motion_of,
     predicted_variance,
 )
@@ -46,15 +52,11 @@ from softfinger.kinematics.hand.grasp_state import holding_moment_arms, load_tor
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_NOISE = 0.05  # N·m, noise of moving joints
-_CLOSING_MIN = 0.03  # rad/s, minimum closing speed at which friction opposes the motion
-_BALANCE_ERROR = 0.05  # relative error of the normal forces
 _SUPPORT_FRICTION = 0.4  # N, friction between object and table
-_BALANCE_TIME = 0.1  # s, correlation time of both errors
-# A bias is significant if it exceeds all of these limits.
-_BIAS_GATE = 5.0  # standard deviations
+# A bias is significant if it exceeds all of these limits and OUTLIER_GATE standard deviations.
 _BIAS_RATIO_MIN = 0.8  # fraction of the other sensor's bias, because a bias partly appears in both
-_D_BIAS_MIN, ANGLE_BIAS_MIN = 0.1, 0.06  # fraction of d; rad
+_D_BIAS_MIN = 0.1  # fraction of d
+ANGLE_BIAS_MIN = 0.5 * ANGLE_JUMP  # rad
 
 
 class TipResult(NamedTuple):
@@ -113,12 +115,12 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
     h.torque_max = max(h.torque_max, torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
-    if h.closing_speed > _CLOSING_MIN:
+    if h.closing_speed > h.velocity_unit:  # Friction opposes the motion.
         innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
         # After a decrease in torque, the gears may hold any part of the decrease.
         held_torque = min(h.torque_max - torque, h.load_held * torque)
-        variance = _TORQUE_NOISE * _TORQUE_NOISE + held_torque * held_torque
+        variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
         if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
             h.covariance[FRICTION, FRICTION] += innovation * innovation  # A load has been removed.
         correct(h, TORQUES, innovation, variance, GATE)
@@ -130,8 +132,8 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
             sense = 1.0 - 2.0 * k
             h.slopes[MODULUS + k] = sense
             h.slopes[D + k] = sense * _log_slope(h, k)
-        error = _BALANCE_ERROR + _SUPPORT_FRICTION / normal_min
-        variance = error * error * max(_BALANCE_TIME / (h.t - h.balance_time), 1.0)
+        error = MODEL_ERROR + _SUPPORT_FRICTION / normal_min
+        variance = error * error * max(MODEL_ERROR_TIME / (h.t - h.balance_time), 1.0)
         correct(h, BALANCE, math.log(normal[1] / normal[0]), variance, GATE)
     h.balance_time = h.t
 
@@ -235,7 +237,7 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     grasp.torque_residual[1] = modulus2 * residual2
     grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
     _write_shear(h)
-    if (left.has_new_frame or right.has_new_frame) and left.in_contact and right.in_contact:
+    if (left.has_new_frame or right.has_new_frame) and is_held(h) and not h.is_single:
         left.has_new_frame = right.has_new_frame = False
         if grasp.load_arm > 0.0 and dt > 0.0:
             _update_by_torques(h, dt)
@@ -284,12 +286,12 @@ def _has_bias(grasp: GraspState, finger: int) -> bool:
         return False
     in_d: bool = abs(grasp.d_bias[finger]) > max(
         _D_BIAS_MIN * grasp.d[finger],
-        _BIAS_GATE * grasp.d_bias_std[finger],
+        OUTLIER_GATE * grasp.d_bias_std[finger],
         _BIAS_RATIO_MIN * abs(grasp.d_bias[1 - finger]),
     )
     in_angle = abs(grasp.angle_bias[finger]) > max(
         ANGLE_BIAS_MIN,
-        _BIAS_GATE * grasp.angle_bias_std[finger],
+        OUTLIER_GATE * grasp.angle_bias_std[finger],
         _BIAS_RATIO_MIN * abs(grasp.angle_bias[1 - finger]),
     )
     return in_d or in_angle

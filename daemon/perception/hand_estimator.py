@@ -46,7 +46,6 @@ FloatArray = NDArray[np.float64]
 # Standard deviations of the settings.
 _TAPER_ERROR = 0.1  # rad, `object.taper`
 _LATENCY_ERROR = 0.03  # s, `tactile.latency`
-_FRICTION_ERROR = 0.05  # N·m, `control.joint_friction`
 _GOAL_DISTANCE = 0.25  # rad; a joint farther than this from its goal draws the full goal current
 
 
@@ -125,7 +124,7 @@ class HandEstimator:
             (states.ANGLE, 0.0, 1.0),
             (states.TAPER, settings.object.taper, _TAPER_ERROR),
             (states.LATENCY, 0.0, _LATENCY_ERROR),
-            (states.FRICTION, settings.control.joint_friction, _FRICTION_ERROR),
+            (states.FRICTION, settings.control.joint_friction, states.TORQUE_NOISE),
         ):
             state.prior_mean[at], state.prior_variance[at] = mean, error**2
         state.mean[:] = state.prior_mean
@@ -152,6 +151,7 @@ class HandEstimator:
             (dq1, dq2),
             (current1, current2),
             commanded,
+            goal is not None,
         )
 
     def update(

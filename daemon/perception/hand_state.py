@@ -9,7 +9,8 @@ D_BIAS          m      d bias in frames, e.g. from a zero offset    sensor warm-
 ANGLE_BIAS      rad    angle bias in frames                         image shift
 MODULUS         –      ln of tip modulus relative to the settings   (constant in a grip)
 GAIN            –      ln of sensor gain                            temperature
-TORQUE          –      relative error of the torque constant        (constant in a grip)
+TORQUE          –      torque constant in the settings over the     (constant in a grip)
+                       true one, minus 1
 ANGLE, TAPER    rad    angle and taper of the object faces          rolling
 LATENCY         s      frame age beyond `tactile.latency`           (constant in a grip)
 FRICTION        N·m    mean joint torque not explained by the       slow drift
@@ -44,27 +45,26 @@ HISTORY_TIME = 0.5  # s of stored joint motion; older frames are treated as this
 CURRENT_OFF_TIME_MAX = 0.1  # s, maximum time for which a current may differ from its goal
 LAW_POINTS = 17  # nodes in d from 0 to the radius
 
-# Random walks during a grip, per √s. docs/estimation.md gives the sources.
+GATE = 3.0  # standard deviations beyond which the effect of an innovation is reduced
+OUTLIER_GATE = 5.0  # standard deviations beyond which a deviation is a fault
+MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
+MODEL_ERROR_TIME = 0.1  # s, correlation time of these errors
+TORQUE_NOISE = 0.05  # N·m, of a moving joint: its friction changes with place and time
+
+# Random walks during a grip, per √s
 _WALK_CLOSING = 2e-5  # m, for d1 + d2; small because the object width is constant
 _WALK_SIDEWAYS = 3e-4  # m, for d1 − d2; the object can move between the tips
 _WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # m, for d1 − d2 if frames do not measure d independently
-_WALK_LOOSE_D = 5e-3  # m, object in contact with only one of two fingers
+_WALK_LOOSE_D = 5e-3  # m, contact without a grip
 _WALK_LOOSE_ANGLE = 2e-2  # rad, same case
 _WALK_ANGLE = 2e-4  # rad, tip creep
 _WALK_D_BIAS = 1e-4  # m, zero drift during sensor warm-up
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
 _WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times gain
-_WALK_FRICTION = 0.05  # N·m
-_MOTION_ERROR = 0.05  # relative error of the predicted rotation and closing
 _SIDEWAYS_ERROR = 0.1  # fraction of sideways finger motion that shifts the object in the grip
-_MOTION_TIME = 0.1  # s, correlation time of these two errors
 _VELOCITY_TIME = 0.02  # s, correlation time of velocity rounding
 _VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to that before it
-_TORQUE_ERROR_MAX = 0.3  # bound of |TORQUE|
-_LATENCY_MAX = 0.15  # s, bound of LATENCY
-_ROTATION_MAX = 1.0  # rad between two readings; larger predictions are discarded as impossible
-_FREE_TORQUE_TIME = 0.02  # s, averaging time for the torque of a free joint
 _TOUCH_DELAY = 0.1  # s, delay from a touch until a frame shows it
 _CURRENT_ERROR = 0.25  # allowed relative deviation of a current from its goal
 _CURRENT_NOISE = 0.02  # A, additional allowed deviation
@@ -131,6 +131,7 @@ class HandFilter(Record):
     inertia: float  # joint inertia [kg·m²]
     load_held: float  # fraction of the tip moment held by the gears when torque decreases
     is_single: bool  # one-finger hand
+    is_gripping: bool  # a grip sets the joint torques
     gain_is_known: bool  # `estimator.free_gain` is false
     t: float  # time of the last reading [s]
     newest_row: int  # index in the history
@@ -163,9 +164,10 @@ def predicted_variance(h: HandFilter) -> float:
 def correct(h: HandFilter, channel: int, innovation: float, variance: float, gate: float) -> None:
     """Update the state with one scalar measurement, using `slopes`, then set the slopes to 0.
 
-    ``variance`` is the noise variance. The innovation is clipped at ``gate`` standard deviations
-    (Huber) and ignored if it is not finite. `grasp.nis` averages the normalised innovation squared
-    of each ``channel``.
+    ``variance`` is the noise variance. It is increased if the innovation exceeds ``gate`` standard
+    deviations, so that the innovation equals ``gate`` standard deviations. An innovation that is
+    not finite is ignored. `grasp.nis` averages the normalised innovation squared of each
+    ``channel``, limited to ``gate`` squared.
     """
     expected = predicted_variance(h)
     square = innovation * innovation
@@ -181,11 +183,11 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
             h.mean[i] += gain * innovation
             for j in range(STATES):
                 h.covariance[i, j] -= gain * h.scratch[j]
-        for k in range(TORQUE, TORQUE + 2):
+        for k in (TORQUE, TORQUE + 1, LATENCY):  # These are hardly observable.
+            bound = OUTLIER_GATE * math.sqrt(h.prior_variance[k])
             error = h.mean[k] - h.prior_mean[k]
-            error = min(max(error, -_TORQUE_ERROR_MAX), _TORQUE_ERROR_MAX)
-            h.mean[k] = h.prior_mean[k] + error
-        h.mean[LATENCY] = min(max(h.mean[LATENCY], -h.latency), _LATENCY_MAX)
+            h.mean[k] = h.prior_mean[k] + min(max(error, -bound), bound)
+        h.mean[LATENCY] = max(h.mean[LATENCY], -h.latency)
     h.slopes[:] = 0.0
 
 
@@ -224,7 +226,7 @@ def _walk(h: HandFilter, state: int, per_root_second: float, dt: float) -> None:
 
 
 @inner_kernel
-def _walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: float) -> None:
+def walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: float) -> None:
     """Add process noise to a pair: ``common`` to its mean, ``opposite`` to its difference."""
     alike = common * common * dt
     other = opposite * opposite * dt
@@ -243,12 +245,15 @@ def predict(
     dq: FloatPair,
     current: FloatPair,
     goal: FloatPair,
+    is_gripping: bool,
 ) -> None:
     """Predict the state at time ``t`` from a joint reading [rad, rad/s, A].
 
-    ``goal`` is the current commanded by a grip [A], or 0 without a grip.
+    ``goal`` is the current commanded by a grip [A], or 0 if it does not apply. ``is_gripping`` is
+    True while a grip sets the joint torques.
     """
     h = hands[0]
+    h.is_gripping = is_gripping
     dt = t - h.t
     last_speed = h.tip[0].speed, h.tip[1].speed
     for k in range(2):
@@ -326,7 +331,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left.travel[1] += step1
     right.travel[1] += step2
     # An impossible step, for example due to a taper of 180°, would stay in the state forever.
-    if not (abs(d_step1) + abs(d_step2) < h.radius and abs(rotation) < _ROTATION_MAX):
+    if not abs(d_step1) + abs(d_step2) + abs(rotation) * h.radius < h.radius:
         return
     left.travel[0] += d_step1
     right.travel[0] += d_step2
@@ -337,12 +342,12 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
         h.mean[D + 1] += d_step2
     h.mean[ANGLE] += rotation
     if dt > 0.0:
-        rotation_error = _MOTION_ERROR * rotation
-        closing_error = _MOTION_ERROR * d_step1
+        rotation_error = MODEL_ERROR * rotation
+        closing_error = MODEL_ERROR * d_step1
         sideways_error = 0.5 * _SIDEWAYS_ERROR * (arm1 * step1 - arm2 * step2)
-        samples = _MOTION_TIME / dt
+        samples = MODEL_ERROR_TIME / dt
         h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples
-        _walk_pair(h, D, closing_error, sideways_error, samples)
+        walk_pair(h, D, closing_error, sideways_error, samples)
     for k in range(2):
         # Velocity rounding affects encoder, tips and object together.
         variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
@@ -359,23 +364,33 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
 
 
 @inner_kernel
+def is_held(h: HandFilter) -> bool:
+    """Return True if all fingers grip an object, whose width then stays constant.
+
+    Without a grip, something else may press on the tips and move freely.
+    """
+    both: bool = h.tip[0].in_contact and h.tip[1].in_contact
+    return h.is_gripping and (both or h.is_single)
+
+
+@inner_kernel
 def _add_process_noise(h: HandFilter, dt: float) -> None:
     """Add ``dt`` seconds of random walk during a contact."""
-    if h.is_single or (h.tip[0].in_contact and h.tip[1].in_contact):
+    if is_held(h):
         sideways = _WALK_SIDEWAYS
         if h.is_single:
             sideways = 0.0
         elif h.tip[0].gain_is_fixed and h.tip[1].gain_is_fixed:
             sideways = _WALK_SIDEWAYS_FIXED_GAIN
-        _walk_pair(h, D, _WALK_CLOSING, sideways, dt)
+        walk_pair(h, D, _WALK_CLOSING, sideways, dt)
         _walk(h, ANGLE, _WALK_ANGLE, dt)
         for k in range(2):
             _walk(h, D_BIAS + k, _WALK_D_BIAS, dt)
             _walk(h, ANGLE_BIAS + k, _WALK_ANGLE_BIAS, dt)
     else:
-        _walk_pair(h, D, _WALK_LOOSE_D, _WALK_LOOSE_D, dt)
+        walk_pair(h, D, _WALK_LOOSE_D, _WALK_LOOSE_D, dt)
         _walk(h, ANGLE, _WALK_LOOSE_ANGLE, dt)
-    _walk(h, FRICTION, _WALK_FRICTION, dt)
+    _walk(h, FRICTION, TORQUE_NOISE, dt)
     for k in range(2):
         _walk(h, GAIN + k, _WALK_GAIN_FIXED_GAIN if h.tip[k].gain_is_fixed else _WALK_GAIN, dt)
 
@@ -423,7 +438,7 @@ def _measure_free_torque(
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
-    weight = min(dt / _FREE_TORQUE_TIME, 1.0)
+    weight = min(dt / _VELOCITY_TIME, 1.0)
     tip.free_torque += (tip.torque - accelerating - tip.free_torque) * weight
     tip.free_torque_max[0] = max(tip.free_torque_max[0], abs(tip.free_torque))
     if t - tip.window_start > _TOUCH_DELAY:
@@ -439,14 +454,9 @@ def _check_current(grasp: GraspState, finger: int, current: float, goal: float, 
 
     Also measures how long the two have differed by more than a servo's current controller allows.
     """
-    if goal <= 0.0:
-        grasp.current_off_time[finger] = 0.0
-        return current
-    if abs(current - goal) <= _CURRENT_ERROR * goal + _CURRENT_NOISE:
-        grasp.current_off_time[finger] = 0.0
-    else:
-        grasp.current_off_time[finger] += dt
-    return goal
+    is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + _CURRENT_NOISE
+    grasp.current_off_time[finger] = grasp.current_off_time[finger] + dt if is_off else 0.0
+    return goal if goal > 0.0 else current
 
 
 @inner_kernel

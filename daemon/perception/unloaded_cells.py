@@ -18,7 +18,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _RIM_DISTANCE = 2.0  # pitches from the tip rim beyond which a cell is unloaded
 _CELL_COUNT_MIN = 50  # minimum number of cells for estimating zero shift and noise
-_AVERAGED_FRAME_COUNT = 8  # frames, time constant of the noise average
+_AVERAGED_FRAME_COUNT = 8  # calls of `update`, time constant of the noise average
 _CLIPPED_FRACTION = 0.25  # fraction of cells at 0 above which noise is treated as clipped
 _CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping
 

@@ -187,7 +187,10 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         with view(fake) as viewed, Watcher(viewed.host) as page:
             pictures = [page.next() for _ in range(5)]
             fake.send(schema.EVENT, msgpack.packb(event(7, "slip", "the object slips", "warning")))
-            while not (picture := page.next())["events"]:
+            # On a busy machine, the publisher may pause, and the picture then shows old data.
+            while not (picture := page.next())["events"] or (
+                picture["age"] >= picture["patience"]["state"]
+            ):
                 pictures.append(picture)
             scene = page.scene
             said = viewed.end()
@@ -214,7 +217,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     shown = {path: picture["row"][scene["columns"][path]] for path in expected}
     assert shown == pytest.approx(expected, abs=1e-4)
     assert picture["row"][2] == picture["mode"] == "holding"
-    assert (picture["fault"], picture["age"] < picture["patience"]["state"]) == ("", True)
+    assert picture["fault"] == ""
     assert picture["events"][-1][2:] == ["warning", "slip", "the object slips"]
     assert picture["notes"][0] == "the object slips"
     assert "left temperature at 94% of safety.temperature_max" in picture["notes"]

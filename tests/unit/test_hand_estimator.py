@@ -11,7 +11,7 @@ from softfinger.daemon.perception.hand_estimator import HandEstimator
 from softfinger.daemon.perception.hand_state import STATES, HandFilter, correct
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Contact, Frame, ObjectPose, Reading
+from softfinger.daemon.types import Contact, Frame, Goal, ObjectPose, Reading
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.material import Material
@@ -31,6 +31,7 @@ def some_hand(rng: np.random.Generator) -> HandFilter:
     root = 1e-2 * rng.normal(size=(STATES, STATES))
     hand.covariance[:] = root @ root.T
     hand.mean[:] = 1e-3 * rng.normal(size=STATES)
+    hand.prior_variance[:] = 1.0
     hand.latency = 1.0
     return hand
 
@@ -169,6 +170,25 @@ def test_a_contact_at_start_up_is_reported_from_the_first_frame_on(estimator, re
     assert contact.theta == pytest.approx(0.1, rel=0.02)
     assert contact.force > 1.0
     assert math.isfinite(contact.energy + contact.d_std + contact.theta_std)
+
+
+@pytest.mark.parametrize("depths", [(3e-3, 3e-3), (3e-3, 1e-3)])
+@pytest.mark.parametrize("gripping", [False, True])
+def test_tips_are_independent_until_a_grip_begins(estimator, depths, gripping):
+    """Plates press both tips of a hand whose joints stand still."""
+    contacts, pose = [Contact(), Contact()], ObjectPose()
+    for k in range(100):
+        t = 5.0 + 0.01 * k
+        estimator.predict(Reading(t=t, q=[0.15, 0.15], valid=True), Goal() if gripping else None)
+        for finger, depth in enumerate(depths):
+            d = depth * min(0.1 + 0.015 * k, 1.0)
+            estimator.update(finger, frame(t), replace(ESTIMATE, d=d), contacts[finger])
+        estimator.write_contacts(t, contacts, pose)
+    found = [contact.d for contact in contacts]
+    if gripping:  # The width of a gripped object is constant, so the frames must be wrong.
+        assert sum(found) < 0.8 * sum(depths)
+    else:
+        assert found == pytest.approx(depths, rel=0.01)
 
 
 @pytest.mark.parametrize("response", [0.04, 0.08])
