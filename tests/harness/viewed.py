@@ -32,7 +32,7 @@ class Viewed:
         for line in self.process.stdout:
             self.commanding = self.commanding or line.split()[1]
             self.address = line.split()[1]
-            if line.rstrip().endswith(("to see it", "in one browser")):
+            if line.rstrip().endswith(("to view the hand", "in one browser")):
                 break
         self.host = urlsplit(self.address).netloc
 

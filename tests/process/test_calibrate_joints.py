@@ -47,7 +47,7 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
     assert calibrate(folder, file, "--config", "hil", *by_hand(folder)) == 0
     told = capsys.readouterr()
     assert "left finger: close the finger fully\n" in told.err
-    assert "left: servo 2 (not 1: IDs are swapped), direction -1, zero 1" in told.out
+    assert "left: servo 2 (servos.ids has 1: the IDs are swapped), direction -1, zero 1" in told.out
     assert "servos.direction = [-1, 1]" in told.out
     found = load(file, folder)
     assert (found.servos.ids, found.servos.direction) == ((2, 1), (-1, 1))
@@ -64,14 +64,14 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
     [
         ("left={pose} right={pose}", "servos 1 and 2 rotated, expected one servo: move only one"),
         ("left={pose}", "servo 2 rotated with both fingers"),
-        ("left=ajar", "ended with status 1"),
+        ("left=ajar", "exited with status 1"),
     ],
 )
 def test_moving_the_wrong_finger_is_refused(hand, tmp_path, capsys, turn, told):
     folder, _ = hand
     assert calibrate(folder, tmp_path / "a.toml", "--config", "hil", *by_hand(folder, turn)) == 1
     error = capsys.readouterr().err
-    assert told in error or "servos 2 and 1 turned" in error
+    assert told in error or "servos 2 and 1 rotated" in error
     assert not (tmp_path / "a.toml").exists()
 
 
@@ -85,7 +85,7 @@ def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
     try:
         assert calibrate(folder, *words) == 1
         assert "servo 2: torque is on" in capsys.readouterr().err
-        assert "torque of the left servo is on" in emulator.turn(["left=open"])
+        assert "torque is on in the left servo" in emulator.turn(["left=open"])
     finally:
         servos.write(2, reg.TORQUE_ENABLE, 1, 0)
         servos.close()

@@ -149,7 +149,7 @@ def test_boards_are_checked(hands, capsys):
     ]
     assert main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "note   servos: simulated: no servo to check" in lines
+    assert "note   servos: simulated: there is no servo to check" in lines
     assert lines[-1].endswith(" 0 failed")
 
 

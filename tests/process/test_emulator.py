@@ -153,9 +153,9 @@ def test_links_that_were_redirected_are_not_removed(tmp_path):
         (["--fault", "lose=2"], 1, "expected a probability of 0 to 1"),
         (["--model", "AX-12"], 2, "XM430-W350"),
         (["--baud", "1234"], 1, "baud"),
-        (["--ids", "1"], 2, "expected two IDs of 0 to 252"),
-        (["--ids", "1,253"], 2, "expected two IDs of 0 to 252"),
-        (["--ids", "1,x"], 2, "expected two IDs of 0 to 252"),
+        (["--ids", "1"], 2, "expected two IDs between 0 and 252"),
+        (["--ids", "1,253"], 2, "expected two IDs between 0 and 252"),
+        (["--ids", "1,x"], 2, "expected two IDs between 0 and 252"),
     ],
 )
 def test_an_invalid_hand_is_reported_in_one_line(tmp_path, inline, options, status, told):

@@ -167,7 +167,7 @@ def test_start_up_waits_for_servos_that_have_not_responded_yet(tmp_path, address
         assert refused.stderr.rstrip().endswith("waited servos.open_timeout = 0.1 s")
         waiting = started(*words, "servos.open_timeout=60", stdout=None)
         with ending(waiting):
-            text = "waiting up to servos.open_timeout = 60 s"
+            text = "waiting for up to servos.open_timeout = 60 s"
             assert any(text in line for line in waiting.stderr)
             send_words(rig.folder, "answer=2")
             assert any("running, disarmed" in line for line in waiting.stderr)

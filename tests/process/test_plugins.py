@@ -42,7 +42,7 @@ def test_the_example_meets_the_backend_interface(caplog):
     check_servos(settings, torque=True)
     check_shape(load(changes=["simulation.object_shape=hexagon"]))
     found = {each.subject: each for each in doctor.results(settings, False)}
-    assert found["servos"].text.startswith("following: a plugin;")
+    assert found["servos"].text.startswith("following: the servos use a plugin")
     assert "44 × 44 cells" in found["tactile left"].text
     assert "/dev/ttyUSB0" not in found  # the ports of plugin backends are not checked
 
@@ -66,7 +66,7 @@ def test_plugin_errors_are_part_of_the_report():
     for part in (
         "plugins.pulsing.height: found -1",
         "plugins.pulsing.hight: unknown key; nearest: height",
-        "plugins.following: found settings, but following of softfinger-example 1.0 has no ",
+        "plugins.following: found settings, but following of softfinger-example 1.0 does not ",
         "plugins.nobody: found settings, but no plugin of this name is installed",
     ):
         assert part in report

@@ -68,7 +68,7 @@ def test_a_stage_is_moved_by_a_program(rubber, capsys):
     assert calibrate(folder, "curve", "--force", "5", "15", *move) == 0
     assert "loads, force error" in capsys.readouterr().out
     assert calibrate(folder, "curve", "--force", "1e4", *move) == 1
-    assert "ended with status 1" in capsys.readouterr().err
+    assert "exited with status 1" in capsys.readouterr().err
     for words in ("press depth=3", "press tip=left", "press depth=9mm"):
         assert main(["emulate", "--dir", str(folder), "--send", words]) == 1
     told = capsys.readouterr().err

@@ -84,7 +84,7 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     assert rig.torque() == [1, 1]  # the daemon could not reach the servos
     # From here on, `clear` reopens the port.
     rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
-    rig.refuses("clear", "no such port")
+    rig.refuses("clear", "port not found")
     rig.plug()
     seq = loop.state.reading.seq
     loop.advance(0.2)
@@ -131,7 +131,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         rig.until(lambda: loop.state.mode == "fault")
         assert loop.state.fault_name == "tactile.silent"
         for _ in range(2):  # a failed attempt can be repeated
-            rig.refuses("clear", "no such port")
+            rig.refuses("clear", "port not found")
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)
         assert rig.does("clear")["mode"] == "disarmed"
@@ -144,7 +144,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         until(lambda: left.counters()["port_lost"] == 1)
         rig.does("arm")
         assert rig.events[-1][:2] != ("info", "tactile")
-        assert any("no such port" in text for level, _, text in rig.events if level == "warning")
+        assert any("port not found" in text for level, _, text in rig.events if level == "warning")
         rig.until(lambda: loop.state.t - loop.state.contacts[0].t_valid > 0.9)
         rig.refuses("grasp", "the port is lost; send `clear`, or `disarm` and `arm`, to reopen it")
         rig.does("disarm")

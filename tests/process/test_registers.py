@@ -192,7 +192,7 @@ def test_invalid_register_files_are_refused(bus, tmp_path):
     other = path.read_text(encoding="utf-8").replace("XM430-W350", "XM430-W210", 1)
     path.write_text(other, encoding="utf-8")
     left, *right = restore_registers(settings, path)
-    assert left.text.endswith("is of an XM430-W210, found XM430-W350")
+    assert left.text.endswith("was saved from an XM430-W210, found XM430-W350")
     assert right == []
 
 

@@ -95,7 +95,7 @@ def test_missing_data_in_a_recording_is_reported(taken, tmp_path):
 
     with pytest.raises(RecordingError, match="does not contain hand/settings"):
         recompute(without(schema.SETTINGS))
-    with pytest.raises(RecordingError, match="contains no hand/input"):
+    with pytest.raises(RecordingError, match="does not contain hand/input"):
         recompute(without(schema.INPUT))
     blind = recompute(without(schema.TACTILE))
     assert blind.missing_frames > 100

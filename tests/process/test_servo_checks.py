@@ -80,7 +80,7 @@ REBOOT = ": remove the cause, then reboot the servo with `softfinger doctor --fi
             ["undervoltage=1"],
             {reg.CURRENT_LIMIT: 100},
             [
-                f"{LEFT}supply is 8.5 V, expected 9.5 to 16.0 V: check the supply",
+                f"{LEFT}supply voltage is 8.5 V, expected 9.5 to 16.0 V: check the power supply",
                 f"{RIGHT}current limit is 0.269 A, expected at least "
                 f"safety.current_max = 1.2 A{FIX}",
             ],
@@ -99,8 +99,8 @@ REBOOT = ": remove the cause, then reboot the servo with `softfinger doctor --fi
             [],
             {},
             [
-                f"{LEFT}is an XM430-W210, not an XM430-W350: set servos.model",
-                f"{RIGHT}is an XM430-W210, not an XM430-W350: set servos.model",
+                f"{LEFT}is an XM430-W210, expected an XM430-W350: set servos.model",
+                f"{RIGHT}is an XM430-W210, expected an XM430-W350: set servos.model",
             ],
         ),
     ],

@@ -69,7 +69,7 @@ def test_a_missing_scheduler_is_reported(monkeypatch, capsys):
     monkeypatch.setattr("softfinger.tools.sweep._CONNECT_TIMEOUT", 0.2)
     words = ["--size", "40", "--mass", "1", "--friction", "0.6", "--shape", "disc"]
     assert main(["envelope", *words, "--scheduler", "tcp://127.0.0.1:9"]) == 1
-    assert "tcp://127.0.0.1:9: no Dask scheduler answers" in capsys.readouterr().err
+    assert "tcp://127.0.0.1:9: no Dask scheduler responds" in capsys.readouterr().err
 
 
 def test_an_interrupted_sweep_continues_from_its_journal(tmp_path):
