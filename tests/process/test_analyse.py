@@ -63,7 +63,9 @@ def test_unusable_frames_are_counted_by_reason(counts, tmp_path):
     (contacts,) = analyse(open_source(tmp_path / "untared.npy", made, False), print)
     assert contacts.reasons() == {"all cells read above zero: tare the sensor": len(counts)}
     write_csv(tmp_path / "out.csv", [contacts])
-    assert rows_of(tmp_path / "out.csv")[0]["invalid"] == "all cells read above zero: tare the sensor"
+    assert (
+        rows_of(tmp_path / "out.csv")[0]["invalid"] == "all cells read above zero: tare the sensor"
+    )
 
 
 def test_all_file_types_give_the_same_contacts(counts, tmp_path):

@@ -199,7 +199,7 @@ def test_servos_at_another_rate_are_found(hands, capsys):
     assert status == 1
     assert found in lines
     assert (
-        "       → softfinger doctor --fix makes it servo 1 (left): 1000000 → 2000000 baud; "
+        "       → run softfinger doctor --fix to use it as servo 1 (left): 1000000 → 2000000 baud; "
         "or set servos.baud = 1000000"
     ) in lines
     assert scanned(capsys, hand.folder, "--wait", "2") == [
@@ -209,7 +209,7 @@ def test_servos_at_another_rate_are_found(hands, capsys):
     assert main(["scan", path, "--baud", "57600", "--wait", "0.5"]) == 1
     assert "no servo replies" in capsys.readouterr().out
     assert main(["scan", "/dev/does-not-exist"]) == 1
-    assert "no such port" in capsys.readouterr().err
+    assert "port not found" in capsys.readouterr().err
 
 
 @pytest.mark.waits
@@ -229,7 +229,7 @@ def test_a_servo_id_is_only_changed_on_request(hands, capsys):
     servo.table.set(reg.ID, 1)
     status, lines = hand.doctor(capsys)
     assert status == 1
-    (garbled,) = [line for line in with_status(lines, "FAIL") if "are damaged" in line]
+    (garbled,) = [line for line in with_status(lines, "FAIL") if "are corrupted" in line]
     assert garbled.startswith("servos: replies of ID 1 at 2000000 baud are corrupted: several ser")
     assert [line for line in lines if line.startswith("       → connect only one servo and")]
 

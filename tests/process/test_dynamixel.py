@@ -65,7 +65,10 @@ def test_torque_on_starts_at_the_current_position(bus, connect):
 
     bus.call(place)
     backend = connect(bus)
-    assert sum("bus watchdog has stopped the servo" in notice for notice in map(str, backend.notices)) == 2
+    assert (
+        sum("bus watchdog has stopped the servo" in notice for notice in map(str, backend.notices))
+        == 2
+    )
     backend.torque_on()
     for i, direction in ((0, 1), (1, -1)):
         memory = bus.memory(i)

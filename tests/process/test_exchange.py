@@ -77,10 +77,10 @@ def test_assessment_of_exchange_times():
     assert (near.status, near.fix.split(",")[0]) == ("warn", "set loop.rate = 440")
     assert near.text.endswith("too much of a tick of 2 ms (loop.rate = 500): ticks will be late")
     both = judged(0.0028, 0.003)  # shorter than reply_timeout and longer than a tick
-    assert (both.status, both.fix.split(";")[0]) == ("FAIL", "set loop.rate = 260")
+    assert (both.status, both.fix.split(",")[0]) == ("FAIL", "set loop.rate = 260")
     assert "expected at most one tick of 2 ms (loop.rate = 500) and at most 4 ms" in both.text
     slow = judged(0.016, 0.016)
-    assert slow.fix.startswith("set servos.reply_timeout = 0.024 and loop.rate = 50; or")
+    assert slow.fix.startswith("set servos.reply_timeout = 0.024 and loop.rate = 50, or")
     assert judged(0.0004, 0.01).status == "FAIL"
     assert judged(0.0004, 0.01, emulated=True).status == "pass"
     assert [judged(0.0004, 0.0009, share).status for share in (0.02, 0.1, 0.3)] == [

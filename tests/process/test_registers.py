@@ -62,7 +62,7 @@ EEPROM = [
         reg.SHUTDOWN,
         20,
         "warn",
-        "shutdown is 20, expected 52: it does not switch torque off after overload",
+        "shutdown is 20, expected 52: the servo does not switch torque off after overload",
     ),
 ]
 RAM = [
@@ -215,7 +215,7 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
 def test_an_error_that_a_wrong_limit_causes_is_corrected_with_the_limit(bus):
     put(bus, reg.MIN_VOLTAGE_LIMIT, 140)
     until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
-    supply = [each for each in told(bus) if each.text.startswith("supply is ")]
+    supply = [each for each in told(bus) if each.text.startswith("supply voltage is ")]
     assert [each.fix for each in supply] == [FIX]
     fixed = [each.text for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert fixed == [

@@ -120,7 +120,7 @@ def test_all_problems_are_listed_with_their_fixes(running, options, faults, regi
 def test_a_model_without_current_control_is_refused(running):
     bus = running(servos={"model": "XL430-W250", "mode": "position"})
     lines = refusal(bus.port, model="XL430-W250")
-    assert sum("no current-based position mode" in line for line in lines) == 2
+    assert sum("does not support current-based position mode" in line for line in lines) == 2
 
 
 @pytest.mark.parametrize("silent", [(2,), (1, 2)])
@@ -163,7 +163,9 @@ def test_minor_findings_are_notices(bus):
             f"{finger}servos.watchdog = 0: the servo keeps moving if the daemon or the bus fails"
             in notices
         )
-        assert [n for n in notices if n.startswith(f"{finger}servos.fault_after = 60 s: without")]
+        assert [
+            n for n in notices if n.startswith(f"{finger}servos.fault_after = 60 s: if replies")
+        ]
     assert [n for n in notices if n.startswith(f"{LEFT}its drive mode is reversed")]
     assert [n for n in notices if n.startswith(f"{LEFT}torque is already on")]
     span = slice(reg.GOAL_CURRENT, reg.GOAL_POSITION + 4)

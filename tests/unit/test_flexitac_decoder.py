@@ -162,7 +162,7 @@ def test_a_constant_image_that_contains_the_marker_is_ambiguous():
     decoder = FlexiTacDecoder(ROWS, COLS)
     assert decode(decoder, [stream[5:]]) == []
     assert decoder.counters()["ambiguous"] > 0
-    assert "several places" in decoder.diagnosis()
+    assert "several times" in decoder.diagnosis()
     # Once the image changes, only one position remains possible.
     found = decode(decoder, [frame(image) for image in numbered(3)])
     assert found[-1] == numbered(3)[1]

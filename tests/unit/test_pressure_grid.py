@@ -127,7 +127,7 @@ def test_no_contact_is_all_zero_and_out_is_reused():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: SensorGrid(0, 4, PITCH), "rows and columns"),
+        (lambda: SensorGrid(0, 4, PITCH), "at least one row and one column"),
         (lambda: SensorGrid(4, 4, 0.0), "pitch"),
         (lambda: SensorGrid(4, 4, (PITCH, math.nan)), "pitch"),
         (lambda: SensorGrid(4, 4, PITCH, centre=(math.inf, 0.0)), "centre"),

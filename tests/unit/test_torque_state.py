@@ -74,7 +74,7 @@ def test_without_a_watchdog_the_bus_is_not_silenced(make):
     lost = Deaf(daemon)
     command(daemon, "stop")
     daemon.loop.advance(0.3)
-    assert "cut their power" in daemon.loop.state.fault
+    assert "switch off their supply" in daemon.loop.state.fault
     assert lost.tries > 140, "torque off must be requested on every tick"
     lost.mend()
     daemon.loop.advance(2 * daemon.loop.period)
