@@ -194,8 +194,8 @@ def _frames(
                     raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
             else:
                 if frames and len(frames[-1]) < rows:
-                    had = f"{len(frames[-1])} rows of {rows}"
-                    raise TekscanError(f"line {number}: frame {numbers[-1]} has only {had}")
+                    had = f"found {len(frames[-1])}, expected {rows}"
+                    raise TekscanError(f"line {number}: rows of frame {numbers[-1]}: {had}")
                 if numbers and int(match[1]) <= numbers[-1]:
                     raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
                 numbers.append(int(match[1]))

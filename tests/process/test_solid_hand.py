@@ -33,4 +33,4 @@ def test_analyse_and_plot_read_the_recording(recorded, capsys):
     assert ", 0 invalid" in capsys.readouterr().out
     out = recorded.parent / "plots"
     assert main(["plot", str(recorded), "--out", str(out)]) == 0
-    assert sorted(each.name for each in out.iterdir()) == ["angle.png", "landscape.png"]
+    assert sorted(each.name for each in out.iterdir()) == ["angle.png", "landscape.png", "time.png"]

@@ -306,7 +306,7 @@ def test_an_unknown_model_is_reported_with_all_other_errors(tmp_path):
         (
             '[material]\nlaw = "points"\nstrain = [0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0]\n'
             "stress = [1e4, 2e4, 3e4, 6e4, 12e4, 18e4, 24e4]\nforce_error_max = 0.01",
-            "material.strain, material.stress: the smooth law deviates from the measured points by ",
+            "material.strain, material.stress: the smooth law deviates from the measured points by",
         ),
     ],
 )
