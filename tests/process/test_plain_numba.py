@@ -21,7 +21,7 @@ import pytest
 numba.__version__ = "99.0"
 from softfinger.kinematics.compiled.kernel import why_plain
 
-assert why_plain.startswith("Numba 99.0 is not one of 0.63")
+assert why_plain.startswith("Numba 99.0 has not been tested")
 tests = "kernels", "pressure_grid"
 files = [f"tests/unit/test_{name}.py" for name in tests]
 files.append("tests/unit/test_estimator_kernels.py::test_activity_matches_plain_numpy")
