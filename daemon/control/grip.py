@@ -171,7 +171,7 @@ class Grip:
     def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
         """Return joint torques [N·m], positive when closing, 0 for an unused finger.
 
-        Set ``holding`` if the grip is settled; only loads then move the joints.
+        Set ``holding`` once the grip has settled. From then on, only loads move the joints.
         """
         if self._single_finger is not None:
             return self._single_torque(reading, False)

@@ -1,4 +1,4 @@
-"""The hand's modes and commands. The documentation page of commands is generated from the table."""
+"""The hand's modes and commands. The commands page is generated from the table."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ _STREAM_TOLERANCE = 0.25
 # Smaller changes in a streamed setpoint or in the force increase are ignored as noise: fraction of
 # the force, and rad (1 σ of the angle).
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
-# s without contact until it counts as lost. Two frames at 25 Hz could show it again in this time.
+# s without contact after which it counts as lost. Two frames at 25 Hz fit into this time.
 _CONTACT_LOSS_TIME = 0.1
 # s for which the tips must appear to touch each other, more than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05

@@ -13,8 +13,8 @@ MEMORY_MAX = 128 << 20  # bytes of data segment; Python and libzmq use a third o
 DESCRIPTOR_COUNT = 64  # file descriptors in addition to those of clients
 CLIENT_COUNT_MAX = 256  # connections, commands and stream combined
 STEP_CPU_TIME_MAX = 3.0  # s, CPU time limit of one step; the kernel then ends the process
-# s, elapsed time limit of one step. It exceeds the CPU limit because a busy machine delays the
-# process.
+# s, elapsed time limit of one step. It is higher than the CPU limit because the process may
+# have to wait on a busy machine.
 STEP_TIME_MAX = 30.0
 # s, longest poll interval. After a longer interval, new requests are stamped with the time of the
 # previous poll.

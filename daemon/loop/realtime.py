@@ -167,7 +167,7 @@ class RealTime:
             self._granted(f"scheduler slices of {nanoseconds * 1e-6:g} ms", *undo)
 
     def _keep_to_processors(self, cpus: tuple[int, ...]) -> None:
-        """Pin the loop thread to processors, which other threads may also use."""
+        """Pin the loop thread to a set of processors, which other threads may still use."""
         names = ", ".join(map(str, cpus))
         before = os.sched_getaffinity(0)
         try:

@@ -170,7 +170,7 @@ class HandEstimator:
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
-            return  # Joint motion still predicts the contact, whose age increases.
+            return  # The contact is still predicted from joint motion, but its age increases.
         # Without a joint reading, only the frame is used.
         in_contact = estimate.contact and self._joints_read
         if in_contact and self._in_contact[finger] and not has_changed:

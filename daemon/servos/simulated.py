@@ -30,7 +30,7 @@ class MotorHeat(Protocol):
 
 
 class HandPlant(JointPlant, Protocol):
-    """Joints of the simulated hand, including servo watchdog and temperatures."""
+    """Joints of the simulated hand, including the servos' watchdogs and temperatures."""
 
     @property
     def servo_heat(self) -> Sequence[MotorHeat]:

@@ -29,7 +29,8 @@ _SLACK = 0.02  # fraction of the range of d; smaller reversals are encoder noise
 _TURNS = 5  # minimum number of rows per reversal of d; with fewer, the rows are not in test order
 _DEEP = 0.9  # fraction of the maximum d; shallower cycles are preconditioning
 TOE = 0.1  # half width of the toe around the first contact, as a fraction of the depth
-_STEEP = 0.2  # fraction of the maximum force; only the curve above it is extrapolated to zero force
+# Fraction of the maximum force; only points above it are used to extrapolate to zero force.
+_STEEP = 0.2
 _POWER = 0.55  # exponent that makes F(d) of springs and solid rubber nearly linear
 _FEWEST = 6  # minimum number of fitted rows per run
 _LOADED = 20.0  # minimum force range of a run, relative to the noise

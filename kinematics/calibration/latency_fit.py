@@ -13,7 +13,7 @@ from softfinger.kinematics.calibration.friction_fit import DURATION_MAX, duratio
 
 FloatArray = NDArray[np.float64]
 
-_STEP = 1e-3  # s, time grid and spacing of the initial delays
+_STEP = 1e-3  # s, step of the time grid and of the initial delays
 _DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # s, range of latencies to search
 # Minimum closing speed in a ramp [m/s], and the time over which the speed is averaged [s].
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05

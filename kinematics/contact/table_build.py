@@ -1,4 +1,4 @@
-"""Fit contact tables to the reference integrals with a certified error.
+"""Fit contact tables to the reference integrals, with a certified error bound.
 
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the

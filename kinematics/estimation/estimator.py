@@ -195,8 +195,8 @@ _ITERATIONS = 20
 PEAK_LEVEL = 3.0  # noise standard deviations, see `detection.activity`
 PATCH_LEVEL = 4.9
 _R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
-# Minimum number of model points per tip radius, for linear and for nonlinear material laws. With a
-# noise of 0.2 % of the modulus and tilts up to 25°, the bias is at most a quarter of the noise
+# Minimum number of model points per tip radius, for linear and for nonlinear material laws. With
+# noise of 0.2 % of the modulus and tilts of up to 25°, the bias is at most a quarter of the noise
 # floor. Within 4° of the domain limit, the bias is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum d/a and sin θ in a spring fit

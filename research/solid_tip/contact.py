@@ -20,7 +20,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from research.solid_tip.green import FloatArray, Green
 
-BEYOND = 0.06  # in units of a; cells up to this distance outside the undeformed overlap may touch
+# In units of a; cells up to this distance outside the undeformed overlap may be in contact.
+BEYOND = 0.06
 
 
 class Press(NamedTuple):

@@ -376,7 +376,7 @@ def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
 class RecordedHand(VirtualTimeHand):
     """Recording in the form of a `Hand` on virtual time; commands do not have an effect.
 
-    Iterations over a stream, and calls of `run`, end at the end of the recording.
+    Iterating over a stream stops, and `run` returns, when the recording ends.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ def described() -> str:
 
 
 def other() -> dict[str, str]:
-    """Return variables that select another floating-point environment of this processor."""
+    """Return environment variables that select a different floating-point code path."""
     core = blas_core().lower()
     if platform.machine() == "aarch64":
         older = "CORTEXA57" if core == "armv8" else "ARMV8"

@@ -117,7 +117,7 @@ class Rig:
         return self.sensor.latest()
 
     def unplug(self) -> None:
-        """Unplug the board's port, in the thread that serves the port."""
+        """Simulate unplugging the board, from the thread that serves its port."""
         self._unplug.set()
 
     def _serve(self) -> None:

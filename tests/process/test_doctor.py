@@ -273,7 +273,7 @@ def test_the_process_using_a_port_is_named(terminal, locked):
         "print('open', flush=True); sys.stdin.read()"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    # The command line is that of a daemon process.
+    # The command line belongs to a daemon process.
     words = [sys.executable, "-c", script, path, "softfinger", "run"]
     with ending(subprocess.Popen(words, **pipes)) as other:
         assert other.stdout.readline() == "open\n"

@@ -16,7 +16,7 @@ from tests.conftest import until
 from tests.harness.tactile import why_not_open
 from tests.unit.test_flexitac_decoder import CELLS, COLS, ROWS, frame, numbered
 
-LATE = 1026 * 10 / 2e6 + 0.02  # s, duration of 32 × 32 cells on the wire, plus latency
+LATE = 1026 * 10 / 2e6 + 0.02  # s, time to transmit 32 × 32 cells, plus latency
 
 
 class Board(FrameWriter):

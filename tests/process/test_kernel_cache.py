@@ -86,7 +86,7 @@ class Package:
         """Return the kernel's result, the number of kernels from the cache, and the warnings."""
         environment = os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": ""}
         environment.pop("NUMBA_CACHE_DIR", None)
-        # Python would load stale bytecode of a file that is rewritten within a second.
+        # Python would load stale bytecode for a file that is rewritten within a second.
         environment["PYTHONDONTWRITEBYTECODE"] = "1"
         done = python("-c", self.first + script, env=environment, cwd=self.folder)
         return done.stdout.split(), done.stderr

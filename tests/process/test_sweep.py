@@ -1,4 +1,4 @@
-"""Test that sweeps give the same bits in one process, a pool, and a cluster that loses a worker."""
+"""Test that sweeps are bit-identical in one process, a pool, and a cluster that loses a worker."""
 
 import json
 import os

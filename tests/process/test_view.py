@@ -451,7 +451,7 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
                 playback.ask(odd)
             playback.ask("speed 0.5")
             playback.ask("play")
-            until(lambda: 0.0 < playback.position < 1.0)  # it starts again at the beginning
+            until(lambda: 0.0 < playback.position < 1.0)  # it starts again from the beginning
             until(lambda: kept.newest["place"]["speed"] == 0.5)
             marks = [(kind, text) for _, _, kind, text in kept.scene["marks"]]
             assert ("mode", "disarmed → armed") in marks

@@ -1,4 +1,4 @@
-"""Test the FlexiTac framing on bytes."""
+"""Test FlexiTac framing at the byte level."""
 
 import itertools
 

@@ -187,8 +187,8 @@ def test_creep_relaxes_a_stuck_shear_exponentially():
 
 def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
     # The expected values are integrals of the springs' own friction. They follow 1 − (1 − u/μd)²
-    # initially, and twice this for half the distance after each reversal. A closed loop returns to
-    # the earlier value.
+    # initially, and twice this for half the distance after each reversal. Around a closed path, the
+    # value returns to where it started.
     def virgin(u: float) -> float:
         return 1.0 - (1.0 - min(u / (MU * DEPTH), 1.0)) ** 2
 

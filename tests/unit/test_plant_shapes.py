@@ -1,4 +1,4 @@
-"""Test shapes of the simulated object, contact between tips, and the palm."""
+"""Test the simulated object's shapes, contact between the tips, and the palm."""
 
 import math
 

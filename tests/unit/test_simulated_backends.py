@@ -75,7 +75,7 @@ def test_the_watchdog_turns_torque_off_only_without_exchanges():
     bench.run(1.8, period=0.09)
     assert bench.hand.force.min() > 5
     assert bench.servos.counters()["watchdog"] == 0
-    # Without exchanges, the plant turns torque off by itself.
+    # If communication stops, the plant turns torque off by itself.
     bench.hand.advance(bench.clock.now() + 0.099)
     assert np.abs(bench.hand.current).min() > 0.4
     bench.hand.advance(bench.clock.now() + 0.120)

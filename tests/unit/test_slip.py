@@ -49,8 +49,8 @@ def test_the_grip_force_decreases_after_the_load_is_removed():
         hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
-        # If the load is removed while the joints close, part of the change is attributed to a
-        # stiffer tip.
+        # If the load is removed while the fingers are closing, part of the change is attributed to
+        # a stiffer tip.
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.1)
 
 

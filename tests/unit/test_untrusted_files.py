@@ -208,7 +208,7 @@ def chunks_of_holes(path: Path) -> None:
 
 
 SMALL, LARGE = message(b"{}") * 100_000, bytes(70 << 20)
-# Each value returns the content after the header, or writes the whole file.
+# Each value is a function that returns the content after the header or writes the whole file.
 BOMBS: dict[str, Callable[[], bytes] | Callable[[Path], None]] = {
     "zstd": lambda: squeezed(LARGE),
     "zstd that claims little": lambda: squeezed(LARGE, 1000),

@@ -29,7 +29,7 @@ class RecorderError(SoftfingerError):
 
 
 class _Lifeline:
-    """Pipe that ends a child process when it is closed."""
+    """Pipe whose closing terminates a child process."""
 
     def start(self, words: list[str], keys: str, **options: Any) -> subprocess.Popen[Any]:
         """Start ``softfinger`` with the arguments ``words`` and, if keys are set, ``--keys``."""

@@ -160,7 +160,7 @@ def _run(
     calibrations: list[str],
     progress: Callable[[int], None] | None,
 ) -> None:
-    # Reject a recording without settings and inputs before the slow import of the loop.
+    # Importing the loop is slow, so first reject recordings that lack settings or inputs.
     from softfinger.daemon.loop.process_replay import ProcessReplay
     from softfinger.daemon.loop.publishing import parts
 

@@ -291,7 +291,7 @@ class _Recorder:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)
                 shown = now
-        # Messages that were sent before a signal, such as the daemon's last ones, may arrive late.
+        # Messages sent before a signal, such as the daemon's last ones, may arrive after it.
         self._read_remaining(
             socket, _TRANSIT_TIME if ending.is_requested or not ending.is_met else 0.0
         )

@@ -97,7 +97,7 @@ _OTHERS = {  # names and colours of lines that do not belong to a finger
     "compute_s": ("work", OBJECT),
     "wake_late_s": ("late", "late"),
 }
-# Finger fields that have a limit `safety.…_max`.
+# Finger fields that have a `safety.…_max` limit.
 _BOUNDED = ("force", "d", "current", "temperature")
 _FACTORS = {path: plot.factor for plot in _PLOTS for path in plot.paths.split()}
 _FACTORS |= {

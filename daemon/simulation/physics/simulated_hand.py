@@ -205,7 +205,7 @@ class SimulatedHand:
     is above 0, the object moves back and forth between both tips and compresses each by 0.4 radii.
 
     The array attributes are views of the state with shape (2,), left finger first. They are valid
-    until the next call of ``advance``.
+    until the next call to ``advance``.
     """
 
     def __init__(

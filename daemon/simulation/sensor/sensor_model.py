@@ -40,8 +40,9 @@ _FINENESS = 60.0  # minimum number of sample points per tip radius
 class SensorModel:
     """Pressure sensor under one simulated tip, with the board's range and imperfections.
 
-    ``gain`` is the ratio of the reading to the material's pressure. ``dead`` lists the cells (row,
-    col) that always read 0. Two models with the same arguments and calls produce the same frames.
+    ``gain`` is the ratio of the reading to the pressure according to the material law. ``dead``
+    lists the cells (row, col) that always read 0. Two models with the same arguments and calls
+    produce the same frames.
     """
 
     def __init__(

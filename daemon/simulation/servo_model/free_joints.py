@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 STEP = 0.0005  # s
-INERTIA = 0.002  # kg·m², rotor inertia at the output of the gear
+INERTIA = 0.002  # kg·m², rotor inertia reflected to the gearbox output
 VISCOUS = 0.05  # N·m·s/rad
 COULOMB = 0.02  # N·m
 TORQUE_CONSTANT = 1.78  # N·m/A
