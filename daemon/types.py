@@ -134,9 +134,7 @@ class ServoHeatEstimate:
     case: float = 0.0  # case temperature without the thermometer's quantisation [°C]
     case_std: float = 0.0
     ambient: float = 0.0  # [°C]
-    time_to_limit: float = (
-        3600.0  # time to `safety.temperature_max` at this current, capped [s]
-    )
+    time_to_limit: float = 3600.0  # time to `safety.temperature_max` at this current, capped [s]
 
 
 @dataclass(slots=True)

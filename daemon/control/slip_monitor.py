@@ -10,10 +10,12 @@ The following is computed on each tick, with the names from `SlipLaw`, `SlipStat
     force     min(max(commanded, needed), force_limit)
 
 **Offset.** Gear friction and errors in modulus and torque constant cause a residual even without a
-load. This offset is measured when holding begins. It then follows r̄ slowly (_SETTLING_TIME). While
-the joints are at standstill, it follows the commanded torque immediately, because friction carries
-any torque that is added to a stuck joint. The offset stays within ±`friction` of its initial value.
-Below that, it may decrease by another _RELAXATION_SHARE of the tip moment, because rubber relaxes.
+load. This offset is measured when holding begins, and again after force or angle have changed. A
+load that the previous hold showed is not part of it. The offset then follows r̄ slowly
+(_SETTLING_TIME). While the joints are at standstill, it follows the commanded torque immediately,
+because friction carries any torque that is added to a stuck joint. The offset stays within
+±`friction` of its initial value. Below that, it may decrease by another _RELAXATION_SHARE of the
+tip moment, because rubber relaxes.
 
 **Load.** Friction hides a load of up to friction/load_arm, which is 2 N per tip for the default
 hand. Loads below half of that are ignored; larger loads are increased by the hidden part.
@@ -101,6 +103,8 @@ class SlipState(Record):
     is_watched: bool  # the initial residual of the hold is known
     offset: float  # residual without a load [N·m]
     start_offset: float  # part of the initial offset that exceeds friction [N·m]
+    deviation: float  # residual attributed to a load [N·m]
+    moment: float  # moment of the tip forces when holding began [N·m]
     holding_time: float  # time since holding began, up to _SETTLING_TIME [s]
     load: float  # load per tip, including the hidden part [N]
     assumed_load: float  # maximum of `load`, solid-tip shear and declared load [N]
@@ -139,7 +143,7 @@ def configure(s: SlipState, settings: Settings) -> None:
 def reset(s: SlipState) -> None:
     """Reset everything except the law and the torque when the object is released or replaced."""
     s.is_watched = s.is_confirmed = s.has_turned = s.reflex_triggered = False
-    s.friction = s.offset = s.start_offset = s.holding_time = 0.0
+    s.friction = s.offset = s.start_offset = s.deviation = s.moment = s.holding_time = 0.0
     s.load = s.assumed_load = s.pull = s.twist = 0.0
     s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
     s.rotation_seen[:] = s.rotation[:] = 0.0
@@ -148,12 +152,23 @@ def reset(s: SlipState) -> None:
 
 @inner_kernel
 def begin(s: SlipState, grasp: GraspState) -> None:
-    """Begin holding and take the current residual as the no-load offset."""
+    """Begin holding, or continue after force or angle have changed.
+
+    The current residual is the offset without a load. If the previous hold showed a load, the load
+    is still there unless the offset would then leave its range, which scales with the force.
+    """
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
         return
-    s.offset = mean(s.residual)
-    s.start_offset = s.offset - clip(s.offset, s.friction)
+    moment = mean(grasp.normal) * mean(grasp.moment_arm)
+    if s.load > 0.0 and s.moment > 0.0:
+        s.start_offset *= moment / s.moment
+        off = mean(s.residual) - s.deviation - s.start_offset
+        s.offset = s.start_offset + clip(off, s.friction)
+    else:
+        s.offset = mean(s.residual)
+        s.start_offset = s.offset - clip(s.offset, s.friction)
+    s.moment = moment
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.rotation[:] = 0.0
     s.q[:] = grasp.q
@@ -336,6 +351,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     deviation = residual - s.offset
     increase = residual - s.start_offset
     deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
+    s.deviation = deviation
     load, slope = load_of(deviation, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
     hidden = s.friction / grasp.load_arm

@@ -240,6 +240,20 @@ def standing(load: float, asked: float = 4.0) -> GripUnderLoad:
     return watched
 
 
+def test_a_load_is_still_known_after_the_force_has_changed():
+    watched = standing(3.0 * FRICTION)
+    raised = watched.grip.target
+    watched.grip.retarget(4.4)
+    watched.run(3.0 * FRICTION, 50, holding=False, normal=raised)
+    watched.grip.begin_holding()
+    assert watched.run(3.0 * FRICTION, 1000, normal=raised) > 1.5 * 4.4
+    # If the load is removed during a change, the force returns to the commanded value.
+    watched.grip.retarget(4.8)
+    watched.run(0.0, 50, holding=False, normal=raised)
+    watched.grip.begin_holding()
+    assert watched.run(0.0, 3000, normal=4.8) == 4.8
+
+
 def test_torque_alone_raises_a_grip_by_30_percent_unless_the_load_exceeds_friction():
     assert standing(1.7 * FRICTION).grip.target == pytest.approx(1.3 * 4.0)
     assert standing(3.0 * FRICTION).grip.target > 1.5 * 4.0
