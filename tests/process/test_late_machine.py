@@ -61,6 +61,6 @@ def test_on_real_time_a_stall_is_a_fault_and_the_task_restarts(start, profile, h
         stand_still(running)
         fault = told(events, "servos.bus", "watchdog")
         assert fault.startswith("this machine was busy for ")
-        told(events, "task", "the task clears the fault and restarts")
+        told(events, "task", "task clears the fault and restarts")
         told(events, "mode", "armed → grasping")
     assert running.end() in (0, 1)  # a busy machine may cause a fault at any time
