@@ -209,7 +209,7 @@ def test_the_page_shows_another_commander_of_a_real_daemon(start, profile, addre
         with Hand(stream, commands, client="notebook", timeout=60.0) as hand:
             hand.arm()
             page.shows("ARMED", "notebook commands the hand")
-            page.press(b"g", "✗ grasp: notebook has the lease for another")
+            page.press(b"g", "✗ grasp: notebook holds the lease for another")
             page.type(b" ")  # stop requires no lease
             page.shows("✓ stop: ok", "DISARMED")
         assert daemon.end() == 0
