@@ -144,7 +144,7 @@ def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
     RecordingWriter(tmp_path / "nothing.mcap").close()
     status, said = call(tmp_path / "nothing.mcap", "--out", tmp_path / "none")
     assert status == 1
-    assert "plot: the recording does not contain hand/state" in said
+    assert "plot: contains no hand/state" in said
 
 
 def test_without_settings_no_model_is_drawn(path, run):
