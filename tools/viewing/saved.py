@@ -18,7 +18,7 @@ from softfinger.tools.viewing.sources import Playback, ViewError, marks_of
 
 _PICTURE_COUNT_MAX = 6000  # The page keeps all pictures in memory, about 10 kB each.
 _SCALE = 3000.0  # units of the moving picture per m
-_ARC = 30  # points; of longer lines, every second point is enough for a small picture
+_ARC = 30  # points; longer lines are drawn with every second point
 
 
 def save(path: Path, recording: Recording, period: float, say: Callable[[str], None]) -> None:
