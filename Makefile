@@ -64,7 +64,8 @@ test-extended: $(TO_TEST)
 	@$(COMPILE)
 	$(PYTEST) -m extended $(ARGS)
 
-test-all: test-extended test
+test-all:
+	@$(MAKE) test ARGS='-m "extended or not extended" $(ARGS)'
 
 test-arithmetic: $(TO_TEST)
 	@$(BIN)/python -m tests.harness.arithmetic softfinger compile --all
