@@ -90,8 +90,8 @@ class Fingers:
     def close_fingers(self, touching: set[int]) -> set[int]:
         """Close the fingers that are not in contact; return the fingers in contact.
 
-        ``touching`` is the result from the previous tick. A finger with a new contact, which is not
-        in ``touching``, stops at its current angle.
+        ``touching`` is this function's result on the previous tick. A finger with a new contact,
+        which is not in ``touching``, stops at its current angle.
         """
         law, now_touching = self._settings.control, set[int]()
         for index in self.indices:
@@ -105,7 +105,7 @@ class Fingers:
         return now_touching
 
     def advance_setpoints(self, rate: float) -> bool:
-        """Advance the setpoints at up to ``rate`` [rad/s]; return True if all have arrived."""
+        """Advance the setpoints at up to ``rate`` [rad/s]; return True once all are at target."""
         arrived = [joint.step(rate) for joint in self._setpoints]
         return all(arrived)
 

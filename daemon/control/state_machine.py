@@ -87,7 +87,7 @@ class ControlState:
 
 @dataclass
 class Off(ControlState):
-    """Torque is off: DISARMED, or FAULT until the fault is cleared."""
+    """Torque is off. The mode is DISARMED, or FAULT until the fault is cleared."""
 
     mode: Mode = Mode.DISARMED
 
@@ -139,7 +139,7 @@ class ContactLoss:
 
 @dataclass
 class GripHistory:
-    """Data shared by the states of one grip, from first contact of all fingers to its end."""
+    """Data shared by the states of one grip, from the contact of all fingers to the end."""
 
     loss: ContactLoss | None = None
     empty_for: float = 0.0  # duration of apparent tip-to-tip contact [s]
@@ -185,7 +185,7 @@ class Turning(Gripping):
 
 
 class Control:
-    """State machine of the hand and its commands. Only the loop thread may call it."""
+    """State machine of the hand and its commands. Only the loop thread may use this class."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
         """Create the machine; ``state`` and ``grasp`` are read on each tick but never written."""
@@ -238,7 +238,7 @@ class Control:
         self._enter(Armed(self._settings.safety.current_move, following_count=2))
 
     def disarm(self) -> None:
-        """Switch torque off. This also clears a fault."""
+        """Switch torque off and clear any fault."""
         self._enter(Off())
 
     def stop(self) -> None:
@@ -365,7 +365,7 @@ class Control:
     def hold_goal(self, goal: Goal) -> None:
         """Hold the goals while frames are late; called instead of :meth:`step`.
 
-        The goals of a grip are torques: the joints stay damped, and any rotation comes to rest.
+        In a grip, the goals are torques: the joints stay damped, and any rotation stops.
         """
         if goal.valid and isinstance(self.state, Gripping) and self.state.history.loss is None:
             self.fingers.apply_torques(goal, self.grip.hold_goal(self.fingers.reading))
@@ -490,7 +490,7 @@ class Control:
                 self.rotate(angle)
 
     def _is_force_reached(self, is_streamed: bool) -> bool:
-        """Return True if the mean tip force has reached its target or a streamed setpoint near it.
+        """Return True if the mean tip force has reached its target, or a setpoint close to it.
 
         The mean is used because friction between object and support may unbalance the tip forces.
         """

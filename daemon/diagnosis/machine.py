@@ -1,7 +1,7 @@
 """Check that this machine can run ticks on time: scheduling, memory, idle states and clock.
 
-Problems of this kind only degrade the timing, so they are reported as warnings. The checks read the
-limits of this process. A daemon that is started from the same shell has the same limits.
+The problems found here only degrade the timing, so they are reported as warnings. The checks read
+the limits of this process. A daemon that is started from the same shell has the same limits.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def note_ports() -> Finding:
 
 
 def check_runtime_folder() -> Finding:
-    """Check the folder of emulated ports and the local stop: only this user may write to it."""
+    """Check that only this user may write to the folder of emulated ports and the local stop."""
     what, _, fix = runtime_fault().partition(": chmod ")
     if what:
         return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")

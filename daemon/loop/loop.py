@@ -297,7 +297,7 @@ class Loop:
     ) -> dict[str, Any]:
         """Execute one request on the current tick.
 
-        A request that does not come from the running task ends this task.
+        A request from another source ends the running task.
 
         Parameters
         ----------

@@ -13,7 +13,7 @@ A disc has no faces. φ is then the direction of the line between the contacts, 
 on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per joint angle, which is 0.4 for a
 radius R of 20 mm and the default hand; the prediction for faces is 1.5. The frames correct the
 difference, so a rotation takes longer and the disc rolls further than commanded. A curved contact
-looks less tilted than it is, which makes φ about 5 % too small. If the fingers are straight or lean
+appears less tilted than it is, so φ is about 5 % too small. If the fingers are straight or lean
 outwards, the line does not follow the joints: a disc with R ≥ 30 mm can be held, but its rotation
 stops at the tip limits.
 """
@@ -162,7 +162,7 @@ class HandEstimator:
         contact: Contact,
         has_changed: bool = True,
     ) -> None:
-        """Update with a finger's new ``frame`` and its ``estimate``; write both to ``contact``.
+        """Update the state with a finger's ``frame`` and ``estimate``; write both to ``contact``.
 
         ``has_changed`` is False for a frame that is identical to an earlier one. During contact,
         such a frame comes from a board that is frozen or sends old data, so it is not used.

@@ -307,10 +307,12 @@ class LoopSettings(Section):
 
 
 class RealtimeSettings(Section):
-    """Measures that reduce the delay of ticks. The daemon reports the ones that the system denies.
+    """Measures that reduce the delay of ticks.
 
-    All are harmless except the priority: under SCHED_FIFO, the loop can block other programs on
-    its processor.
+    The daemon reports the measures that the system denies.
+
+    All measures are harmless except the priority: under SCHED_FIFO, the loop can block other
+    programs on its processor.
     """
 
     priority: int = setting(0, "", "SCHED_FIFO priority; 0 keeps normal scheduling.", ge=0, le=80)
@@ -345,7 +347,10 @@ class RealtimeSettings(Section):
 
 
 class StreamSettings(Section):
-    """The published stream. A topic is sent on every n-th tick, with the n closest to its rate."""
+    """The published stream.
+
+    A topic is sent on every n-th tick, where n gives the rate closest to the setting.
+    """
 
     address: str = setting(STREAM_ADDRESS, "", "Address of the stream, tcp or ipc.")
     latest: str = setting(
@@ -387,7 +392,7 @@ class CommandSettings(Section):
 
 
 class AccessSettings(Section):
-    """Access to stream and commands. Keys are required for addresses that other machines reach."""
+    """Access to stream and commands. Keys are required if other machines can reach an address."""
 
     keys: str = setting(
         "",

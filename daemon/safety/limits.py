@@ -1,6 +1,7 @@
 """Define all limits of the hand, with their checks and consequences, in the table ``LIMITS``.
 
-- ``warn``: reported once on ``hand/event``, and again only after it has been clear for a while.
+- ``warn``: reported once on ``hand/event``, and again only after the problem has been absent for a
+  while.
 - ``limit``: the goal is modified before it is sent; ``status`` counts the affected ticks.
 - ``fault``: torque off, latched until ``clear``, which is refused while the cause persists.
 

@@ -1,9 +1,9 @@
-"""Track the torque state: on from the request to switch it on, off only after confirmation.
+"""Track the torque state: on as soon as torque is requested, off only after confirmation.
 
 Torque off is sent on every tick until the servo registers confirm it. If the servos do not confirm
 within half the bus watchdog time, the bus stays silent until the watchdog has stopped the motors.
-Otherwise, a servo that receives read requests but loses all writes would keep driving. The daemon
-then tries torque off again.
+Otherwise, a servo that receives read requests but loses all writes would keep driving its motor.
+The daemon then tries to switch torque off again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _CLOSING_TRY_COUNT = 15  # attempts at shutdown
 
 
 class TorqueState:
-    """Torque controller that writes ``torque``, ``torque_off`` and ``write_error`` of the state."""
+    """Torque controller. It writes ``torque``, ``torque_off`` and ``write_error`` in the state."""
 
     def __init__(
         self,

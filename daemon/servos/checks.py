@@ -183,7 +183,7 @@ def check_registers(
     finger: int,
     status: Status,
 ) -> list[Finding]:
-    """Return findings with this ``status`` for registers without the required value."""
+    """Return findings with this ``status`` for registers that lack the required value."""
     found = []
     for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
         wrong = row.wrong_in(table)

@@ -67,8 +67,8 @@ _CLOSING_TRY_COUNT = 10  # torque-off attempts when closing
 class DynamixelServos:
     """Servo backend over a serial port; see :class:`servos.base.Servos`.
 
-    Use it from a single thread only. ``notices`` contains the findings of `connect` that are not
-    errors.
+    Use an object from a single thread only. ``notices`` contains the findings of `connect` that are
+    not errors.
     """
 
     def __init__(self, settings: Settings, clock: Clock) -> None:

@@ -70,7 +70,7 @@ def choose_reads(
 ) -> tuple[TickReads, list[Finding]]:
     """Return the fastest group reads supported by all servos, and notices.
 
-    ``claims_fast`` is True if the firmware should support fast sync reads. If these fail, the
+    ``claims_fast`` is True if the firmware should support fast sync reads. If fast reads fail, the
     normal sync read is used and a notice is returned. Raises ServoError if the servos do not
     respond to any group read.
     """

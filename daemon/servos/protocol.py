@@ -9,12 +9,12 @@ The rest of the SDK is used unchanged.
 - ``rxPacket`` polls with non-blocking reads, which keeps a processor busy during transmission.
 - ``txPacket`` leaves ``is_using`` set if the port raises, so all later calls return −1000.
 - ``readTxRx`` accepts replies with a wrong length, so the CRC of a late reply is returned as data.
-- ``GroupSyncRead`` discards the servos' error bytes and returns 0 after a failure. Alerts are lost,
-  and a joint appears to be at 0.
+- ``GroupSyncRead`` discards the servos' error bytes and returns 0 after a failure. As a result,
+  alerts are lost, and the joint appears to be at position 0.
 - ``broadcastPing`` always waits for 253 servos, which takes 0.8 s at 1 Mbaud.
 - ``PortHandler`` measures deadlines on the wall clock and adds 34 ms. A missing servo therefore
-  causes a delay of 35 ms, and adjusting the system clock changes the deadline. It also opens ports
-  that are in use by another process.
+  causes a delay of 35 ms, and adjusting the system clock changes the deadline. ``PortHandler`` also
+  opens ports that are in use by another process.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     ) -> tuple[list[int], int, int]:
         """Read a register span; return (data, result code, error byte).
 
-        After an error, the data are 0. Replies of the wrong length are skipped. They are late
+        After an error, the data are 0. Replies of the wrong length are skipped: they are late
         replies to an action instruction, for which the SDK does not wait.
         """
         if dxl_id >= BROADCAST_ID:
@@ -162,7 +162,7 @@ class GroupRead:
     """Sync read of one register span from several servos.
 
     After a successful :meth:`exchange`, ``data[id]`` contains the span's bytes and ``errors[id]``
-    the servo's error byte. After a failure, their contents are undefined.
+    the servo's error byte. After a failure, the contents of both are undefined.
     """
 
     instruction = INST_SYNC_READ
@@ -246,7 +246,7 @@ class GroupWrite:
         self.ids = [bytes((servo_id,)) for servo_id in ids]
 
     def send(self, values: Sequence[bytes]) -> None:
-        """Write one value per servo, in the order of the IDs, without a reply."""
+        """Write one value per servo, in the order of the IDs. Servos do not reply."""
         body = b"".join(name + value for name, value in zip(self.ids, values, strict=True))
         self._port.send(packed(BROADCAST_ID, INST_SYNC_WRITE, self._span + body))
 

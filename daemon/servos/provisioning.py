@@ -102,8 +102,8 @@ def search(
 ) -> Found:
     """Search the port for servos for ``wait`` [s] at each baud rate, without changing registers.
 
-    Baud rates that the adapter does not support are skipped. If corrupted bytes arrive, ``ids`` are
-    probed individually.
+    Baud rates that the adapter does not support are skipped. If corrupted bytes arrive, each of the
+    ``ids`` is probed individually.
 
     Raises
     ------
@@ -190,7 +190,8 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 
     If a servo of the configured model replies at another baud rate with the ID of a missing servo,
     it is assumed to be the missing servo. Otherwise, if exactly one servo is unassigned and exactly
-    one is missing, they are matched. Servos with corrupted replies are not changed.
+    one servo is missing, the former is assumed to be the latter. Servos with corrupted replies are
+    not changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}

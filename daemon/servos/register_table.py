@@ -1,4 +1,4 @@
-"""List the servo registers that affect the hand and their required values.
+"""List the servo registers that affect the hand, with their required values.
 
 :func:`required_registers` returns the table in the order of the e-Manual's control table. A servo
 retains its EEPROM permanently and its RAM until power is cut, so both may contain values from
@@ -88,10 +88,7 @@ _AT: Final = {register.address: register for register in REGISTERS}
 
 
 class Requirement(NamedTuple):
-    """Required value of a register.
-
-    If the value is wrong, a finding with this ``status`` is reported.
-    """
+    """Required value of a register. Other values are reported as findings with this ``status``."""
 
     register: Register
     holds: Callable[[int], bool]

@@ -34,8 +34,8 @@ The firmware sends each scan without being asked, at any baud rate (USB boards m
 
 A 44 × 44 frame of uint16 takes at most 3903 bytes on the wire. `encode` is the reference
 implementation. A reader that starts within a frame synchronises at the next zero byte. Incomplete
-and corrupted frames are dropped: the CRC detects every error of up to 16 adjacent bits, and all but
-1 in 65536 of all other errors. Gaps in the sequence numbers indicate the number of missed frames.
+and corrupted frames are dropped: the CRC detects every error within 16 adjacent bits, and all but 1
+in 65536 other errors. Gaps in the sequence numbers indicate the number of missed frames.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 Supported files:
 
-- ``.npz`` with ``frames`` [n, rows, cols], or with a single three-dimensional array of another
-  name. Optional arrays are ``t`` [n], ``live`` [rows, cols] bool, and the true contact of each
-  frame, if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
+- ``.npz`` with ``frames`` [n, rows, cols], or with a single three-dimensional array that has
+  another name. Optional arrays are ``t`` [n], ``live`` [rows, cols] bool, and the true contact of
+  each frame, if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
 - ``.npy`` with one frame [rows, cols] or several frames [n, rows, cols], or a folder of such files.
   The files are sorted by name, and numbers in names are sorted by value. The folder may contain
   ``t.npy`` [n].

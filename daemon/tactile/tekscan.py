@@ -66,7 +66,7 @@ class TekscanError(SoftfingerError, ValueError):
 class Export:
     """Parsed export.
 
-    ``values`` float64 [frames, rows, cols] are in Pa, or counts if ``raw``. They are 0 where
+    ``values`` float64 [frames, rows, cols] are in Pa, or counts if ``raw``. The values are 0 where
     ``live`` [rows, cols] is False. ``t`` float64 [frames] is the time since the first frame [s].
     ``pitch`` (x, y) [m] is NaN if the header does not contain it. ``full`` is the reading of a
     saturated cell, inf if unknown.

@@ -1,7 +1,7 @@
 """Provide a local socket for ``stop`` that other clients can't block.
 
-It is a Unix datagram socket, so connections can't run out. Only the daemon's user has access to its
-folder. `client.command_client` uses the socket if it exists.
+The socket is a Unix datagram socket, so connections can't run out. Only the daemon's user has
+access to the socket's folder. `client.command_client` uses the socket if it exists.
 """
 
 from __future__ import annotations

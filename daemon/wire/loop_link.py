@@ -44,8 +44,8 @@ class Ask(NamedTuple):
 
     ``came`` is the arrival time according to `machine_time`. ``stops`` is the number of stops that
     certainly arrived before the request. An ``urgent`` request looks like a stop. ``name`` is the
-    client name that belongs to the client's key. ``route`` is the return route for the reply. Its
-    first part identifies the connection.
+    client name that belongs to the client's key. ``route`` is the return route for the reply. The
+    first part of the route identifies the connection.
     """
 
     came: float
@@ -146,7 +146,7 @@ class Link:
         self._offered = channel
 
     def watch(self, descriptor: int) -> None:
-        """Poll an additional descriptor; `look` then sets `called` if it is readable."""
+        """Poll an additional descriptor; `look` sets `called` when the descriptor is readable."""
         self._other = descriptor
         self._poll.register(descriptor, select.POLLIN)
 
@@ -214,7 +214,7 @@ class Link:
         self.unpacked.clear()
 
     def fence(self, stops: int) -> None:
-        """Send the gateway the stop count with which it must stamp requests."""
+        """Send the current stop count to the gateway, which stamps requests with this count."""
         self._fence = stops
         if self._channel is not None and stops:
             self._channel.send(FENCE, stops)

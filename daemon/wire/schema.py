@@ -98,7 +98,7 @@ _news = FieldSource["EventSource"]()
 
 @record
 class _TickMessage:
-    """Message sent every n-th tick."""
+    """Message that is sent on every n-th tick."""
 
     schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _state(*_SEQ)

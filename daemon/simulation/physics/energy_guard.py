@@ -69,7 +69,7 @@ def is_on_rim(plant: Plant) -> bool:
 
 @inner_kernel
 def open_guard(plant: Plant) -> None:
-    """Accept the current energy if it was changed from outside since the last step."""
+    """Accept the current energy if the state was changed externally since the last step."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy

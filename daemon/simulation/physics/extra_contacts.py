@@ -13,7 +13,8 @@ by a rigid plane, with d = a − D/2, where D is the distance between the centre
 both tips is U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With
 different tilts, a real contact surface would bulge towards the softer tip, so this energy is
 slightly too high (second order in the difference of cos² θ). The plane sticks equally to both tips:
-each tip shears by half of the relative sliding of their surfaces, minus its tan θ ḋ.
+the shear rate of each tip is half of the relative sliding velocity of the two surfaces, minus the
+tip's tan θ ḋ.
 """
 
 from __future__ import annotations

@@ -54,8 +54,8 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 def set_motor_slopes(plant: Plant, g: float) -> None:
     """Set the motor torque derivatives (angle and velocity), divided by (τ + g).
 
-    The derivatives are 0 unless the motors are stiff relative to a step ``g``. They are upper
-    bounds, since the current may enter or leave its limits within the step.
+    The derivatives are 0 unless the motors are stiff relative to a step ``g``. The derivatives are
+    upper bounds, because the current may enter or leave its limits within the step.
     """
     p, goals = plant.parameters, plant.goals
     constant = p.torque_constant

@@ -215,7 +215,7 @@ def store_bristles(plant: Plant) -> None:
 
 @inner_kernel
 def senses_other_tip(plant: Plant, finger: int) -> bool:
-    """Return True if a tip senses the other tip because that contact is stronger."""
+    """Return True if a tip senses the other tip rather than the object."""
     if not plant.tips_may_touch:
         return False
     stage = plant.stages[0]

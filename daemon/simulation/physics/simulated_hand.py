@@ -309,7 +309,7 @@ class SimulatedHand:
         self._run(0)
 
     def place_object(self) -> None:
-        """Move the object back to its start pose with no velocity or load."""
+        """Move the object back to its start pose, at rest and without load."""
         self.object_pose[:], self.object_velocity[:] = self._first_pose, 0.0
         self.load()
         self.refresh()

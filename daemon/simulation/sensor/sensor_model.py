@@ -4,11 +4,12 @@
 profiles ``velostat`` and ``capacitive`` use them.
 
 `sensing.pressure_grid` computes the pressure of a plane face; this module computes the pressure of
-a cylindrical face, as on a disc. Both use the same spring model: above each point of the base, the
-face compresses a vertical spring whose length is the height of the hemisphere. An estimator that
-assumes a plane face interprets the narrower footprint as a smaller d: it finds 0.72 of the true
-value for R = a, and 0.83 for R = 2a. Its θ is 1 % to 12 % too small (the error increases with d),
-and its gain is above 1, which compensates for the underestimated force.
+a cylindrical face, as on a disc. Both calculations use the same spring model: above each point of
+the base, the face compresses a vertical spring whose length is the height of the hemisphere. An
+estimator that assumes a plane face interprets the narrower footprint as a smaller d: it finds 0.72
+of the true value for R = a, and 0.83 for R = 2a. The estimated θ is 1 % to 12 % too small (the
+error increases with d), and the estimated gain is above 1, which compensates for the underestimated
+force.
 """
 
 from __future__ import annotations

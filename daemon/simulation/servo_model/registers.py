@@ -35,7 +35,7 @@ _UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 class Item:
     """One register.
 
-    ``low`` and ``high`` are the limits in the manual's table; other registers may narrow them.
+    ``low`` and ``high`` are the limits in the manual's table. Other registers may narrow the range.
     """
 
     address: int
