@@ -444,8 +444,8 @@ def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
 def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
     """Fit non-negative relaxation strengths to the force of a press and the following hold.
 
-    F∞ is constant during the hold. During the press, F∞ follows from F and the strengths. Therefore
-    F∞ and the strengths are determined alternately.
+    F∞ is constant during the hold. During the press, F∞ follows from F and the strengths. The fit
+    therefore alternates between F∞ and the strengths.
 
     Parameters
     ----------

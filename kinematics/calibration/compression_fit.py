@@ -66,7 +66,7 @@ class Run:
 
     @property
     def depth(self) -> float:
-        """Largest d beyond the beginning of the curve [m]."""
+        """Maximum d relative to the beginning of the curve [m]."""
         return float(self.d.max()) - self.begin
 
     @property

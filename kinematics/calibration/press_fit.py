@@ -119,11 +119,11 @@ class TipFit:
 
     ``law`` is the material law for a modulus of 1 Pa at zero strain. The fit determines ``modulus``
     [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the mean
-    squared residual per cell divided by the noise variance. The following errors are errors of the
-    estimator for this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors.
-    ``force_error`` is the rms difference between the estimated force and the frame sum, divided by
-    the rms frame sum. The errors include only frames with a valid estimate; ``valid`` is the
-    fraction of such frames. ``trend`` contains the value of E from each individual press.
+    squared residual per cell divided by the noise variance. The errors below are the estimator's
+    errors for this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors. ``force_error``
+    is the rms difference between the estimated force and the frame sum, divided by the rms frame
+    sum. The errors include only frames with a valid estimate; ``valid`` is the fraction of such
+    frames. ``trend`` contains the value of E from each individual press.
     """
 
     tip: Fingertip

@@ -15,10 +15,10 @@ it. Numba then optimises the function together with its callees, compiles it to 
 two wrappers and caches it. The callers link the bitcode and repeat this work. Stopping at bitcode
 reduces the compile time by a third and the cache size to a quarter.
 
-`KernelCache` stores the machine code of a kernel but not its bitcode. If another kernel calls the
-stored kernel, it needs the bitcode and therefore compiles the kernel again. Before loading a stored
-kernel, Numba normally imports all its implementations of Python and NumPy functions, which takes a
-third of a second and 50 MB. `KernelCache` skips this import.
+`KernelCache` stores the machine code of a kernel but not its bitcode. A kernel that calls the
+stored kernel needs the bitcode and therefore compiles the stored kernel again. Before loading a
+stored kernel, Numba normally imports all its implementations of Python and NumPy functions, which
+takes a third of a second and 50 MB. `KernelCache` skips this import.
 """
 
 from __future__ import annotations
