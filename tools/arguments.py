@@ -102,7 +102,8 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
 def stream_address(text: str) -> str:
     """Parse the stream address from a socket address, ``tcp://HOST`` or ``STREAM,COMMANDS``.
 
-    An empty string selects SOFTFINGER_ADDRESS, or else the default address on this machine.
+    An empty string selects SOFTFINGER_ADDRESS or, if the variable is unset, the default address on
+    this machine.
 
     Raises
     ------

@@ -277,7 +277,7 @@ def _depths(d: FloatArray) -> FloatArray:
 
 
 def draw_landscape(run: RecordedRun) -> Figure:
-    """Draw paths on U(d, θ) with its minimum over θ, and their height above U(d, 0) versus time."""
+    """Draw paths on U(d, θ) and its minimum over θ; plot their height above U(d, 0) versus time."""
     tables = run.contacts()
     figure = style.new_figure(7.0, 2.2 + 4.0 * len(tables))
     panels = figure.subplots(len(tables) + 1, 1, height_ratios=[*[1.0] * len(tables), 0.4])

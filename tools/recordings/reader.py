@@ -141,7 +141,7 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last message [s], or 0 if empty."""
+        """Time from the first to the last message [s], or 0 for an empty recording."""
         return 0.0 if math.isnan(self.start) else self.end - self.start
 
     @property
@@ -315,7 +315,7 @@ class Recording:
             self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
-        """Check the file's end; return the header's profile, or PROFILE if it is unreadable."""
+        """Check the file's end; return the profile in the header, or PROFILE without a header."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Header
 

@@ -210,7 +210,7 @@ class Site:
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Send a page the next picture each time it requests one, together with the missing rows.
+        """Send a page the next picture and the missing rows, each time it requests a picture.
 
         A new scene is sent before the picture.
         """
