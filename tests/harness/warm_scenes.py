@@ -61,7 +61,7 @@ SCRIPT: list[tuple[float, dict[str, Any]]] = [
 
 
 class Watch(event.Listener):
-    """Record each time a kernel is compiled or loaded from the cache, which delays a tick."""
+    """Record each compilation of a kernel and each load from the cache; both delay a tick."""
 
     def __init__(self) -> None:
         self.heard: list[str] = []

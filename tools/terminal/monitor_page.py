@@ -300,7 +300,7 @@ class MonitorPage:
         return lines + [Text() for _ in range(count - len(lines))]
 
     def _footer(self, width: int) -> Text:
-        """List all keys or, on a narrow terminal, only the keys that the current mode allows."""
+        """List the keys; a narrow terminal shows only keys that are useful in the current mode."""
         if not self.keys:
             return Text(" no keyboard input: send commands with softfinger send", DIM)
         force = f"{self.force:.3g} N" if math.isfinite(self.force) else "N"
