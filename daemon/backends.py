@@ -2,7 +2,7 @@
 
 Built-in backends are listed in `BUILT_IN`. Plugins are entry points of installed packages, in the
 groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A servo or tactile
-plugin is a class, and a shape plugin is a function. Both take the same arguments as the built-in
+plugin is a class, and a shape plugin is a function. Plugins take the same arguments as the built-in
 backends. A plugin may define these attributes:
 
 - ``metal``: True (default) if the backend is real hardware.

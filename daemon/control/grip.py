@@ -13,13 +13,13 @@ parts:
 With ``control.law = "energy"``, the moment arms are the gradient of the contact-table energy along
 the rolling increments. These moment arms include the moments and shear forces of the tips.
 
-With ``"upright"``, the control law ignores the object angle until a command steers it. Both joints
-receive the same torque plus damping, as in the literature on blind grasping. A virtual spring
-between the fingers places the minimum of the tips' elastic energy at the upright object pose,
-regardless of residual shear in the tips (`hand.upright`). Antisymmetric dither of the fingers
-overcomes joint friction until the object has settled in that minimum. The control law then holds
-the antisymmetric joint angle. Once a command steers the object, the moment arm is the force's arm
-about the pivot.
+With ``"upright"``, the control law ignores the object angle until a command steers it. The upright
+law gives both joints the same torque plus damping, as in the literature on blind grasping. A
+virtual spring between the fingers places the minimum of the tips' elastic energy at the upright
+object pose, regardless of residual shear in the tips (`hand.upright`). Antisymmetric dither of the
+fingers overcomes joint friction until the object has settled in that minimum. The control law then
+holds the antisymmetric joint angle. Once a command steers the object, the moment arm is the force's
+arm about the pivot.
 """
 
 from __future__ import annotations

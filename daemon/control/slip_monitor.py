@@ -10,7 +10,7 @@ The following is computed on each tick, with the names from `SlipLaw`, `SlipStat
     force     min(max(commanded, needed), force_limit)
 
 **Offset.** Gear friction and errors in modulus and torque constant cause a residual even without a
-load. This offset is measured when holding begins, and again after force or angle have changed. A
+load. The offset is measured when holding begins, and again after force or angle have changed. A
 load detected during the previous hold is not part of the offset. The offset then follows r̄ slowly
 (_SETTLING_TIME). While the joints are at standstill, the offset follows the commanded torque
 immediately, because friction carries any torque that is added to a stuck joint. The offset stays
@@ -367,7 +367,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
 def _has_turned(s: SlipState, grasp: GraspState) -> bool:
     """Return True if the object has rotated by more than the tips' shear deformation.
 
-    Both tips must show the rotation, because a faulty sensor can indicate one by itself.
+    Both tips must show the rotation, because a single faulty sensor can simulate a rotation.
     """
     for k in range(2):
         s.rotation[k] += grasp.unexplained_rotation[k] - s.rotation_seen[k]

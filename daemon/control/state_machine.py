@@ -26,13 +26,13 @@ Several states share these transitions:
 - Settled, Changing, Turning: `rotate` → Turning
 - Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for _EMPTY_TIME →
   Travelling (RELEASING)
-- Pressing, Settled, Changing, Turning: a contact is missing for _CONTACT_LOSS_TIME → Armed. Until
-  then, the joints hold their positions (`ContactLoss`).
+- Pressing, Settled, Changing, Turning: a contact is missing for _CONTACT_LOSS_TIME → Armed. While
+  the contact is missing, the joints hold their positions (`ContactLoss`).
 
-Each transition creates a new instance of one of the classes below. Timers and flags are attributes
-of the state that uses them and are discarded with it. `control.modes` lists the commands for each
-mode, `loop.requests` checks them, `control.fingers` drives the joints, `control.grip` computes the
-joint torques of a grip, and `safety.safety` limits the goals.
+Each transition creates a new instance of a state class. Timers and flags are attributes of the
+state that uses them and are discarded with it. `control.modes` lists the commands for each mode,
+`loop.requests` checks them, `control.fingers` drives the joints, `control.grip` computes the joint
+torques of a grip, and `safety.safety` limits the goals.
 """
 
 from __future__ import annotations
@@ -417,8 +417,9 @@ class Control:
     def _empty_for(self, before: float, dt: float) -> float:
         """Return the duration [s] of apparent tip-to-tip contact; release after _EMPTY_TIME.
 
-        Tips that press against each other would roll off to one side. Both sensors measure the same
-        contact in this case, so the estimated object width is 0 within its error.
+        Tips that press against each other would roll off to one side. When the tips touch each
+        other, both sensors measure the same contact, so the estimated object width is 0 to within
+        its standard error.
         """
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:

@@ -139,7 +139,10 @@ def _restore(
 
 
 def _stored(path: Path) -> dict[int, StoredServo]:
-    """Return the servos in a file by ID. Raises ServoError if the file format is invalid."""
+    """Return a file's servos as a dictionary with the ID as key.
+
+    Raises ServoError if the file format is invalid.
+    """
     try:
         stored = StoredServos.model_validate_json(read_file(path, _FILE_SIZE_MAX))
     except OSError as error:

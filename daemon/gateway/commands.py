@@ -1,16 +1,16 @@
 """Forward requests to the loop, within limits, and forward replies to clients.
 
 The gateway does not unpack requests. Requests that look like a stop bypass the queues, one at a
-time for each client. Only a few other requests are forwarded to the loop at a time. The other
-requests wait in queues, and the clients are served in turn. If a client exceeds its rate, its
-requests are refused until it pauses.
+time for each client. Apart from stops, only a few requests are forwarded to the loop at a time.
+Further requests wait in queues, and the clients are served in turn. If a client exceeds its rate,
+its requests are refused until it pauses.
 
 Each request is stamped with its arrival time and the number of stops that preceded it. The libzmq
 thread reads ahead, so the gateway can't determine whether a request arrived before or after a stop.
 After a stop or a gap between two polls, the gateway therefore stamps requests as if they had
-arrived earlier, until the socket has been empty and few requests have arrived. Until then, replies
-are also held back for a limited time, because clients may respond to a reply with new requests,
-which would be refused.
+arrived earlier, until the socket has been empty and few requests have arrived. Replies are also
+held back, for a limited time, because clients may respond to a reply with new requests, which would
+be refused.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Provide the client sockets and authenticate the clients.
 
 Without keys all clients are accepted, but libzmq disconnects peers that do not send a ZMTP 3
-greeting. This excludes web pages, whose POST requests are valid messages in older protocol
+greeting. The greeting excludes web pages, whose POST requests are valid messages in older protocol
 versions.
 """
 

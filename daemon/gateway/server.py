@@ -1,7 +1,7 @@
 """Run the gateway process, in which one thread serves the loop and the clients.
 
-It is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's file
-descriptor and a `Config` as JSON. The process first binds its sockets, and exits when the loop
+The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's
+file descriptor and a `Config` as JSON. The process first binds its sockets, and exits when the loop
 disconnects.
 """
 

@@ -250,8 +250,8 @@ def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
 class Service:
     """Notifier for systemd via the socket in ``NOTIFY_SOCKET``. Never blocks or raises.
 
-    Each notification is one datagram. The loop calls `alive` on every tick. Most calls only compare
-    times; only a few messages are sent per watchdog period.
+    Each systemd notification is one datagram. The loop calls `alive` on every tick. Most calls only
+    compare times; only a few messages are sent per watchdog period.
     """
 
     def __init__(self, address: str, watchdog: float = 0.0) -> None:

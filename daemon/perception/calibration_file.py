@@ -283,7 +283,7 @@ class Converter:
     def pressure(self, readings: FloatArray) -> FloatArray:
         """Convert readings to pressure [Pa].
 
-        The curve is odd because noise may make readings negative.
+        The curve is an odd function, because noise may make readings negative.
         """
         exponent, c1, c2, c3 = self._curve.tolist()
         x = np.abs(readings)

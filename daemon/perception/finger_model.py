@@ -156,7 +156,9 @@ def make_estimator(
     active: NDArray[np.bool_] | None = None,
     calibration: Calibration | None = None,
 ) -> ContactEstimator | MeasuredEstimator:
-    """Create a finger's estimator. It keeps the last estimate, so fingers can't share one.
+    """Create a finger's estimator.
+
+    An estimator stores its last estimate, so each finger needs its own estimator.
 
     Parameters
     ----------

@@ -77,8 +77,8 @@ class RepeatDetector:
     """Detector for frame sequences that repeat in the same order.
 
     A noisy sensor never repeats a frame. At standstill, a noise-free sensor may send the same frame
-    for a long time or alternate between two frames. Such frames do not count as a repetition; the
-    frozen-sensor check handles constant frames.
+    for a long time or alternate between two frames. Constant or alternating frames do not count as
+    a repetition; the frozen-sensor check handles constant frames.
     """
 
     def __init__(self, rate: float, enabled: bool = True) -> None:

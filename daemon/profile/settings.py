@@ -557,8 +557,8 @@ class SafetySettings(Section):
             "fault is latched."
     )  # fmt: skip
     residual_width: Positive = setting(
-        0.004, "m", "Change of the held object's width since the grip began, above which a fault is "
-        "latched."
+        0.004, "m", "Change of the held object's width since the grip began, above which a fault "
+        "is latched."
     )  # fmt: skip
     residual_force: Positive = setting(
         0.5, "", "Relative difference between the tip forces, above which a warning is issued."

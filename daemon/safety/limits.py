@@ -53,7 +53,8 @@ class JointMotion:
     """Consistency check of joint angles with measured velocities and the maximum velocity.
 
     An encoder may jump, freeze while the joint rotates, or drift while the joint is at standstill.
-    Its angles are then inconsistent with its velocity, and the finger's bit is set in ``jumped``.
+    A faulty encoder's angles are inconsistent with its velocity, and the finger's bit is then set
+    in ``jumped``.
     """
 
     def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:

@@ -24,7 +24,7 @@ _CLOSING_TRY_COUNT = 15  # attempts at shutdown
 
 
 class TorqueState:
-    """Torque controller. It writes ``torque``, ``torque_off`` and ``write_error`` in the state."""
+    """Torque controller that writes ``torque``, ``torque_off`` and ``write_error`` in the state."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class TorqueState:
         """Request torque off immediately; return "confirmed" or "unconfirmed".
 
         The call waits for at most one reply. Each tick repeats the request until the servos confirm
-        it.
+        torque off.
         """
         state, servos = self._state, self.servos
         if servos is None:

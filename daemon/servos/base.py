@@ -23,8 +23,8 @@ Status = Literal["pass", "note", "fixed", "warn", "FAIL"]
 class Finding:
     """Result of checking one device or the machine, and how to fix any problem.
 
-    ``FAIL`` prevents the daemon from running, and ``warn`` degrades its operation. The other
-    statuses require no action.
+    ``FAIL`` prevents the daemon from running, and ``warn`` degrades its operation. All other status
+    values require no action.
     """
 
     status: Status
@@ -48,8 +48,8 @@ class Servos(Protocol):
       with ``servos.stiffness`` and ``servos.damping``, limited to ± ``goal.current``. Without
       readings, the current stays constant until the servo's bus watchdog stops the servo.
     - *position* (3): the servo's own position loop without a current limit. ``goal.current`` is
-      ignored, and switching torque on holds the joint immediately. This mode is suitable for moving
-      but not for grasping.
+      ignored, and switching torque on holds the joint immediately. Position mode is suitable for
+      moving but not for grasping.
 
     ``connect`` checks the servos and never switches torque on or moves the hand. ``read`` and
     ``write`` are called once per tick. A failed exchange is reported by ``valid`` and the counters.

@@ -1,7 +1,7 @@
 """Implement the client side of Protocol 2.0: packet handler, group exchanges and single servos.
 
 This module and :mod:`servos.port` override the following behaviour of the SDK (3.7.31 to 4.1.0).
-The rest of the SDK is used unchanged.
+All other SDK functions are used unchanged.
 
 - ``txPacket`` discards the stuffed packet, so the sequence FF FF FD in a goal is sent without
   stuffing and is misinterpreted.
@@ -270,7 +270,7 @@ class ServoLine:
         return None
 
     def ping_old(self, servo_id: int) -> bool:
-        """Return True if a servo replies to one ping in Protocol 1.0."""
+        """Return True if a servo replies to a Protocol 1.0 ping."""
         port = self.port
         body = bytes((servo_id, 2, INST_PING))
         request = _OLD_HEADER + body + bytes((~sum(body) & 0xFF,))
@@ -311,7 +311,7 @@ class ServoLine:
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write bytes of equal length to each servo without a reply or verification.
 
-        This uses a sync write, which works at every status return level.
+        The method uses a sync write, which works at every status return level.
         """
         length = len(next(iter(values.values())))
         GroupWrite(self.port, address, length, list(values)).send(list(values.values()))

@@ -6,9 +6,10 @@ another program. The EEPROM is checked in `connect` and written only by `softfin
 RAM registers marked ``armed`` are written by `arm`, so they are correct even after a reboot.
 
 The omitted registers do not affect goal tracking, limits or bus replies in the modes used by the
-hand. ID and baud rate are found by a search. Moving threshold, LED and external ports are only
-indicators. Velocity gains and goal velocity apply only to velocity mode. `servos.torque` writes
-goal current, goal position, bus watchdog and indirect addresses on each `arm`.
+hand. ID and baud rate are found by a search. The registers for moving threshold, LED and external
+ports have no effect on the motion. Velocity gains and goal velocity apply only to velocity mode.
+`servos.torque` writes goal current, goal position, bus watchdog and indirect addresses on each
+`arm`.
 """
 
 from __future__ import annotations

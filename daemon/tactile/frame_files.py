@@ -11,8 +11,8 @@ Supported files:
 - Other files are read as Tekscan-style ASCII exports.
 
 Integer frames contain counts. Other frames are in Pa and are converted with ``pascal_per_count``. A
-cell that is NaN in all frames is dead. Negative readings are set to 0 if noise around a tared zero
-can explain them. Times are in seconds, unless their step or date indicates another unit.
+cell that is NaN in all frames counts as dead. Negative readings are set to 0 if noise around a
+tared zero can explain them. Times are in seconds, unless their step or date indicates another unit.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Connect the loop and the gateway by a socket pair; define the messages and the loop's end.
 
 Each message is a msgpack list whose first element is the message kind. Sending never blocks. If the
-socket buffer is full, the remaining bytes are sent later. Until then, stream messages are dropped,
-but replies and stops are queued. The gateway limits the number of pending requests, so this queue
-is bounded.
+socket buffer is full, the remaining bytes are sent later. While bytes remain, stream messages are
+dropped, but replies and stops are queued. The gateway limits the number of pending requests, so
+this queue is bounded.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def pair() -> tuple[socket.socket, socket.socket]:
 
 
 def repeated(message: bytes) -> bytes:
-    """Return a stream message with its ``again`` field set, if it has one."""
+    """Return a stream message after setting its ``again`` field, if this field exists."""
     return message.replace(_FIRST, _AGAIN, 1)
 
 

@@ -311,7 +311,10 @@ class HandState(_TickMessage):
         return record_text.state_html(self)
 
     def finger(self, name: str) -> FingerState:
-        """Return the finger named ``left`` or ``right``. Raises ValueError for other names."""
+        """Return the finger named ``left`` or ``right``.
+
+        Raises ValueError if no finger has this name.
+        """
         if name not in FINGERS:
             raise ValueError(f"found finger {name!r}, expected one of {', '.join(FINGERS)}")
         return self.left if name == FINGERS[0] else self.right

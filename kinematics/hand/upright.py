@@ -1,8 +1,8 @@
 """Compute the virtual joint spring that keeps a held object upright despite sticking tips.
 
-Two mirrored fingers hold an object of width W by its parallel faces. Each tip is displaced by
-d. The small antisymmetric motions are the object's angle φ and the antisymmetric joint angle
-δ = (q1 − q2)/2. These motions change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual
+Two mirrored fingers hold an object of width W by its parallel faces. Each tip is displaced by d.
+The small antisymmetric motions are the object's angle φ and the antisymmetric joint angle δ = (q1 −
+q2)/2. These antisymmetric motions change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual
 spring k between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by
 kδ. For a normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ
 + σ, where c is 2/3 for the spring model of the paper. With b = k/(N B) and pivots 2B apart,

@@ -259,8 +259,8 @@ class Body:
         """Return the energy, the dof forces and, if ``pressures`` are given, the upper tangent.
 
         ``pressures`` are the coefficients (e, 4) of each element's linear functions, updated as in
-        the Newton steps of a mixed method. Without these pressures, the second-order volume change
-        in a step, multiplied by κ, would distort the next tangent.
+        the Newton steps of a mixed method. If each step recomputed the pressures, the second-order
+        volume change, multiplied by κ, would distort the next tangent.
         """
         if self.at_rest is not None:
             out = self.times_tangent(self.at_rest, motion)

@@ -690,7 +690,7 @@ class Soak:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:
-        """Check that each channel reported as faulty is faulty, unless the object has slipped."""
+        """Check that only faulty channels are reported as faulty, unless the object has slipped."""
         t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1

@@ -157,7 +157,7 @@ class Site:
         await asyncio.gather(*others, return_exceptions=True)
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the page or a refusal, or None to accept a WebSocket."""
+        """Return the HTTP response (page or refusal), or None to accept a WebSocket connection."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         path, upgrade = urlsplit(request.path).path, "Upgrade" in request.headers
         known = [[], *([f"http://{host}"] for host in hosts)]

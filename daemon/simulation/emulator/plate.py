@@ -133,7 +133,7 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
 
 
 class Plate:
-    """Plate above one tip. Its path is piecewise linear in the hand's time [s]."""
+    """Plate above one tip. The plate's path is piecewise linear in the hand's time [s]."""
 
     def __init__(self) -> None:
         self._t = [0.0]

@@ -122,10 +122,10 @@ def friction_level(plant: Plant, finger: int, rate: float, current: float) -> fl
 def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
     """Return a joint's bristle torque [N·m] and set the bristle damping as the joint's drag.
 
-    Elastic bristles with deflection z connect the gears and slip at the friction level f. This is
-    the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE Trans. Automatic
-    Control 47(5), 2002), with the same deflection z_p = ``presliding`` for break-away and steady
-    slip:
+    Elastic bristles with deflection z connect the gears and slip at the friction level f. The
+    bristles follow the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE
+    Transactions on Automatic Control 47(5), 2002), with the same deflection z_p = ``presliding``
+    for break-away and steady slip:
 
         torque = f z/z_p    ż = q̇ while |z| ≤ z_p
 

@@ -39,17 +39,17 @@ the maximum ratio. Damping is viscous and proportional to the stiffness of the s
 increases as the contact grows.
 
 The shear of a stuck tip may relax by creep and by micro-slip. Creep and micro-slip are off by
-default. Without them, a tip sticks or slips as a whole and has no memory. Micro-slip occurs because
-each spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed by w = ℓ
-− h, has the pressure Ew/ℓ. When the face has moved by u, the spring has the shear traction Eu/ℓ and
-slips if u > μw. All layers w = 0 … d are equally stiff, because r dr = −ℓ dℓ. Starting from zero
-shear, integration gives
+default. Without creep and micro-slip, a tip sticks or slips as a whole and has no memory.
+Micro-slip occurs because each spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² −
+r²), compressed by w = ℓ − h, has the pressure Ew/ℓ. When the face has moved by u, the spring has
+the shear traction Eu/ℓ and slips if u > μw. All layers w = 0 … d are equally stiff, because r dr =
+−ℓ dℓ. Starting from zero shear, integration gives
 
     T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
 
-where the whole tip slips at u = μd. This is an Iwan model with uniformly distributed limits. The
-layers scale with the footprint. The mean of the layer shears is the tip's d_t, and their variance
-adds to d_t² in the tip energy.
+where the whole tip slips at u = μd. The layers form an Iwan model with uniformly distributed
+limits. The layers scale with the footprint. The mean of the layer shears is the tip's d_t, and
+their variance adds to d_t² in the tip energy.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def fade(theta: float) -> tuple[float, float]:
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
     """Return the maximum ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of maximum ratio.
 
-    Here, ζ is measured from the shear at which T = 0.
+    In this function, ζ is measured from the shear at which T = 0.
     """
     if friction <= 0.0 or n0 <= 0.0:
         return 0.0

@@ -175,7 +175,7 @@ class SensorModel:
         """Sample points: their positions across the cylinder axis, and the hemisphere heights [m].
 
         Both arrays have the shape [lines, points per line]; the height is 0 beyond the rim. The
-        other two results are matrices that average over cells along y and x, including blur.
+        last two results are matrices that average over cells along y and x, including blur.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -251,7 +251,7 @@ class SensorModel:
 def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
     """Apply hysteresis: each cell reads higher during unloading than during loading.
 
-    This is a Prandtl-Ishlinskii model: the output of a cell is the mean of PLAY_COUNT generalised
+    In this Prandtl-Ishlinskii model, the output of a cell is the mean of PLAY_COUNT generalised
     play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each operator follows an
     increasing pressure p immediately. An operator follows a decreasing pressure only when its state
     is above (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. The loading curve is
