@@ -6,9 +6,9 @@ plugin is a class, and a shape plugin is a function. Plugins take the same argum
 backends. A plugin may define these attributes:
 
 - ``metal``: True (default) if the backend is real hardware.
-- ``hand``: True if the plugin needs the simulated hand, which is then passed as to a built-in
-  backend. Instead of True, a servo plugin may specify a class that replaces `SimulatedHand` and
-  takes the same arguments.
+- ``hand``: True if the plugin needs the simulated hand. The daemon then passes the hand in the same
+  way as to a built-in backend. Instead of True, a servo plugin may specify a class that replaces
+  `SimulatedHand` and takes the same arguments.
 - ``Settings``: a pydantic model for the profile table ``[plugins.NAME]``, preferably derived from
   `profile.fields.Section`. The validated settings are passed as the last argument.
 """

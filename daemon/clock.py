@@ -131,7 +131,7 @@ class RealClock:
 
 
 class HandClock:
-    """Clock of a simulated or emulated hand, which pauses while the machine is late.
+    """Clock that pauses while the machine is late, for a simulated or emulated hand.
 
     The clock's time changes only during a sleep. After a sleep, the time equals the sleep's
     deadline, even if the machine woke up late. The clock makes up for any delay that is shorter

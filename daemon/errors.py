@@ -1,6 +1,6 @@
 """Define the exceptions that several packages use. All are derived from `SoftfingerError`.
 
-An exception that only one package uses is defined in that package, with the same base class. This
+An exception used by a single package is defined in that package and has the same base class. This
 module does not import Numba or ZeroMQ.
 """
 
@@ -90,7 +90,7 @@ class RecordingError(SoftfingerError):
 
 
 class Reason(StrEnum):
-    """Machine-readable reason for rejecting a command: ``reason`` in the reply."""
+    """Machine-readable reason for rejecting a command, in the reply's field ``reason``."""
 
     LATE = "late"
     STOPPED = "stopped"

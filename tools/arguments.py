@@ -24,7 +24,7 @@ WAIT_MAX = 5.0  # s, maximum wait for the first message with `--no-wait`
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config``, ``--set`` and ``--dir``, which select the hand for `profile`."""
+    """Add ``--config``, ``--set`` and ``--dir``; `profile` loads the settings that they select."""
     add_settings(parser)
     add_directory(parser)
 

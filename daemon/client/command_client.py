@@ -49,10 +49,10 @@ class NoAnswer(SoftfingerError):
 class Attempts:
     """Retry policy for one command, within the caller's timeout.
 
-    After a stall, the daemon refuses commands that have become too old, with the reason ``late``. A
-    refused command has no effect. All attempts have the same key, so the daemon carries out the
-    command at most once. The daemon refuses a repeated attempt if it has received a stop or another
-    command in the meantime.
+    After a stall, the daemon refuses outdated commands with the reason ``late``. A refused command
+    has no effect. All attempts have the same key, so the daemon carries out the command at most
+    once. The daemon refuses a repeated attempt if it has received a stop or another command in the
+    meantime.
     """
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:

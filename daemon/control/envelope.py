@@ -1,8 +1,8 @@
 """Look up which objects the hand can hold in simulation, by shape, size, friction and mass.
 
-`softfinger envelope --keep` creates the map of these objects, and `grasp` uses the map for
-warnings. A map is valid only for the hand that was simulated; the packaged map is valid for the
-built-in hand.
+`softfinger envelope --keep` creates a map of the objects that the hand can hold, and `grasp` uses
+the map for warnings. A map is valid only for the hand that was simulated; the packaged map is valid
+for the built-in hand.
 """
 
 from __future__ import annotations

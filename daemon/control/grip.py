@@ -6,9 +6,9 @@ parts:
 
 1. *grip*: a feed-forward torque (moment arm × target force + joint friction), proportional and
    integral feedback of the force error, and damping matched to the tip stiffness;
-2. *steering*, the serial two-phased controller of the soft-fingertip literature: the object angle
-   error is integrated and added with opposite signs to the joint goals, which a PD controller
-   follows. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
+2. *steering*, the serial two-phased controller of the soft-fingertip literature: the integrated
+   object angle error is added to the joint goals with opposite signs, and a PD controller follows
+   these goals. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
 
 With ``control.law = "energy"``, the moment arms are the gradient of the contact-table energy along
 the rolling increments. These moment arms include the moments and shear forces of the tips.

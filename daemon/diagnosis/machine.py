@@ -74,7 +74,7 @@ def check_idle_states(path: Path) -> Finding:
 
 
 def check_wall_clock(now: float) -> Finding:
-    """Check that the Unix time ``now`` [s], which all published messages contain, is plausible."""
+    """Check that the Unix time ``now`` [s] is plausible; all published messages contain it."""
     if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))

@@ -1,4 +1,4 @@
-"""Forward requests to the loop, within limits, and forward replies to clients.
+"""Forward requests to the loop, within the limits in `bounds`, and replies to clients.
 
 The gateway does not unpack requests. Requests that look like a stop bypass the queues, one at a
 time for each client. Apart from stops, only a few requests are forwarded to the loop at a time.
@@ -102,7 +102,7 @@ class CommandEndpoint(Endpoint):
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
     def fence(self, stops: int) -> None:
-        """Stamp new requests as older than the last stop until the older ones have been read."""
+        """Stamp new requests as older than the last stop until all earlier requests are read."""
         self._fence = stops
         self._since, self._arrived = self._clock(), 0
 

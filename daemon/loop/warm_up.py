@@ -68,9 +68,9 @@ class Part(NamedTuple):
 def parts(settings: Settings) -> list[Part]:
     """Return the parts required by ``settings``, in an order that suits two processes.
 
-    One process compiles the estimator and then the simulated sensor, which share kernels. The
-    second process compiles the contact table and then the simulated hand and the filter, which use
-    the table. The shorter parts balance the load.
+    One process compiles the estimator and the simulated sensor, because they share kernels. The
+    second process compiles the contact table before the simulated hand and the filter, because both
+    use the table. The shorter parts balance the load.
     """
     simulated = needs_hand(settings.servos.backend, settings.tactile.backend)
     servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"

@@ -164,8 +164,9 @@ class HandEstimator:
     ) -> None:
         """Update the state with a finger's ``frame`` and ``estimate``; write both to ``contact``.
 
-        ``has_changed`` is False for a frame that is identical to an earlier one. During contact,
-        such a frame comes from a board that is frozen or sends old data, so it is not used.
+        ``has_changed`` is False for a frame that is identical to an earlier one. An identical frame
+        during contact comes from a board that is frozen or sends old data, so the frame is not
+        used.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME

@@ -398,7 +398,7 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
-    """Update the state with the encoder, which is precise when its count changes.
+    """Update the state with the encoder angle, which is precise when the count changes.
 
     Between two changes, the angle is known to within one count. ``step`` [rad] is the joint motion
     since the last reading, computed from the velocity.

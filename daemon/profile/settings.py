@@ -292,9 +292,9 @@ class EstimatorSettings(Section):
 class LoopSettings(Section):
     """The control loop and its clock.
 
-    The clock ``real`` is the machine's time. ``hand`` is the time of a simulated hand, which pauses
-    while the machine is busy. ``virtual`` runs as fast as possible. ``hand`` and ``virtual`` need
-    simulated backends. ``auto`` selects ``hand`` for simulated backends and for the ports of
+    The clock ``real`` is the machine's time. ``hand`` is the time of a simulated hand; this clock
+    pauses while the machine is busy. ``virtual`` runs as fast as possible. ``hand`` and ``virtual``
+    need simulated backends. ``auto`` selects ``hand`` for simulated backends and for the ports of
     `softfinger emulate`, otherwise ``real``.
     """
 
@@ -347,7 +347,7 @@ class RealtimeSettings(Section):
 class StreamSettings(Section):
     """The published stream.
 
-    A topic is sent on every n-th tick, where n gives the rate closest to the setting.
+    A topic is sent on every n-th tick; n is chosen so that the rate is closest to the setting.
     """
 
     address: str = setting(STREAM_ADDRESS, "", "Address of the stream, tcp or ipc.")

@@ -58,7 +58,7 @@ class TickReads:
         self.errors = kind(port, handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
 
     def answered(self) -> bool:
-        """Return True if all servos respond to each of these group reads."""
+        """Return True if all servos respond to each group read."""
         return all(
             any(lengths[0].exchange() == COMM_SUCCESS for _ in range(TRY_COUNT))
             for lengths in self.spans.values()

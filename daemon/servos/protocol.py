@@ -208,7 +208,7 @@ class GroupRead:
 
 
 class FastGroupRead(GroupRead):
-    """Fast sync read: all servos share one reply, whose last CRC covers all its bytes."""
+    """Fast sync read: all servos share one reply; its last CRC covers the complete reply."""
 
     instruction = _FAST_SYNC_READ
 
@@ -287,8 +287,7 @@ class ServoLine:
     def ping_all(self, wait: float) -> dict[int, tuple[int, int]]:
         """Return (model number, firmware) of each servo that replies to a ping within ``wait`` [s].
 
-        Servos reply one after the other in the order of their IDs, which takes 0.8 s for 253
-        servos.
+        Servos reply one after the other in the order of their IDs; 253 replies take 0.8 s.
         """
         found: dict[int, tuple[int, int]] = {}
         port = self.port

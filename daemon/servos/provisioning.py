@@ -60,7 +60,7 @@ class FoundServo:
         return self.describe(str(self.baud))
 
     def describe(self, rates: str) -> str:
-        """Return the report line for a servo that replies at these baud rates."""
+        """Return the report line for a servo and the baud rates at which it replies."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 

@@ -104,7 +104,7 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
 
 
 class CobsDecoder(DelimitedDecoder):
-    """Decoder for COBS framing, with the board's sequence number and time."""
+    """Decoder for COBS framing, which contains the board's sequence number and time."""
 
     def __init__(self, rows: int, cols: int) -> None:
         super().__init__(rows, cols, b"\0", longest_frame(rows, cols))
@@ -117,7 +117,7 @@ class CobsDecoder(DelimitedDecoder):
         self._wraps = 0  # number of overflows of the board clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """Parse like :meth:`DelimitedDecoder.parse`, with the board's sequence number and time."""
+        """Parse as in :meth:`DelimitedDecoder.parse`; also read the sequence number and time."""
         if len(packet) >= self.longest:
             self._reason = f"packets of {len(packet)} bytes"
             return None

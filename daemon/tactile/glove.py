@@ -7,7 +7,7 @@ resynchronises at the next newline. There is no checksum, so a corrupted byte is
 value is still in 11 … 42.
 
 Boards with a 12-bit converter use the same framing with 6 bits per half. A ``tactile.full_count``
-from 1024 to 4095 selects such a board.
+from 1024 to 4095 selects a 12-bit board.
 """
 
 from __future__ import annotations

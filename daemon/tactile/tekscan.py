@@ -1,9 +1,9 @@
 """Parse Tekscan-style ASCII exports of pressure frames.
 
 An export starts with lines of the form ``KEY value``, up to the line ``ASCII_DATA @@``. Each frame
-consists of a line ``Frame n``, which may contain more text, and the rows, with ``B`` where the
-sensor has no cell. A line ``@@`` may end the file. An export with a single frame has no ``Frame``
-line.
+consists of a line ``Frame n``, which may contain more text, and the rows. The letter ``B`` marks a
+position without a cell. A line ``@@`` may end the file. An export with a single frame has no
+``Frame`` line.
 
 Encoding, decimal sign and separator depend on the locale of the exporting machine. The parser
 detects them from the file. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings

@@ -50,7 +50,7 @@ class Presses:
     def of(
         self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT_MATERIAL
     ) -> FloatArray:
-        """Return the modelled pressures of these presses for a modulus of 1 Pa, [used cells]."""
+        """Return the modelled pressures of the presses for a modulus of 1 Pa, [used cells]."""
         made = [
             grid.pressure(tip, law, float(depth), float(tilt))
             for depth, tilt in zip(np.maximum(d, 1e-9), self.theta, strict=True)

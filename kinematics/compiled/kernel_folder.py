@@ -139,7 +139,7 @@ def mark(folder: OwnFolder, part: str) -> None:
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove other cache folders except the newest few and those used recently."""
+    """Remove other cache folders, except the newest few and recently used folders."""
     oldest = time.time() - _RECENT
     others = [
         each

@@ -3,9 +3,9 @@
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
 higher coefficients, and rounding. The bound assumes that the reference integrals have only rounding
-errors, and that coefficients beyond the computed ones continue to decrease. Both assumptions about
-the coefficients hold for all supported laws, because each law is a single polynomial. Pieces are
-halved until the bound is within the tolerance.
+errors, and that the higher coefficients continue to decrease. Both assumptions about the
+coefficients hold for all supported laws, because each law is a single polynomial. Pieces are halved
+until the bound is within the tolerance.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _bound(
 
     ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` contains the Chebyshev
     coefficients of the difference between ratios and table. The sum of their magnitudes bounds this
-    difference. Coefficients beyond the computed ones contribute less than twice the last two
+    difference. Higher coefficients, which are not computed, contribute less than twice the last two
     coefficients in each direction, because each coefficient is less than half of its predecessor.
     The reason is that the ratios are analytic well beyond the piece. ``rounding`` [5] is absolute.
     """

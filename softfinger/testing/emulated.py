@@ -30,7 +30,7 @@ _STALL = 0.5  # s; longer pauses of this process count only up to this value as 
 
 
 class EmulatedHand:
-    """Emulated hand in a `softfinger emulate` process, which ends with this context.
+    """Emulated hand in a `softfinger emulate` process that ends with this context.
 
     The first start on a machine compiles kernels, which takes minutes.
 

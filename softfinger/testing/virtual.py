@@ -263,7 +263,7 @@ class VirtualTimeHand(Hand):
 
 
 class VirtualHand(VirtualTimeHand):
-    """Simulated hand and its daemon in virtual time, which run as fast as this machine permits.
+    """Simulated hand and its daemon, which run in virtual time as fast as this machine permits.
 
     On the same machine, identical calls produce bit-for-bit identical states.
 

@@ -60,7 +60,7 @@ def _simulated(title: str, seconds: int) -> Report:
 
 
 def _in_turns(title: str, rounds: int) -> Report:
-    """Measure only the pipeline: back to back, with and without subscribers; in place, at 3 rates.
+    """Measure only the pipeline: back to back with or without subscribers, or in place at 3 rates.
 
     SCHED_FIFO is used if permitted.
     """

@@ -9,8 +9,8 @@ The shear rate is the rolling speed minus two other terms: the speed along the f
 component along a tilted face due to increasing d. s, d and θ are defined in
 `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium if Σ δU = 0
 for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ +
-T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies this condition. `turned` solves this
-condition step by step, without time, mass or damping.
+T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies the equilibrium condition, which
+`turned` solves step by step, without time, mass or damping.
 """
 
 from __future__ import annotations

@@ -88,10 +88,10 @@ class Recording:
 
     ``counts`` (number of messages by channel), ``start`` and ``end`` (Unix time [s], NaN if empty)
     are read from the summary at the end of the file. If the summary is incomplete, or if there are
-    other programs' channels, the whole file is read once instead. A killed recorder leaves a file
-    without an end, which is marked ``truncated``. Corrupted chunks are skipped. Messages in other
-    programs' channels are ignored; ``others`` counts them. ``say`` is called once for each of these
-    findings.
+    other programs' channels, the whole file is read once instead. If the recorder was killed, the
+    file has no end and is marked ``truncated``. Corrupted chunks are skipped. Messages in other
+    programs' channels are ignored; ``others`` counts them. ``say`` is called once for each kind of
+    problem found.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:

@@ -115,9 +115,9 @@ class ShownEvent(NamedTuple):
 class StreamState:
     """Process stream messages and store the data that a page shows.
 
-    In all methods ``now`` is monotonic time [s]. ``events`` are sorted by time of occurrence. After
-    a late subscription, this order differs from the order of arrival, in which `news` returns the
-    events.
+    In all methods ``now`` is monotonic time [s]. ``events`` are sorted by time of occurrence,
+    whereas `news` returns events in the order of arrival. The two orders differ after a late
+    subscription.
     """
 
     def __init__(self) -> None:

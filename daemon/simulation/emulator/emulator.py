@@ -78,9 +78,9 @@ class EmulatorClock:
 
     If interruptions were included, a process that was stopped for a minute would have to simulate
     that minute and could not reply in the meantime. A daemon whose own clock pauses while the
-    machine is busy sets deadlines. While such a daemon uses the ``servos`` and their torque is on,
-    the emulator clock advances from one deadline to the next by the same amount as the daemon
-    clock, within `_AHEAD_TIME`.
+    machine is busy sets deadlines. While a daemon that sets deadlines uses the ``servos`` and their
+    torque is on, the emulator clock advances from one deadline to the next by the same amount as
+    the daemon clock, within `_AHEAD_TIME`.
     """
 
     pauses_when_late = False

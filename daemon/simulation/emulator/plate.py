@@ -74,7 +74,7 @@ def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, lis
 
     Each press has either a depth (0 lifts off), a force or a pressure (uniform, like a bladder).
     Optional words are tilt, speed, hold, and tip (left, right or both; default both). If ``hold``
-    is not given, the last press is held and each of the others lasts one second. Forces are
+    is not given, the last press is held and every earlier press lasts one second. Forces are
     ``scale`` times the ``table`` forces. Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
