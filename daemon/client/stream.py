@@ -240,7 +240,10 @@ class Wait:
         return max(left, 0.0)
 
     def ends_with(self, state: HandState) -> bool:
-        """Return True if the condition is met. If not, raises HandFault if the hand is in fault."""
+        """Return True if the condition is met.
+
+        Raises HandFault if the condition is not met and the hand is in fault.
+        """
         self._last = state
         if self._condition(state):
             return True

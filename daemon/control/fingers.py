@@ -105,7 +105,7 @@ class Fingers:
         return now_touching
 
     def advance_setpoints(self, rate: float) -> bool:
-        """Advance the setpoints at up to ``rate`` [rad/s]; return True once all are at target."""
+        """Advance the setpoints at up to ``rate`` [rad/s]; return True once all have arrived."""
         arrived = [joint.step(rate) for joint in self._setpoints]
         return all(arrived)
 

@@ -311,8 +311,8 @@ def _equal_torques(
     """Return joint torques that push with equal force at any object angle.
 
     During the dither, the virtual spring from `hand.upright` acts between the fingers. The dither
-    amplitude decreases gradually so that joint friction leaves no bias. The joints then hold their
-    antisymmetric angle.
+    amplitude decreases gradually so that joint friction leaves no bias. After the dither, the
+    joints hold their antisymmetric angle.
     """
     law, q = g.law, grasp.q
     closing_rate = _closing_rate(grasp, g.force.speed, 0.0)

@@ -23,11 +23,11 @@ larger loads. Increasing the grip force by more than _UNCONFIRMED_SHARE requires
 object has rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
 
 **Sudden events** increase the force immediately. A torque jump beyond the noise while both joints
-yield, or a shear jump in the frames of solid tips, increases it to its limit. An object rotation
-beyond the tips' shear deformation μ (d1 + d2)/2W increases it by _ROTATION_INCREASE. A sliding tip
-transmits only its friction force, so the size of a sudden load is unknown. In a pull, the two
-torques jump in the same direction; in a twist, they jump in opposite directions. A sideways push
-looks like a twist.
+yield, or a shear jump in the frames of solid tips, increases the force to its limit. An object
+rotation beyond the tips' shear deformation μ (d1 + d2)/2W increases the force by
+_ROTATION_INCREASE. A sliding tip transmits only its friction force, so the size of a sudden load is
+unknown. In a pull, the two torques jump in the same direction; in a twist, they jump in opposite
+directions. A sideways push looks like a twist.
 
 A force increase is held for _SETTLING_TIME and then decreases by increase_max per _DECAY_TIME.
 

@@ -111,7 +111,7 @@ class Travelling(ControlState):
 
 @dataclass
 class GraspCommand:
-    """Values commanded for a grasp, stored until it has settled."""
+    """Values commanded for a grasp, stored until the grasp has settled."""
 
     force: float  # [N]
     is_streamed: bool  # the force is a streamed setpoint

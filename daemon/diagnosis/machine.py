@@ -94,7 +94,7 @@ def wake_ups() -> list[float]:
 
 
 def check_wake_ups(late: list[float]) -> Finding:
-    """Check wake-up delays [s]. A median above a quarter of the period is a warning."""
+    """Check wake-up delays [s]. A median above a quarter of the tick period causes a warning."""
     worst = max(late)
     middle = sorted(late)[len(late) // 2]
     text = (

@@ -31,7 +31,7 @@ _DOMAIN = "softfinger"
 
 
 class RestartNeeded(SoftfingerError):
-    """All clients must be disconnected and reconnect. The message gives the reason."""
+    """All clients must be disconnected so that they reconnect. The message gives the reason."""
 
 
 class Admission(ThreadAuthenticator):

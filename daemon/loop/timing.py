@@ -122,8 +122,8 @@ class Lateness:
     def look(self, t: float, own_doing: bool) -> Event | None:
         """Evaluate the tick that began at ``t`` [s]; return an event to emit, or None.
 
-        ``timing`` must already contain the start of this tick. ``own_doing`` is True if a command
-        executed on the previous tick may have delayed this tick.
+        ``timing`` must already contain the start time of this tick. ``own_doing`` is True if a
+        command executed on the previous tick may have delayed this tick.
         """
         timing = self._timing
         gap = 0.0 if own_doing else timing.tick_s - self._period

@@ -166,7 +166,7 @@ def now() -> str:
 
 
 def sensor_of(settings: Settings, finger: int) -> Sensor:
-    """Return the sensor of ``finger``. If it has no label, its USB serial number is used."""
+    """Return the sensor of ``finger``. Without a label, the sensor's USB serial number is used."""
     tactile = settings.tactile
     return Sensor(
         finger=_NAMES[finger],

@@ -50,7 +50,7 @@ _GOAL_DISTANCE = 0.25  # rad; a joint farther than this from its goal draws the 
 
 
 class HandEstimator:
-    """Estimator for one hand. Without contact, it costs one comparison per tick."""
+    """Estimator for one hand. Without contact, the estimator costs one comparison per tick."""
 
     def __init__(
         self,

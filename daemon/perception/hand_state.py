@@ -367,8 +367,8 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
 def is_held(h: HandFilter) -> bool:
     """Return True if all fingers grip an object.
 
-    The distance between the faces is then constant. Without a grip, an object that presses on the
-    tips may move freely.
+    While an object is held, the distance between its faces is constant. Without a grip, an object
+    that presses on the tips may move freely.
     """
     both: bool = h.tip[0].in_contact and h.tip[1].in_contact
     return h.is_gripping and (both or h.is_single)
@@ -454,7 +454,8 @@ def _measure_free_torque(
 def _check_current(grasp: GraspState, finger: int, current: float, goal: float, dt: float) -> float:
     """Return a joint's current [A]: its ``goal`` during a grip, otherwise the measured current.
 
-    Also measures how long the two have differed by more than a servo's current controller allows.
+    Also measure the time for which both currents have differed by more than a servo's current
+    controller allows.
     """
     is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + _CURRENT_NOISE
     grasp.current_off_time[finger] = grasp.current_off_time[finger] + dt if is_off else 0.0

@@ -23,7 +23,7 @@ from softfinger.daemon.profile.fields import (
 
 
 class SimulationSettings(Section):
-    """The simulated hand of the simulated backends and of `softfinger emulate`.
+    """The simulated hand used by the simulated backends and by `softfinger emulate`.
 
     The default values are plausible, but not measured.
     """

@@ -175,7 +175,7 @@ FingerCheck = Callable[[View, State, float, int], str]
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """One row of the table. As a decorator, it adds the row with the decorated check.
+    """One row of the table. As a decorator, `Limit` adds the row with the decorated check.
 
     A row without a check is added directly, because its limit is applied elsewhere: in
     `Safety.write`, on the bus or in the gateway.

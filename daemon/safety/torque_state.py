@@ -2,8 +2,8 @@
 
 Torque off is sent on every tick until the servo registers confirm it. If the servos do not confirm
 within half the bus watchdog time, the bus stays silent until the watchdog has stopped the motors.
-Otherwise, a servo that receives read requests but loses all writes would keep driving its motor.
-The daemon then tries to switch torque off again.
+If the bus were not silent, a servo that receives read requests but loses all writes would keep
+driving its motor. The daemon then tries to switch torque off again.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class TorqueState:
     def end(self) -> None:
         """Turn torque off if it may be on.
 
-        If this fails, the bus stays silent, which trips the watchdogs.
+        If torque cannot be turned off, the bus stays silent, which trips the watchdogs.
         """
         for _ in range(_CLOSING_TRY_COUNT):
             if not self._state.torque:

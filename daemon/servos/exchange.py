@@ -108,8 +108,9 @@ def time_exchanges(
 ) -> ExchangeTimes:
     """Time ``count`` exchanges without pauses, with the same reads and writes as in a tick.
 
-    A read has to wait until the preceding write has been transmitted, so its duration includes
-    both. If ``write`` is None, only reads are timed. Each reply may take up to 0.1 s.
+    A read has to wait until the preceding write has been transmitted, so the duration of a read
+    includes both transmissions. If ``write`` is None, only reads are timed. Each reply may take up
+    to 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0

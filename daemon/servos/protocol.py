@@ -162,7 +162,7 @@ class GroupRead:
     """Sync read of one register span from several servos.
 
     After a successful :meth:`exchange`, ``data[id]`` contains the span's bytes and ``errors[id]``
-    the servo's error byte. After a failure, the contents of both are undefined.
+    the servo's error byte. After a failure, ``data`` and ``errors`` are undefined.
     """
 
     instruction = INST_SYNC_READ
@@ -318,7 +318,7 @@ class ServoLine:
     def store(self, address: int, values: Mapping[int, bytes]) -> list[int]:
         """Write each servo's bytes and read them back.
 
-        Return the IDs of servos for which this failed.
+        Return the IDs of servos for which the write failed.
         """
         waiting = dict(values)
         for _ in range(TRY_COUNT):

@@ -181,7 +181,7 @@ class SimulatedServos:
             self._connected = False
 
     def _exchange(self) -> float:
-        """Advance the hand to the current time, and apply and restart its watchdog."""
+        """Advance the hand to the current time, check its watchdog and restart it."""
         now = self._clock.now()
         if self._torque and now > self._last + self._watchdog:
             self._torque = False

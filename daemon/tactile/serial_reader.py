@@ -50,8 +50,8 @@ class SensorClock:
     def arrival(self, t_sensor: float, t: float) -> float:
         """Return a frame's arrival time [s] without jitter.
 
-        ``t_sensor`` [s] is the frame's board time, and ``t`` [s] is the local time at which it was
-        read.
+        ``t_sensor`` [s] is the frame's board time, and ``t`` [s] is the local time at which the
+        frame was read.
         """
         offset = t - t_sensor
         risen = self._offset + self._DRIFT * (t - self._t)

@@ -97,7 +97,7 @@ def decode(data: bytes) -> str:
 def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     """Parse an export. Raises TekscanError.
 
-    ``seconds_per_frame`` [s] is used if the header does not contain it.
+    ``seconds_per_frame`` [s] is used if the header does not state a frame period.
     """
     lines = text.splitlines()
     header, first = _header(lines)
@@ -271,8 +271,8 @@ _GROUPS = str.maketrans("", "", "'\N{RIGHT SINGLE QUOTATION MARK}\N{NO-BREAK SPA
 def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
-    If both characters occur, the last one is the decimal sign, and the other groups digits.
-    Apostrophes and narrow spaces only group digits.
+    If point and comma both occur, the last of them is the decimal sign, and the other character
+    groups digits. Apostrophes and narrow spaces only group digits.
     """
     text = text.translate(_GROUPS)
     if "," in text:

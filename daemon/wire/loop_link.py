@@ -2,8 +2,8 @@
 
 Each message is a msgpack list whose first element is the message kind. Sending never blocks. If the
 socket buffer is full, the remaining bytes are sent later. While bytes remain, stream messages are
-dropped, but replies and stops are queued. The gateway limits the number of pending requests, so
-this queue is bounded.
+dropped, but replies and stops are queued. The gateway limits the number of pending requests, so the
+queue of replies and stops is bounded.
 """
 
 from __future__ import annotations

@@ -283,8 +283,8 @@ def _power(
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
     """Set mean readings [rows, cols] over ``frames`` frames to 0 where they are within 4 σ of 0.
 
-    Clipped noise has a positive mean. Summed over all cells, this mean may be as large as the force
-    of a contact.
+    Clipped noise has a positive mean. Summed over all cells, the mean of clipped noise may be as
+    large as the force of a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)

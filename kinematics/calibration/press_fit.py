@@ -60,7 +60,7 @@ class Presses:
 
 @dataclass(frozen=True)
 class Trend:
-    """Modulus E [n] [Pa] of each press versus d [n] [m], to check that one E fits all presses.
+    """Modulus E [n] [Pa] of each press versus d [n] [m], to check that one value fits all presses.
 
     ``drift`` is the relative change of a fitted line from the minimum to the maximum d, and ``std``
     is its standard deviation, derived from the scatter about the line.

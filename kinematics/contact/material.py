@@ -193,9 +193,9 @@ class Material:
     def expansions(self) -> FloatArray:
         """Return the law's expansions divided by E₀, for the quadrature, float64 [7, order].
 
-        Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. With
-        X_1 = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε, the rows are S_1, W_1, T_1, S_2, S_2′, T_2
-        and T_2′. All are polynomials, so there is no cancellation at small strain.
+        Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. With X_1
+        = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε, the rows are S_1, W_1, T_1, S_2, S_2′, T_2 and
+        T_2′. All expansions are polynomials, so there is no cancellation at small strain.
         """
         unit = [value / self.coefficients[0] for value in self.coefficients]
         secant = unit[1:] or [Fraction(0)]

@@ -159,9 +159,9 @@ def _clip_noise(
 def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
     """Compute ``residual`` and ``factor`` of each cell, and their sums, from readings and model.
 
-    A cell cannot read below the floor, or below 0 even where the rubber is in tension. A saturated
-    cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the noise is
-    clipped at the floor; otherwise, cells with a model below the floor are excluded.
+    A cell never reads below the floor, and never below 0 even where the rubber is in tension. A
+    saturated cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the
+    noise is clipped at the floor; otherwise, cells with a model below the floor are excluded.
     """
     fit = state.fit
     saturation = state.signal.saturation

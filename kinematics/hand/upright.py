@@ -41,8 +41,8 @@ def upright_spring(
 ) -> float:
     """Return the joint spring k [N·m/rad] that keeps the object upright at joint angle ``q`` [rad].
 
-    ``d`` [m] and ``force`` [N] are averages of both tips, ``tilt_moment_ratio`` is their c, and
-    ``lengths`` [m] are defined in :func:`hand.grasp_state.held_motion`.
+    ``d`` [m] and ``force`` [N] are averages of both tips, ``tilt_moment_ratio`` is the c of both
+    tips, and ``lengths`` [m] are defined in :func:`hand.grasp_state.held_motion`.
     """
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)

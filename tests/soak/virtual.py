@@ -443,7 +443,7 @@ class Soak:
         return 1 + int(self._random.expovariate(1.0 / mean))
 
     def _may_be_disturbed(self) -> bool:
-        """Return True in mode holding, and occasionally in other modes."""
+        """Return True in the mode ``holding``, and occasionally in other modes."""
         return self.daemon.loop.state.mode == "holding" or self._random.random() < 1e-3
 
     # Actions

@@ -138,7 +138,7 @@ class RecordedRun:
         return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
 
     def contacts(self) -> dict[str, ContactTable]:
-        """Return the contact table of each finger that touched; raise Missing if none did."""
+        """Return the contact table of each finger that touched; raise Missing if no finger did."""
         if not self.t.size:
             raise Missing("the recording does not contain hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]

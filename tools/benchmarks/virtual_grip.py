@@ -74,8 +74,8 @@ class VirtualGrip(SimulatedDaemon):
     def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:
         """Build daemon and hand.
 
-        ``hand`` contains the hand's settings if they differ. ``torque`` is the true torque constant
-        divided by the configured value.
+        ``hand`` contains the hand's settings if they differ from the daemon's settings. ``torque``
+        is the true torque constant divided by the configured value.
         """
         self.alarms: list[tuple[float, str]] = []  # (time [s], kind) of warnings and errors
         super().__init__(merged(daemon, {}), None if hand is None else merged(hand, {}))

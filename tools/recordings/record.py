@@ -126,7 +126,7 @@ class RecordingWriter:
         self._write(topic, message, when)
 
     def flush(self) -> None:
-        """End the chunk and pass it to the system; it survives the end of this process."""
+        """End the chunk and pass it to the system, which keeps it if this process is killed."""
         try:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._wrote()

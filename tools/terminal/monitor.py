@@ -1,8 +1,8 @@
 """Run ``softfinger monitor``, which shows a live page about the hand in the terminal.
 
 This module parses the arguments, handles keys and signals, and redraws the page. If the output is
-not a terminal, it prints plain lines. `stream_state` collects the data and `monitor_page` draws the
-page.
+not a terminal, the monitor prints plain lines. `stream_state` collects the data and `monitor_page`
+draws the page.
 """
 
 from __future__ import annotations

@@ -325,8 +325,8 @@ class Commander:
 
     Each command uses its own request socket, so a missing reply does not delay other commands. If
     the same user runs the daemon on this machine, a stop bypasses the requests of all clients. The
-    daemon replies on the next tick. If the daemon is stalled, the client waits for this reply only
-    briefly.
+    daemon replies on the next tick. If the daemon is stalled, the client waits only briefly for the
+    reply to a stop.
     """
 
     OPEN_LIMIT = 8  # maximum number of open commands; further commands are dropped, except stop

@@ -1,4 +1,4 @@
-"""Control the terminal for a full-screen page: screen modes, key decoding, output, restoring.
+"""Control the terminal of a full-screen page: screen modes, key decoding, output, restoration.
 
 A redraw sends all changed lines in a single write operation, which is fast over ssh and avoids
 flicker.

@@ -46,7 +46,7 @@ class PlatePress:
     """Press to ``d`` [m] at ``theta`` [rad], or with uniform ``pressure`` [Pa] on all cells.
 
     ``force`` [N] is the resulting force on the tip base. The press is held for ``hold`` [s], or
-    until the next command if this is inf.
+    until the next command if ``hold`` is inf.
     """
 
     d: float

@@ -101,7 +101,7 @@ class PtyServoBus:
         self._master, self._slave, self.path = open_pty()
 
     def unplug(self) -> None:
-        """Remove the terminal, as if an adapter were unplugged; the servos continue."""
+        """Remove the terminal, as if an adapter were unplugged; the servos keep running."""
         self._due.clear()
         self.bus.parser.reset()
         if self.plugged:

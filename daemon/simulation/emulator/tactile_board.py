@@ -225,7 +225,7 @@ Encode = Callable[[NDArray[np.uint16], int, float], bytes]
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """Framing of a board, and the byte that requests a frame (empty for unrequested frames)."""
+    """Framing of a board, and its frame request byte (empty if it needs no requests)."""
 
     encode: Encode
     request: bytes = b""

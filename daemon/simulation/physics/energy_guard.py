@@ -3,7 +3,7 @@
 With smooth forces, the integration error is small and decreases with the step size. With non-smooth
 forces (for example, when a light object hits the stiff rim of the backing plate) or an excessively
 long step, the energy could increase by more than the work of the motors and loads. The guard
-removes such an excess from the kinetic energy. If the kinetic energy is smaller than the excess,
+removes any excess energy from the kinetic energy. If the kinetic energy is smaller than the excess,
 the motion stops at an earlier point of the step. Without damping, the energy should be constant;
 the method's small drift is then allowed in smooth steps.
 """

@@ -216,7 +216,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
 def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
     """Add the tip-to-tip torques if the tips are close or there is no object.
 
-    In the first stage, this function also sets their rows in the full matrix.
+    In the first stage, this function also sets the tips' rows in the full matrix.
     """
     near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
     touching = near and tip_on_tip(plant, table, now, stage)

@@ -141,7 +141,7 @@ class SensorModel:
 
         ``curvature`` [1/m] is the face curvature in the plane of ``tilt_x``, 0 for a plane. The
         face is a cylinder with its axis along the finger's y. All pressures are multiplied by
-        ``fraction``. For a solid tip, the curvature acts only through this factor, and the frame
+        ``fraction``. For a solid tip, the curvature acts only through ``fraction``, and the frame
         also shows the ``shear`` [N] along x, applied at height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
