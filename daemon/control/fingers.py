@@ -50,9 +50,9 @@ class Fingers:
     def turning_range(self) -> tuple[float, float]:
         """Return the minimum and maximum angle [rad] to which this grip can rotate the object.
 
-        When the object rotates by φ, each joint moves by the angle ψ, which is φ divided by the sum
-        of both rotation Jacobians, and the tilt of each tip changes by φ + ψ. The joint and tilt
-        limits determine the range.
+        When the object rotates by φ, each joint moves by ψ, which is φ divided by the sum of both
+        rotation Jacobians. The tilt of each tip then changes by φ + ψ. The joint and tilt limits
+        determine the range.
         """
         settings, present_angle = self._settings, self.pose.angle
         rotation = self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1]

@@ -36,7 +36,7 @@ _START_AGE_MAX = 0.2
 
 
 def command_age_max(settings: Settings, waits: bool) -> float:
-    """Return the maximum age [s] of a command that stiffens or moves the hand.
+    """Return the maximum age [s] of a command that switches torque on or moves the hand.
 
     An older command may have been sent before the servo watchdog stopped the hand. If ``waits`` is
     True, the servos' clock and watchdog pause while this machine is late.

@@ -149,7 +149,7 @@ class Requests:
         Parameters
         ----------
         emit : sends an event
-        command_age_max : maximum age [s] of a command that may stiffen or move the hand
+        command_age_max : maximum age [s] of a command that switches torque on or moves the hand
         """
         self._command_age_max = command_age_max
         self._settings = settings

@@ -101,7 +101,7 @@ def make_models(
 
 
 def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
-    """Return a finger's prior from `calibrate scales` if it was run, else from the settings."""
+    """Return a finger's prior from `calibrate scales` or, without one, from the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales
         # The gain changes with temperature and load, so it remains uncertain after calibration.

@@ -1,8 +1,8 @@
 """Detect swapped servo IDs: each finger then receives the other finger's commands.
 
 Joint angles and currents remain consistent, because each servo reports its own values. Only the
-tactile sensors show the error: when one joint is stationary and the other moves, the wrong tip
-tilts or is loaded, and the object rotates opposite to the command.
+tactile sensors show the error. When one joint is stationary and the other joint moves, the wrong
+tip tilts or is loaded, and the object rotates opposite to the command.
 """
 
 from __future__ import annotations

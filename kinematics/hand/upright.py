@@ -18,8 +18,8 @@ q, so the result does not depend on the path. For an object whose angle is φ0 a
     D = 2ℓ + (1 − 2c)d − b(W − d)        M = a − d + ℓ + (1 + b)d/2
 
 which vanishes for D = 0. The spring b = (2ℓ + (1 − 2c)d)/(W − d) therefore keeps the object upright
-for any φ0. The model neglects the tip tilt q relative to the faces, a second-order effect, and all
-friction except at the tips.
+for any φ0. The model neglects all friction except at the tips. It also neglects the tip tilt q
+relative to the faces, which is a second-order effect.
 """
 
 from __future__ import annotations

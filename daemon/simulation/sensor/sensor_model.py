@@ -254,8 +254,8 @@ def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
     In this Prandtl-Ishlinskii model, the output of a cell is the mean of PLAY_COUNT generalised
     play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each operator follows an
     increasing pressure p immediately. An operator follows a decreasing pressure only when its state
-    is above (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. The loading curve is
-    therefore the pressure itself, the unloading curve ends at (1 + excess) p, loops are closed,
+    is above (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. Therefore, the loading
+    curve is the pressure itself, and the unloading curve ends at (1 + excess) p. Loops are closed,
     inner loops lie inside outer loops, and zero pressure always reads 0.
     """
     widths = 2.0 * excess * (np.arange(PLAY_COUNT) + 0.5) / PLAY_COUNT
