@@ -303,12 +303,12 @@ class Loop:
         ----------
         request : command with its parameters
         age : time since the request arrived [s]
-        by_task : the request comes from the running task
+        by_task : True if the request comes from the running task
 
         Raises
         ------
         Refused
-            If the request is rejected. The message says why.
+            If the request is rejected. The message gives the reason.
         """
         name = request["command"]
         if name == "status":

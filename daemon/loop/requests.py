@@ -148,7 +148,7 @@ class Requests:
 
         Parameters
         ----------
-        emit : sends an event
+        emit : function that sends an event
         command_age_max : maximum age [s] of a command that switches torque on or moves the hand
         """
         self._command_age_max = command_age_max
@@ -187,7 +187,7 @@ class Requests:
         Raises
         ------
         Refused
-            If the request is rejected. The message says why.
+            If the request is rejected. The message gives the reason.
         """
         state, control = self._state, self._control
         if request["command"] == "stop":  # accepted in every mode, from any client, with any fields

@@ -52,9 +52,9 @@ class Fingertip:
     poisson
         Poisson's ratio of a solid tip, 0.45 to 0.4995.
     base
-        Whether a solid tip is "bonded" to the sensor or "lying" on it.
+        "bonded" if a solid tip is bonded to the sensor, "lying" if it lies on the sensor.
     face
-        Whether the surface of a solid tip is "frictionless" or "sticking" on the object.
+        Contact of a solid tip with the object: "frictionless" or "sticking".
     law
         Measured curves; required if ``physics`` is "measured", otherwise None.
 
