@@ -80,7 +80,7 @@ _EMPTY_TIME = 0.05
 
 
 class ControlState:
-    """Base class of the states."""
+    """Base class of the hand's states."""
 
     mode: Mode
 

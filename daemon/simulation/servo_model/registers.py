@@ -175,7 +175,7 @@ class ControlTable:
     def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
         """Restore factory defaults from address ``first`` on, except for the items in ``keep``.
 
-        If ``first`` is `control_table.RAM`, this has the effect of a power-up.
+        If ``first`` is `control_table.RAM`, the reset has the effect of a power-up.
         """
         for item in self.items:
             if item.address >= first and item.address not in keep:
