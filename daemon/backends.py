@@ -1,14 +1,14 @@
 """Look up servo, tactile and shape backends by name, and import them on demand.
 
 Built-in backends are listed in `BUILT_IN`. Plugins are entry points of installed packages, in the
-groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A plugin is a class,
-or for a shape a function, with the same arguments as the built-in backends. A plugin may define
-these attributes:
+groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A servo or tactile
+plugin is a class, and a shape plugin is a function. Plugins take the same arguments as the built-in
+backends. A plugin may define these attributes:
 
 - ``metal``: True (default) if the backend is real hardware.
-- ``hand``: True if the plugin needs the simulated hand, which is then passed to it in the same way
-  as to the built-in backends. A servo plugin may specify a class here, which replaces
-  `SimulatedHand` and must take the same arguments.
+- ``hand``: True if the plugin needs the simulated hand. The daemon then passes the hand in the same
+  way as to a built-in backend. Instead of True, a servo plugin may specify a class that replaces
+  `SimulatedHand` and takes the same arguments.
 - ``Settings``: a pydantic model for the profile table ``[plugins.NAME]``, preferably derived from
   `profile.fields.Section`. The validated settings are passed as the last argument.
 """
@@ -45,7 +45,7 @@ class Backend(NamedTuple):
         return self.source.partition(" ")[0]
 
     def options(self, tables: Mapping[str, Any]) -> tuple[BaseModel, ...]:
-        """Return a tuple with the plugin's validated settings, or an empty tuple if it has none."""
+        """Return the plugin's validated settings in a tuple, which is empty without settings."""
         if self.section is None:
             return ()
         return (self.section.model_validate(tables.get(self.name, {})),)
@@ -108,7 +108,7 @@ def plugins(kind: Kind) -> list[EntryPoint]:
 
 
 def source(entry: EntryPoint) -> str:
-    """Return a plugin's name, with the name and version of its package."""
+    """Return a plugin's name and the name and version of its package."""
     package = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "no package"
     return f"{entry.name} of {package}"
 
@@ -133,7 +133,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
 
 
 def servo_model(name: str) -> Any:
-    """Return the `ServoModel` of this name.
+    """Return the `ServoModel` with this name.
 
     If the name is unknown, raises KeyError with a list of all model names.
     """

@@ -68,10 +68,10 @@ def emulated(settings: Settings) -> bool:
 
 
 class Deadline:
-    """Start time of the daemon's next tick [s], beyond which an emulated hand must not advance.
+    """Start time [s] of the daemon's next tick; an emulated hand must not advance past it.
 
-    The time is that of the daemon's clock. It is stored in a file in the emulator's port folder,
-    and both processes map this file into memory.
+    The time is measured by the daemon's clock. The deadline is stored in a file in the emulator's
+    port folder, and both processes map this file into memory.
     """
 
     NAME = ".deadline"
@@ -87,7 +87,7 @@ class Deadline:
 
     @classmethod
     def of(cls, port: str) -> Deadline | None:
-        """Return the deadline of the emulator that owns ``port``, or None if it is a real port."""
+        """Return the deadline of the emulator that owns ``port``, or None for a real port."""
         try:
             return cls(Path(port).with_name(cls.NAME))
         except OSError:
@@ -95,7 +95,7 @@ class Deadline:
 
     @property
     def t(self) -> float:
-        """Last value that was set [s], initially 0."""
+        """Most recent deadline [s], initially 0."""
         return self._value[0]
 
     @t.setter
@@ -131,12 +131,12 @@ class RealClock:
 
 
 class HandClock:
-    """Clock of a simulated or emulated hand, which pauses while the machine is late.
+    """Clock that pauses while the machine is late, for a simulated or emulated hand.
 
-    The time is constant between two sleeps. After a sleep it equals the sleep's deadline, even if
-    the machine woke up late. If the machine is late by less than the time to the next deadline, it
-    catches up. Any additional delay is hidden from the hand and added to ``behind``. For an
-    emulated hand, ``due`` limits how far its time may advance.
+    The clock's time changes only during a sleep. After a sleep, the time equals the sleep's
+    deadline, even if the machine woke up late. The clock makes up for any delay that is shorter
+    than the time to the next deadline. A longer delay is hidden from the hand, and the excess is
+    added to ``behind``. An emulated hand must not advance past ``due``.
     """
 
     pauses_when_late = True

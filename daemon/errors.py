@@ -1,6 +1,6 @@
-"""Define the exceptions that several packages share. All are derived from `SoftfingerError`.
+"""Define the exceptions that several packages use. All are derived from `SoftfingerError`.
 
-An exception that only one package uses is defined in that package, with the same base class. This
+An exception used by a single package is defined in that package and has the same base class. This
 module does not import Numba or ZeroMQ.
 """
 
@@ -75,7 +75,10 @@ class ServoError(SoftfingerError):
 
 
 class ServosSilent(ServoError):
-    """Servos that have not replied, without any other problem. The servos may still be starting."""
+    """Some servos have not replied, and there is no other problem.
+
+    The servos may still be starting.
+    """
 
 
 class TactileError(SoftfingerError):
@@ -87,7 +90,7 @@ class RecordingError(SoftfingerError):
 
 
 class Reason(StrEnum):
-    """Machine-readable reason for rejecting a command: ``reason`` in the reply."""
+    """Machine-readable reason for rejecting a command, in the reply's field ``reason``."""
 
     LATE = "late"
     STOPPED = "stopped"

@@ -1,8 +1,8 @@
 """Read user-specified files within size limits, and write files safely in shared folders.
 
-A path given by a user or in another file may lead to a device, a pipe without a writer, or a file
-that is larger than the memory. In a shared folder such as /tmp, another user may have placed a file
-or a link at the output path. Writing through the link would overwrite its target.
+A path given by a user or in another file may refer to a device, a pipe without a writer, or a file
+that does not fit in memory. In a shared folder such as /tmp, another user may have placed a file or
+a link at the output path. Writing through the link would overwrite its target.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ def unpacked_size_max(file: BinaryIO) -> int:
 def runtime_folder() -> Path:
     """Return the user's runtime folder, which by default contains an emulated hand's port links.
 
-    The folder is in XDG_RUNTIME_DIR or /run/user. If neither is usable, it is in the temporary
-    folder and named after the user. If another user owns a folder of this name, it is in the home
-    folder. Raises RuntimeError if there is no home folder either.
+    The folder is in XDG_RUNTIME_DIR or /run/user. If neither location is usable, the folder is in
+    the temporary folder and named after the user. If another user owns a folder with that name, the
+    runtime folder is in the home folder. Raises RuntimeError if there is no home folder either.
     """
     named = os.environ.get("XDG_RUNTIME_DIR", "")
     for folder in (Path(named), Path(f"/run/user/{os.geteuid()}")):

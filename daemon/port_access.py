@@ -14,7 +14,10 @@ def port_group_remedy(path: str) -> str:
 
 
 def serial_group() -> str:
-    """Return the group of serial ports on this system: ``dialout``, or ``uucp`` without it."""
+    """Return the group of serial ports on this system:
+
+    ``dialout``, or ``uucp`` if there is no ``dialout``.
+    """
     import grp  # missing on some systems that run a client
 
     groups = {each.gr_name for each in grp.getgrall()}

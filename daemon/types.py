@@ -97,7 +97,7 @@ class Contact:
 
     @property
     def valid(self) -> bool:
-        """True if a frame has arrived, its estimate is valid, and it is not too old."""
+        """True if a frame has arrived, the frame is not too old, and its estimate is valid."""
         return not self.invalid
 
 
@@ -114,7 +114,7 @@ class ObjectPose:
 
 @dataclass(slots=True)
 class Goal:
-    """Servo goals. The control law sets them in place, and `safety` limits them."""
+    """Servo goals. The control law sets the goals in place, and `safety` limits them."""
 
     seq: int = 0
     t: float = 0.0

@@ -216,10 +216,10 @@ def solve(
 class SoftTips:
     """Context manager that turns spheres in a MuJoCo model into soft tips.
 
-    While the context is active, it uses MuJoCo's global callbacks ``mjcb_passive`` and
-    ``mjcb_sensor``, so only one model at a time can have soft tips. A user sensor named
-    ``TIP_pressure`` with ``needstage="vel"`` receives the cell pressures [Pa], which are updated
-    ``tactile.rate`` times per second.
+    While active, the context uses MuJoCo's global callbacks ``mjcb_passive`` and ``mjcb_sensor``,
+    so only one model at a time can have soft tips. A user sensor named ``TIP_pressure`` with
+    ``needstage="vel"`` receives the cell pressures [Pa], which are updated ``tactile.rate`` times
+    per second.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ class SoftTips:
         solve(*law, work, self._inertial, data.qacc, data.qfrc_passive, self._own)
 
     def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
-        """Set the pressure sensors on each step, since MuJoCo clears them (`mjcb_sensor`)."""
+        """Set the pressure sensors on each step, because MuJoCo clears them (`mjcb_sensor`)."""
         if data is self.data and stage == mujoco.mjtStage.mjSTAGE_VEL:
             is_due = data.time >= self._due
             self._due = data.time + self._period - 1e-9 if is_due else self._due

@@ -93,7 +93,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_unconfigure() -> None:
-    """Kill processes that a crashed test process left behind and this process adopted."""
+    """Kill processes left behind by a crashed test process and adopted by this process."""
     descendants.end(descendants.running() - _OUR_OWN)
 
 

@@ -24,7 +24,7 @@ WAIT_MAX = 5.0  # s, maximum wait for the first message with `--no-wait`
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config``, ``--set`` and ``--dir``, which select the hand for `profile`."""
+    """Add ``--config``, ``--set`` and ``--dir``; `profile` loads the settings that they select."""
     add_settings(parser)
     add_directory(parser)
 
@@ -102,7 +102,8 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
 def stream_address(text: str) -> str:
     """Parse the stream address from a socket address, ``tcp://HOST`` or ``STREAM,COMMANDS``.
 
-    An empty string selects SOFTFINGER_ADDRESS, or else the default address on this machine.
+    An empty string selects SOFTFINGER_ADDRESS or, if the variable is unset, the default address on
+    this machine.
 
     Raises
     ------

@@ -2,8 +2,8 @@
 
 Each subcommand is a module in a ``tools/`` package and is imported only when called. The module
 defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user
-can correct, it raises SettingsError (exit status 2), another SoftfingerError, or OSError for a file
-(exit status 1).
+can correct, the module raises SettingsError (exit status 2), another SoftfingerError, or OSError
+for a file (exit status 1).
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def _open_standard_streams() -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that suggests the closest known word for an unknown one."""
+    """Argument parser that suggests the closest known word for an unknown word."""
 
     def error(self, message: str) -> NoReturn:
         unknown = _UNKNOWN.search(message)

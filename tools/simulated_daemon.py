@@ -46,7 +46,7 @@ class SimulatedDaemon:
         sections: dict[str, dict[str, Any]],
         hand: dict[str, dict[str, Any]] | None = None,
     ) -> None:
-        """Build the daemon; ``hand`` contains the hand's settings if they differ."""
+        """Build the daemon; ``hand`` contains the hand's settings if these are different."""
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self.events: list[Event] = []
         real = None if hand is None else checked(hand | {"loop": {"clock": "virtual"}})

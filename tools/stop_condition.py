@@ -111,14 +111,14 @@ class Signals:
             signal.signal(number, self._end)
 
     def hand_over(self, end: Callable[[], None]) -> None:
-        """Let signals call ``end`` from now on; raise Interrupted if one has already arrived."""
+        """Let signals call ``end`` from now on; raise Interrupted if a signal arrived earlier."""
         self._end_running = end
         if self._has_ended:
             raise Interrupted
 
     @contextlib.contextmanager
     def deferred(self) -> Iterator[None]:
-        """Defer signals within this context; raise Interrupted on exit if one has arrived."""
+        """Defer signals within this context; raise Interrupted on exit if a signal has arrived."""
         self._deferred = True
         try:
             yield

@@ -92,7 +92,7 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
 
 
 class Sweep(Generic[Case, Result]):
-    """Run ``work`` once for each of ``cases``; iteration yields the results in this order.
+    """Run ``work`` once for each of ``cases``; iteration yields the results in the same order.
 
     ``work``, cases and results must be picklable. With a ``journal``, results must also be
     JSON-serialisable; the caller removes the journal after storing the results. ``name`` labels the

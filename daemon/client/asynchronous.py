@@ -36,7 +36,7 @@ class AsyncSubscription(Subscriber[_Record]):
         return await self.next(self._timeout)
 
     async def next(self, timeout: float | None) -> _Record:
-        """Return the next record. Raises NoStream if no record arrives within ``timeout`` s."""
+        """Return the next record; raise NoStream if no record arrives within ``timeout`` s."""
         for milliseconds in self._waits(timeout):
             if await self._socket.poll(milliseconds):
                 record = self._take(await self._socket.recv_multipart())
@@ -60,7 +60,7 @@ class AsyncSubscription(Subscriber[_Record]):
 class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
     """Asyncio version of `client.hand.Hand`: ``async with AsyncHand() as hand: …``.
 
-    Parameters, methods and exceptions are those of `Hand`.
+    The parameters, methods and exceptions are the same as those of `Hand`.
     """
 
     _CONTEXT = zmq.asyncio.Context
@@ -85,7 +85,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> AsyncSubscription[TactileFrame]:
-        """Subscribe to the tactile frames of both fingers; see `TactileFrame.finger`."""
+        """Subscribe to both fingers' tactile frames; `TactileFrame.finger` names the finger."""
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> AsyncSubscription[Event]:

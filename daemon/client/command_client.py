@@ -49,13 +49,14 @@ class NoAnswer(SoftfingerError):
 class Attempts:
     """Retry policy for one command, within the caller's timeout.
 
-    After a stall, the daemon refuses commands that have become too old, with the reason ``late``.
-    Such commands have no effect. All attempts have the same key, so the daemon carries out the
-    command at most once. It refuses a repeated attempt that follows a stop or another command.
+    After a stall, the daemon refuses outdated commands with the reason ``late``. A refused command
+    has no effect. All attempts have the same key, so the daemon carries out the command at most
+    once. The daemon refuses a repeated attempt if it has received a stop or another command in the
+    meantime.
     """
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
-        """Create a policy; ``timeout`` [s] applies to all attempts together."""
+        """Create a policy; all attempts together may take ``timeout`` [s]."""
         harmless = request.get("command") in NO_LEASE_COMMANDS
         self.request = request if harmless else {**request, "key": secrets.token_hex(8)}
         self.timeout = timeout
@@ -66,12 +67,12 @@ class Attempts:
         return max(self._end - _now(), 0.0)
 
     def again(self, reply: dict[str, Any]) -> bool:
-        """Return True if the command must be sent again, after `RETRY_DELAY` s."""
+        """Return True if the command must be sent again `RETRY_DELAY` s later."""
         return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * RETRY_DELAY
 
 
 def _now() -> float:
-    """Return the monotonic time [s], including time spent in suspend if the system supports it."""
+    """Return the monotonic time [s], which includes suspended time on systems that support it."""
     return time.clock_gettime(_CLOCK) if _CLOCK is not None else time.monotonic()
 
 
@@ -84,9 +85,9 @@ def send(
     """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
 
     If the daemon refuses the command as late, it is sent again until ``timeout`` expires. If the
-    reply takes longer than 1 s, a warning is logged; without logging handlers it goes to standard
-    error. If the same user runs the daemon on this machine, a ``stop`` is sent over a local socket
-    and bypasses the queues of other clients.
+    reply takes longer than 1 s, a warning is logged. If no logging handler exists, the warning is
+    printed to standard error. If the daemon runs on this machine under the same user, a ``stop`` is
+    sent over a local socket and bypasses other clients' queues.
     """
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
@@ -176,11 +177,12 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 
 
 class HandClient(Generic[_Done]):
-    """Base class of `Hand` and `AsyncHand`, with the addresses and a method for each command.
+    """Base class of `Hand` and `AsyncHand`, which stores the addresses and defines the commands.
 
-    Commands raise Refused, with the daemon's reason, or NoAnswer if the daemon does not reply. If
-    the daemon refuses a command as late, it is sent again until ``timeout`` expires. ``arm``,
-    ``disarm``, ``clear`` and ``release`` may be repeated: arming an armed hand is not an error.
+    A command raises Refused, with the reason, if the daemon refuses it, and NoAnswer if the daemon
+    does not reply. If the daemon refuses a command as late, it is sent again until ``timeout``
+    expires. ``arm``, ``disarm``, ``clear`` and ``release`` may be repeated: arming an armed hand is
+    not an error.
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context
@@ -252,7 +254,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("move", left=left, right=right)
 
     def grasp(self, force: float | None = None) -> _Done:
-        """Close and grip with ``force`` [N] per tip; the default comes from the settings."""
+        """Close the fingers and grip with ``force`` [N] per tip; the default is in the settings."""
         return self._carry_out("grasp", force=force)
 
     def rotate(self, angle: float) -> _Done:
@@ -260,7 +262,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("rotate", angle=angle)
 
     def hold(self, force: float | None = None, angle: float | None = None) -> _Done:
-        """Send one setpoint of a continuous stream, for example at 50 to 100 Hz.
+        """Send one setpoint; call this method continuously, for example at 50 to 100 Hz.
 
         Pass the ``force`` [N] per tip, the object ``angle`` [rad], or both. If the hand is not
         gripping yet, it grasps first. The angle is limited to the grip's range, and the angular

@@ -77,7 +77,7 @@ def require_host(address: str) -> None:
 
 
 class OneThread:
-    """Owner of a hand's sockets: the first thread that uses them, until it ends.
+    """Owner of a hand's sockets: the first thread that uses them, until that thread ends.
 
     A ZeroMQ socket that two threads use loses messages or aborts the process.
     """

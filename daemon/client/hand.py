@@ -20,7 +20,7 @@ class Subscription(Subscriber[_Record]):
     """Iterator over the records of one topic, in order of arrival.
 
     The subscription begins when the object is created. The iterator raises NoStream if no record
-    arrives within ``timeout`` [s]. If ``timeout`` is None, it waits indefinitely.
+    arrives within ``timeout`` [s]. If ``timeout`` is None, the iterator waits indefinitely.
     """
 
     def __iter__(self) -> Iterator[_Record]:
@@ -30,7 +30,7 @@ class Subscription(Subscriber[_Record]):
         return self.next(self._timeout)
 
     def next(self, timeout: float | None) -> _Record:
-        """Return the next record. Raises NoStream if no record arrives within ``timeout`` s.
+        """Return the next record; raise NoStream if no record arrives within ``timeout`` s.
 
         If there is a timeout, a warning is logged after 1 s of waiting.
         """
@@ -55,23 +55,22 @@ class Subscription(Subscriber[_Record]):
 
 
 class Hand(HandClient[None]):
-    """Client of one hand. Create one object in each thread.
+    """Client of one hand. Create one `Hand` in each thread.
 
-    Commands may be sent from any thread. The stream of one object (`state`, `stream`, `frames`,
-    `events`, `collect`, `wait_for`) and `close` belong to the first thread that uses the stream,
-    until it ends; they raise WrongThread in other threads. All methods raise HandClosed after
-    `close`.
+    Commands may be sent from any thread. The first thread that reads the stream (`state`, `stream`,
+    `frames`, `events`, `collect`, `wait_for`) owns it until the thread ends. In other threads,
+    these methods and `close` raise WrongThread. All methods raise HandClosed after `close`.
 
     Parameters
     ----------
     stream, commands
-        Addresses of the daemon. ``stream`` may also contain both, as ``tcp://HOST`` or
+        Addresses of the daemon. ``stream`` may also contain both addresses, as ``tcp://HOST`` or
         ``STREAM,COMMANDS``. The default is the environment variable SOFTFINGER_ADDRESS, or else
         this machine.
     client
         Client name for the command lease.
     timeout
-        Time limit for a reply or a first state [s]; 5 s by default.
+        Time limit for a reply or for the first state [s]; 5 s by default.
     keys
         Folder with this client's keys, if the daemon requires keys.
 
@@ -105,7 +104,7 @@ class Hand(HandClient[None]):
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> Subscription[TactileFrame]:
-        """Subscribe to the tactile frames of both fingers; see `TactileFrame.finger`."""
+        """Subscribe to both fingers' tactile frames; `TactileFrame.finger` names the finger."""
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> Subscription[Event]:

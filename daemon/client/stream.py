@@ -84,9 +84,9 @@ class Gaps:
     """Counter for lost messages of one topic.
 
     Messages are identified by their ``number`` or, if they have none, by ``seq`` divided by
-    ``seq_step``. A decrease does not count as a loss: it means that the daemon was restarted or
-    that a second daemon is running. If a repeated message (``again``) was not received the first
-    time, it fills a gap.
+    ``seq_step``. A decreasing number does not count as a loss: it means that the daemon was
+    restarted or that a second daemon is running. A repeated message (``again``) fills a gap if the
+    first copy was lost.
     """
 
     def __init__(self) -> None:
@@ -122,14 +122,14 @@ class Gaps:
 
 
 def no_stream(address: str, topic: bytes, timeout: float) -> NoStream:
-    """Return the exception to raise if a topic has no messages."""
+    """Return the exception to raise if no message of a topic arrives."""
     return NoStream(
         f"no {topic.decode()} from {address} within {timeout:g} s; is softfinger running?"
     )
 
 
 class Subscriber(Generic[_Record]):
-    """Base class of `Subscription` and `AsyncSubscription`, with a topic's socket and decoder.
+    """Base class of `Subscription` and `AsyncSubscription`: socket and decoder of one topic.
 
     ``unreadable`` is the number of messages that were skipped because they could not be decoded.
     """
@@ -240,7 +240,10 @@ class Wait:
         return max(left, 0.0)
 
     def ends_with(self, state: HandState) -> bool:
-        """Return True if the condition is met. If not, raises HandFault if the hand is in fault."""
+        """Return True if the condition is met.
+
+        Raises HandFault if the condition is not met and the hand is in fault.
+        """
         self._last = state
         if self._condition(state):
             return True

@@ -1,7 +1,8 @@
 """Look up which objects the hand can hold in simulation, by shape, size, friction and mass.
 
-`softfinger envelope --keep` creates the map, and `grasp` uses it for warnings. A map is valid only
-for the hand that was simulated; the packaged map is valid for the built-in hand.
+`softfinger envelope --keep` creates a map of the objects that the hand can hold, and `grasp` uses
+the map for warnings. A map is valid only for the hand that was simulated; the packaged map is valid
+for the built-in hand.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def increased_force_limit(settings: Settings, force: float) -> float:
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
     """Describe the first setting that differs, with both values; return "" if none differs.
 
-    If an older map does not contain a setting, its default is used.
+    If an older map does not contain a setting, the setting's default is used.
     """
     defaults = identity(Settings())
     for name, section in expected.items():
@@ -57,7 +58,9 @@ class Envelope:
     """Map for one hand, evaluated for the object in the settings."""
 
     def __init__(self, settings: Settings) -> None:
-        """Read the map named in the settings, or otherwise the packaged map if it fits this hand.
+        """Read the map named in the settings.
+
+        By default, use the packaged map if it fits this hand.
 
         Raises
         ------

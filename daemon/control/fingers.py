@@ -50,9 +50,9 @@ class Fingers:
     def turning_range(self) -> tuple[float, float]:
         """Return the minimum and maximum angle [rad] to which this grip can rotate the object.
 
-        When the object rotates by φ, each joint moves by φ divided by the sum of both rotation
-        Jacobians, and the tilt of each tip changes by the sum of these two angles. The joint and
-        tilt limits determine the range.
+        When the object rotates by φ, each joint moves by ψ, which is φ divided by the sum of both
+        rotation Jacobians. The tilt of each tip then changes by φ + ψ. The joint and tilt limits
+        determine the range.
         """
         settings, present_angle = self._settings, self.pose.angle
         rotation = self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1]
@@ -90,8 +90,8 @@ class Fingers:
     def close_fingers(self, touching: set[int]) -> set[int]:
         """Close the fingers that are not in contact; return the fingers in contact.
 
-        ``touching`` is the result from the previous tick. A finger with a new contact, which is not
-        in ``touching``, stops at its current angle.
+        ``touching`` is this function's result on the previous tick. A finger that is in contact but
+        not in ``touching`` stops at its current angle.
         """
         law, now_touching = self._settings.control, set[int]()
         for index in self.indices:
@@ -105,7 +105,7 @@ class Fingers:
         return now_touching
 
     def advance_setpoints(self, rate: float) -> bool:
-        """Advance the setpoints at up to ``rate`` [rad/s]; return True if all have arrived."""
+        """Advance the setpoints at up to ``rate`` [rad/s]; return True once all have arrived."""
         arrived = [joint.step(rate) for joint in self._setpoints]
         return all(arrived)
 

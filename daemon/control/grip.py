@@ -6,20 +6,20 @@ parts:
 
 1. *grip*: a feed-forward torque (moment arm × target force + joint friction), proportional and
    integral feedback of the force error, and damping matched to the tip stiffness;
-2. *steering*, the serial two-phased controller of the soft-fingertip literature: the object angle
-   error is integrated and added with opposite signs to the joint goals, which a PD controller
-   follows. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
+2. *steering*, the serial two-phased controller of the soft-fingertip literature: the integrated
+   object angle error is added to the joint goals with opposite signs, and a PD controller follows
+   these goals. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
 
 With ``control.law = "energy"``, the moment arms are the gradient of the contact-table energy along
-the rolling increments. They include the moments and shear forces of the tips.
+the rolling increments. These moment arms include the moments and shear forces of the tips.
 
-With ``"upright"``, the control law ignores the object angle until a command steers it. Both joints
-receive the same torque plus damping, as in the literature on blind grasping. A virtual spring
-between the fingers places the minimum of the tips' elastic energy at the upright object pose,
-regardless of residual shear in the tips (`hand.upright`). Antisymmetric dither of the fingers
-overcomes joint friction until the object has settled in that minimum. The law then holds the
-antisymmetric joint angle. Once a command steers the object, the moment arm is the force's arm about
-the pivot.
+With ``"upright"``, the control law ignores the object angle until a command steers it. The upright
+law gives both joints the same torque plus damping, as in the literature on blind grasping. A
+virtual spring between the fingers places the minimum of the tips' elastic energy at the upright
+object pose, regardless of residual shear in the tips (`hand.upright`). Antisymmetric dither of the
+fingers overcomes joint friction until the object has settled in that minimum. The control law then
+holds the antisymmetric joint angle. Once a command steers the object, the moment arm is the force's
+arm about the pivot.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Grip:
         return self._state.is_steering and self.angle.value != self.target_angle
 
     def start(self, measured: float, force: float) -> None:
-        """Take over from the approach at the ``measured`` force and change it to ``force`` [N]."""
+        """Begin the grip at the ``measured`` force and change the force to ``force`` [N]."""
         kernels.start(self._state.array, self._grasp.array, self.force.windows, measured)
         self.target_angle = math.nan
         self.retarget(force)
@@ -122,7 +122,7 @@ class Grip:
     def retarget(self, force: float) -> None:
         """Change the commanded force [N].
 
-        A lower force also reduces the slip-related increase in proportion.
+        If the force decreases, the increase due to slip decreases in proportion.
         """
         force = min(force, self.commanded_max)
         if force < self.commanded:
@@ -142,7 +142,7 @@ class Grip:
         self._state.force_rate = abs(self.force.value - force_max) / duration
 
     def force_for_load(self) -> float:
-        """Return the force [N] required for the load, including slip margin and hidden load."""
+        """Return the force [N] required for the load, including slip margin and undetected load."""
         law, grasp = self.slip.law, self._grasp
         load = self.slip.assumed_load
         if not law.has_shear and law.object_load == 0.0:  # friction may hide this load
@@ -171,7 +171,7 @@ class Grip:
     def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
         """Return joint torques [N·m], positive when closing, 0 for an unused finger.
 
-        Set ``holding`` once the grip has settled. From then on, only loads move the joints.
+        Set ``holding`` once the grip has settled, so that only loads move the joints.
         """
         if self._single_finger is not None:
             return self._single_torque(reading, False)

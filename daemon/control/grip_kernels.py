@@ -1,4 +1,4 @@
-"""State and kernels of the grip control laws, which `control.grip` explains.
+"""State and kernels of the grip control laws; `control.grip` explains the control laws.
 
 The kernels called from Python take the controller state, this tick's grasp, and the windows of both
 setpoints. Pairs are (left, right). SI units.
@@ -85,7 +85,7 @@ def start(
     force_windows: FloatArray,
     measured: float,
 ) -> None:
-    """Take over from the approach at the ``measured`` force [N]."""
+    """Begin the grip at the ``measured`` force [N]."""
     g = grips[0]
     q = grasps[0].q
     slip_monitor.reset(g.slip)
@@ -173,7 +173,7 @@ def single_torque(
 ) -> float:
     """Return the torque [N·m] for one ``finger`` that presses on a supported object.
 
-    If ``frames_late``, the force stays constant.
+    If ``frames_late`` is True, the force stays constant.
     """
     g = grips[0]
     grasp = grasps[0]
@@ -251,10 +251,10 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
 
 @inner_kernel
 def _distribute(g: GripState, grasp: GraspState) -> None:
-    """Equalise the tip forces, which friction between object and support may keep unequal.
+    """Equalise the tip forces if friction between object and support keeps them unequal.
 
-    The force controller acts only on their mean. To equalise them, both fingers shift sideways by a
-    small angle, which rotates the object by at most _DISTRIBUTE_ANGLE.
+    The force controller acts only on the mean tip force. To equalise the forces, both fingers shift
+    sideways by a small angle, which rotates the object by at most _DISTRIBUTE_ANGLE.
     """
     off = (
         0.5
@@ -270,7 +270,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
 
 @inner_kernel
 def _closing_rate(grasp: GraspState, rate: float, offset_rate: float) -> float:
-    """Return the closing rate [rad/s] that yields a force ``rate`` [N/s] during a rotation."""
+    """Return the closing rate [rad/s] that changes the force at ``rate`` [N/s] in a rotation."""
     arm = grasp.moment_arm
     rotation = grasp.jacobian_rotation
     d_rate = 2.0 * rate / _mean_stiffness(grasp)
@@ -311,7 +311,8 @@ def _equal_torques(
     """Return joint torques that push with equal force at any object angle.
 
     During the dither, the virtual spring from `hand.upright` acts between the fingers. The dither
-    fades out so that joint friction leaves no bias. The joints then hold their antisymmetric angle.
+    amplitude decreases gradually so that joint friction leaves no bias. After the dither, the
+    joints hold their antisymmetric angle.
     """
     law, q = g.law, grasp.q
     closing_rate = _closing_rate(grasp, g.force.speed, 0.0)

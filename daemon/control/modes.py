@@ -1,4 +1,4 @@
-"""The hand's modes and commands. The commands page is generated from the table."""
+"""The hand's modes and commands. The commands page is generated from `COMMANDS`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _ALL_MODES = frozenset(Mode)
 
 
 class Parameter(NamedTuple):
-    """Number that a command takes. `loop.requests.bounds` returns its range."""
+    """Numeric parameter of a command. `loop.requests.bounds` returns the allowed range."""
 
     required: bool
     unit: str
@@ -43,10 +43,10 @@ _NONE: Mapping[Any, Any] = MappingProxyType({})
 
 
 class CommandKind(NamedTuple):
-    """What a command does, when it is accepted, and what its reply contains.
+    """Description of a command: effect, modes that accept it, parameters, reply and refusals.
 
-    ``reply`` names the fields beside ``mode``, which `REPLY` explains. ``refusals`` has the causes
-    of a refusal that are particular to this command, by the reason in the reply.
+    ``reply`` names the reply fields other than ``mode``; `REPLY` explains them. ``refusals`` maps
+    reasons in the reply to causes that are specific to this command.
     """
 
     modes: frozenset[Mode]

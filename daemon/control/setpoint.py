@@ -107,12 +107,12 @@ class Setpoint:
     """Rate-limited ramp, smoothed by two running means in series.
 
     The first mean limits the acceleration to rate/window; the second limits the jerk to
-    rate/(window · window/2). The value never overshoots, whatever the sequence of targets. It
-    reaches the target 1.5 windows after the ramp.
+    rate/(window · window/2). The value never overshoots, for any sequence of targets. The value
+    reaches the target 1.5 windows after the ramp does.
     """
 
     def __init__(self, dt: float, window: float, state: SetpointState) -> None:
-        """Create a setpoint in ``state`` with tick period ``dt`` and first ``window`` [s]."""
+        """Create a setpoint in ``state``, with tick period ``dt`` and averaging ``window`` [s]."""
         self.state = state
         self.state.dt = dt
         self.state.first.length = max(round(window / dt), 1)
@@ -126,7 +126,7 @@ class Setpoint:
         _reset(self.state.array, self.windows, value)
 
     def step(self, rate: float) -> bool:
-        """Advance by one tick at up to ``rate`` [1/s]; return True if stopped at the target."""
+        """Advance by one tick at up to ``rate`` [1/s]; return True once stopped at the target."""
         return _step(self.state.array, self.windows, rate)
 
     @property

@@ -10,24 +10,24 @@ The following is computed on each tick, with the names from `SlipLaw`, `SlipStat
     force     min(max(commanded, needed), force_limit)
 
 **Offset.** Gear friction and errors in modulus and torque constant cause a residual even without a
-load. This offset is measured when holding begins, and again after force or angle have changed. A
-load that the previous hold showed is not part of it. The offset then follows r̄ slowly
-(_SETTLING_TIME). While the joints are at standstill, it follows the commanded torque immediately,
-because friction carries any torque that is added to a stuck joint. The offset stays within
-±`friction` of its initial value. Below that, it may decrease by another _RELAXATION_SHARE of the
-tip moment, because rubber relaxes.
+load. The offset is measured when holding begins, and again after force or angle have changed. A
+load detected during the previous hold is not part of the offset. The offset then follows r̄ slowly
+(_SETTLING_TIME). While the joints are at standstill, the offset follows the commanded torque
+immediately, because friction carries any torque that is added to a stuck joint. The offset stays
+within ±`friction` of its initial value. Because rubber relaxes, the offset may fall below this
+range by up to _RELAXATION_SHARE of the tip moment.
 
 **Load.** Friction hides a load of up to friction/load_arm, which is 2 N per tip for the default
-hand. Loads below half of that are ignored; larger loads are increased by the hidden part.
-Increasing the grip force by more than _UNCONFIRMED_SHARE requires confirmation: the object has
-rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
+hand. Loads below half of the hidden load are ignored. The load that friction may hide is added to
+larger loads. Increasing the grip force by more than _UNCONFIRMED_SHARE requires confirmation: the
+object has rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
 
 **Sudden events** increase the force immediately. A torque jump beyond the noise while both joints
-yield, or a shear jump in the frames of solid tips, increases it to its limit. An object rotation
-beyond the tips' shear deformation μ (d1 + d2)/2W increases it by _ROTATION_INCREASE. A sliding tip
-cannot show a load above its friction, so the size of a sudden load is unknown. In a pull, the two
-torques jump in the same direction; in a twist, they jump in opposite directions. A sideways push
-looks like a twist.
+yield, or a shear jump in the frames of solid tips, increases the force to its limit. An object
+rotation beyond the tips' shear deformation μ (d1 + d2)/2W increases the force by
+_ROTATION_INCREASE. A sliding tip transmits only its friction force, so the size of a sudden load is
+unknown. In a pull, the two torques jump in the same direction; in a twist, they jump in opposite
+directions. A sideways push looks like a twist.
 
 A force increase is held for _SETTLING_TIME and then decreases by increase_max per _DECAY_TIME.
 
@@ -37,7 +37,8 @@ Limits of the method:
   or the joint angles, so ``control.tip_friction`` must not exceed the actual friction.
 - Slowly growing loads stay hidden in joint friction; docs/safety.md gives the values.
 - Grips below 7 N (default hand) are poorly protected, because joint friction hides their loads.
-- A load towards the palm wedges the object between the tips. It is less visible and slips later.
+- A load towards the palm wedges the object between the tips, so the object slips later and the load
+  is harder to detect.
 - While the force changes or the object rotates, the motors also move the joints, so the load
   estimate is not updated.
 """
@@ -154,8 +155,8 @@ def reset(s: SlipState) -> None:
 def begin(s: SlipState, grasp: GraspState) -> None:
     """Begin holding, or continue after force or angle have changed.
 
-    The current residual is the offset without a load. If the previous hold showed a load, the load
-    is still there unless the offset would then leave its range, which scales with the force.
+    Without a load, the offset equals the current residual. A load from the previous hold is assumed
+    to persist, unless this would move the offset out of its range. The range scales with the force.
     """
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
@@ -276,7 +277,7 @@ def _detect_torque_jump(
 ) -> bool:
     """Average the residuals; return True if both residuals jumped while both joints yielded.
 
-    A wrong current or frame affects only one joint or does not move the joints.
+    An incorrect current reading affects only one joint, and an incorrect frame moves no joints.
     """
     known_torque = closing * (s.friction if closing < 0.0 else s.law.joint_friction)
     deviation1 = grasp.torque_residual[0] - known_torque - s.residual[0]
@@ -366,7 +367,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
 def _has_turned(s: SlipState, grasp: GraspState) -> bool:
     """Return True if the object has rotated by more than the tips' shear deformation.
 
-    Both tips must show the rotation, because a faulty sensor can indicate one by itself.
+    Both tips must show the rotation, because a single faulty sensor can simulate a rotation.
     """
     for k in range(2):
         s.rotation[k] += grasp.unexplained_rotation[k] - s.rotation_seen[k]

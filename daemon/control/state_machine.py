@@ -26,13 +26,13 @@ Several states share these transitions:
 - Settled, Changing, Turning: `rotate` → Turning
 - Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for _EMPTY_TIME →
   Travelling (RELEASING)
-- Pressing, Settled, Changing, Turning: a contact is missing for _CONTACT_LOSS_TIME → Armed. Until
-  then, the joints hold their positions (`ContactLoss`).
+- Pressing, Settled, Changing, Turning: a contact is missing for _CONTACT_LOSS_TIME → Armed. While
+  the contact is missing, the joints hold their positions (`ContactLoss`).
 
-Each transition creates a new instance of one of the classes below. Timers and flags are attributes
-of the state that uses them and are discarded with it. `control.modes` lists the commands for each
-mode, `loop.requests` checks them, `control.fingers` drives the joints, `control.grip` computes the
-joint torques of a grip, and `safety.safety` limits the goals.
+Each transition creates a new instance of a state class. Timers and flags are attributes of the
+state that uses them and are discarded with it. `control.modes` lists the commands for each mode,
+`loop.requests` checks them, `control.fingers` drives the joints, `control.grip` computes the joint
+torques of a grip, and `safety.safety` limits the goals.
 """
 
 from __future__ import annotations
@@ -80,14 +80,14 @@ _EMPTY_TIME = 0.05
 
 
 class ControlState:
-    """Base class of the states."""
+    """Base class of the hand's states."""
 
     mode: Mode
 
 
 @dataclass
 class Off(ControlState):
-    """Torque is off: DISARMED, or FAULT until the fault is cleared."""
+    """Torque is off. The mode is DISARMED, or FAULT until the fault is cleared."""
 
     mode: Mode = Mode.DISARMED
 
@@ -111,7 +111,7 @@ class Travelling(ControlState):
 
 @dataclass
 class GraspCommand:
-    """Values commanded for a grasp, stored until it has settled."""
+    """Values commanded for a grasp, stored until the grasp has settled."""
 
     force: float  # [N]
     is_streamed: bool  # the force is a streamed setpoint
@@ -139,7 +139,7 @@ class ContactLoss:
 
 @dataclass
 class GripHistory:
-    """Data shared by the states of one grip, from first contact of all fingers to its end."""
+    """Data shared by the states of one grip, from the contact of all fingers to the end."""
 
     loss: ContactLoss | None = None
     empty_for: float = 0.0  # duration of apparent tip-to-tip contact [s]
@@ -185,7 +185,7 @@ class Turning(Gripping):
 
 
 class Control:
-    """State machine of the hand and its commands. Only the loop thread may call it."""
+    """State machine of the hand and its commands. Only the loop thread may use this class."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
         """Create the machine; ``state`` and ``grasp`` are read on each tick but never written."""
@@ -238,7 +238,7 @@ class Control:
         self._enter(Armed(self._settings.safety.current_move, following_count=2))
 
     def disarm(self) -> None:
-        """Switch torque off. This also clears a fault."""
+        """Switch torque off and clear any fault."""
         self._enter(Off())
 
     def stop(self) -> None:
@@ -365,7 +365,7 @@ class Control:
     def hold_goal(self, goal: Goal) -> None:
         """Hold the goals while frames are late; called instead of :meth:`step`.
 
-        The goals of a grip are torques: the joints stay damped, and any rotation comes to rest.
+        In a grip, the goals are torques: the joints stay damped, and any rotation stops.
         """
         if goal.valid and isinstance(self.state, Gripping) and self.state.history.loss is None:
             self.fingers.apply_torques(goal, self.grip.hold_goal(self.fingers.reading))
@@ -417,8 +417,9 @@ class Control:
     def _empty_for(self, before: float, dt: float) -> float:
         """Return the duration [s] of apparent tip-to-tip contact; release after _EMPTY_TIME.
 
-        Tips that press against each other would roll off to one side. Both sensors measure the same
-        contact in this case, so the estimated object width is 0 within its error.
+        Tips that press against each other would roll off to one side. When the tips touch each
+        other, both sensors measure the same contact, so the estimated object width is 0 to within
+        its standard error.
         """
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:
@@ -490,7 +491,7 @@ class Control:
                 self.rotate(angle)
 
     def _is_force_reached(self, is_streamed: bool) -> bool:
-        """Return True if the mean tip force has reached its target or a streamed setpoint near it.
+        """Return True if the mean tip force has reached its target, or a setpoint close to it.
 
         The mean is used because friction between object and support may unbalance the tip forces.
         """

@@ -1,8 +1,8 @@
 """Check the hand's devices: the scene's servos and the frames of each tactile board.
 
 The checks do not change settings. `softfinger doctor --fix` calls the functions named `repair`,
-which configure adapters and servos. If a servo's EEPROM must be written, the hand goes limp; it is
-never stiffened or moved.
+which configure adapters and servos. Torque is switched off to write a servo's EEPROM, so the hand
+goes limp. Torque is never switched on, and the hand is never moved.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def _try_exchange(
 
 
 def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -> list[Finding]:
-    """Return the findings of one servo; ``late`` if it replied only after some waiting."""
+    """Return the findings for one servo. ``late`` is True if the servo replied after a wait."""
     name = servo.name
     if not servo.replies:
         if servo.errors:
@@ -178,7 +178,7 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
 
 
 def _blame_power(examined: list[Examined]) -> list[Finding]:
-    """Report the most likely cause of missing servos if no further servos reply."""
+    """Report the most likely cause if servos are missing and a search finds no others."""
     at = reg.PRESENT_INPUT_VOLTAGE
     volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
     problem = "no other servo replies at any baud rate"
@@ -260,7 +260,10 @@ def check_board(settings: Settings, finger: int) -> Finding:
 
 
 def _rest(settings: Settings, finger: int, frame: Frame) -> float:
-    """Return the median cell pressure [Pa]. A contact loads fewer than half of the cells."""
+    """Return the pressure of an unloaded cell [Pa]: the median of all cells.
+
+    A contact loads fewer than half of the cells.
+    """
     calibration = calibration_for(settings, finger)
     scale = settings.tactile.pascal_per_count
     if calibration is None:

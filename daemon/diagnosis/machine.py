@@ -1,7 +1,7 @@
 """Check that this machine can run ticks on time: scheduling, memory, idle states and clock.
 
-Problems of this kind only degrade the timing, so they are reported as warnings. The checks read the
-limits of this process. A daemon that is started from the same shell has the same limits.
+The problems found here only degrade the timing, so they are reported as warnings. The checks read
+the limits of this process. A daemon that is started from the same shell has the same limits.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def check_idle_states(path: Path) -> Finding:
 
 
 def check_wall_clock(now: float) -> Finding:
-    """Check that the Unix time ``now`` [s], which all published messages contain, is plausible."""
+    """Check that the Unix time ``now`` [s] is plausible; all published messages contain it."""
     if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
@@ -94,7 +94,7 @@ def wake_ups() -> list[float]:
 
 
 def check_wake_ups(late: list[float]) -> Finding:
-    """Check wake-up delays [s]. A median above a quarter of the period is a warning."""
+    """Check wake-up delays [s]. A median above a quarter of the tick period causes a warning."""
     worst = max(late)
     middle = sorted(late)[len(late) // 2]
     text = (

@@ -38,7 +38,7 @@ def note_ports() -> Finding:
 
 
 def check_runtime_folder() -> Finding:
-    """Check the folder of emulated ports and the local stop: only this user may write to it."""
+    """Check that only this user may write to the folder of emulated ports and the local stop."""
     what, _, fix = runtime_fault().partition(": chmod ")
     if what:
         return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
@@ -53,7 +53,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     """Check that a port exists, can be opened, and is not used by another process.
 
     The port is closed afterwards. ``key`` is the setting that names the port. ``mode_of_daemon`` is
-    the mode of the running daemon, which may be using the port, or empty if no daemon runs.
+    the mode of a running daemon that may be using the port; it is empty if no daemon runs.
     """
     try:
         mode = Path(path).stat()

@@ -82,7 +82,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
 def restore_registers(settings: Settings, path: Path) -> list[Finding]:
     """Write the registers saved by :func:`save_registers` to servos with the same ID and model.
 
-    Raises ServoError if the file does not have this format.
+    Raises ServoError if the file format is invalid.
     """
     stored = _stored(path)
     result: list[Finding] = []
@@ -139,7 +139,10 @@ def _restore(
 
 
 def _stored(path: Path) -> dict[int, StoredServo]:
-    """Return a file's servos by ID. Raises ServoError if the file does not have this format."""
+    """Return a file's servos as a dictionary with the ID as key.
+
+    Raises ServoError if the file format is invalid.
+    """
     try:
         stored = StoredServos.model_validate_json(read_file(path, _FILE_SIZE_MAX))
     except OSError as error:

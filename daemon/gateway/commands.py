@@ -1,16 +1,16 @@
-"""Forward requests to the loop, within limits, and forward replies to clients.
+"""Forward requests to the loop, within the limits in `bounds`, and replies to clients.
 
-The gateway does not unpack requests. A request that looks like a stop is urgent: it bypasses the
-queues, one at a time per client. Only a few other requests are forwarded to the loop at a time. The
-other requests wait in queues, and the clients are served in turn. If a client exceeds its rate, its
-requests are refused until it pauses.
+The gateway does not unpack requests. Requests that look like a stop bypass the queues, one at a
+time for each client. Apart from stops, only a few requests are forwarded to the loop at a time.
+Further requests wait in queues, and the clients are served in turn. If a client exceeds its rate,
+its requests are refused until it pauses.
 
 Each request is stamped with its arrival time and the number of stops that preceded it. The libzmq
 thread reads ahead, so the gateway can't determine whether a request arrived before or after a stop.
 After a stop or a gap between two polls, the gateway therefore stamps requests as if they had
-arrived earlier. It does so until the socket has been empty and few requests have arrived. In the
-meantime, replies are held back for a limited time, because clients may respond to them with new
-requests, which would be refused.
+arrived earlier, until the socket has been empty and few requests have arrived. Replies are also
+held back, for a limited time, because clients may respond to a reply with new requests, which would
+be refused.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Client:
         self._then = now
 
     def floods(self, per_second: float, now: float) -> bool:
-        """Count one request; return True while the client must pause, having exceeded its rate."""
+        """Count one request; return True if the client has exceeded its rate and must pause."""
         passed = now - self._then
         left = min(self._left + passed * per_second, per_second) - 1.0
         self._left = max(left, 0.0)
@@ -102,7 +102,7 @@ class CommandEndpoint(Endpoint):
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
     def fence(self, stops: int) -> None:
-        """Stamp new requests as older than the last stop until all older ones have been read."""
+        """Stamp new requests as older than the last stop until all earlier requests are read."""
         self._fence = stops
         self._since, self._arrived = self._clock(), 0
 
@@ -138,8 +138,8 @@ class CommandEndpoint(Endpoint):
     def _note_empty(self, now: float) -> None:
         """Check whether all requests from before a stop or a gap have been read.
 
-        The socket is empty, but the libzmq thread may still deliver older requests. They count as
-        read only after `bounds.REFUSAL_TIME` with few new requests.
+        The socket is empty, but the libzmq thread may still deliver older requests. Older requests
+        count as read only after `bounds.REFUSAL_TIME` with few new requests.
         """
         if now - self._since > bounds.REFUSAL_TIME:
             if self._arrived <= bounds.TOTAL_RATE * bounds.REFUSAL_TIME:
@@ -198,7 +198,7 @@ class CommandEndpoint(Endpoint):
         return client
 
     def _client_rate(self, identity: bytes, now: float) -> float:
-        """Return the allowed request rate per client [1/s], which is lower with many clients."""
+        """Return the allowed request rate per client [1/s], which decreases with many clients."""
         if now > self._active_until:
             self._active_until = now + 1.0
             self._active.clear()

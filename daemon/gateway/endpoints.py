@@ -1,7 +1,7 @@
 """Provide the client sockets and authenticate the clients.
 
 Without keys all clients are accepted, but libzmq disconnects peers that do not send a ZMTP 3
-greeting. This excludes web pages, whose POST requests are valid messages in older protocol
+greeting. The greeting excludes web pages, whose POST requests are valid messages in older protocol
 versions.
 """
 
@@ -31,14 +31,16 @@ _DOMAIN = "softfinger"
 
 
 class RestartNeeded(SoftfingerError):
-    """All clients must be disconnected and reconnect. The message gives the reason."""
+    """All clients must be disconnected so that they reconnect. The message gives the reason."""
 
 
 class Admission(ThreadAuthenticator):
     """Authenticate clients for libzmq with the keys that are currently in the folder."""
 
     def __init__(self, context: zmq.Context[Any], folder: Path | None) -> None:
-        """Load the keys in ``folder`` (see `softfinger keys`). With None, all clients are accepted.
+        """Load the keys in ``folder`` (see `softfinger keys`).
+
+        If ``folder`` is None, all clients are accepted.
 
         Raises
         ------
@@ -172,7 +174,10 @@ class Endpoint:
             raise AddressError(f"{key}: {error}") from None
 
     def _parts(self) -> list[zmq.Frame]:
-        """Return the next message's parts, at most one more than allowed. Empty without message."""
+        """Return the next message's parts, but at most one part more than allowed.
+
+        Empty without message.
+        """
         found: list[zmq.Frame] = []
         with contextlib.suppress(zmq.Again):
             while not found or found[-1].more:
@@ -210,7 +215,7 @@ class StreamEndpoint(Endpoint):
         self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # report every subscription to a topic
 
     def read(self, now: float) -> None:
-        """Read subscriptions, and repeat stored messages to new subscribers."""
+        """Read subscriptions, and send stored messages to new subscribers."""
         for _ in range(bounds.SUBSCRIPTIONS_PER_TURN):
             parts = self._parts()
             if not parts:

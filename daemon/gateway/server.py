@@ -1,8 +1,8 @@
 """Run the gateway process, in which one thread serves the loop and the clients.
 
-It is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's file
-descriptor and a `Config` as JSON. The process first binds its sockets. The process exits when the
-loop disconnects.
+The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's
+file descriptor and a `Config` as JSON. The process first binds its sockets, and exits when the loop
+disconnects.
 """
 
 from __future__ import annotations

@@ -25,7 +25,10 @@ _RESTART_DELAYS = 0.1, 2.0  # s, first and maximum delay between an exit and the
 
 
 class Gateway:
-    """Gateway process, restarted until `close` is called. The loop communicates through `link`."""
+    """Gateway process, which is restarted whenever it dies until `close` is called.
+
+    The loop communicates through `link`.
+    """
 
     def __init__(self, config: Config, link: Link | None = None) -> None:
         """Start the process in the background. Call `wait` before use."""

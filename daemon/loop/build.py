@@ -62,8 +62,8 @@ class Daemon:
         Parameters
         ----------
         on_event : called with the level, kind and text of each event
-        wire : serve clients over ZeroMQ; the owner of a `Link` exchanges the messages itself
-        hand : settings of the simulated hand, if they differ from those that the daemon uses
+        wire : True to serve clients over ZeroMQ, or a `Link` whose owner exchanges the messages
+        hand : settings of the simulated hand, if they differ from the daemon's settings
         """
         self.settings = settings
         self._hand_settings = settings if hand is None else hand

@@ -36,7 +36,7 @@ _START_AGE_MAX = 0.2
 
 
 def command_age_max(settings: Settings, waits: bool) -> float:
-    """Return the maximum age [s] of a command that stiffens or moves the hand.
+    """Return the maximum age [s] of a command that switches torque on or moves the hand.
 
     An older command may have been sent before the servo watchdog stopped the hand. If ``waits`` is
     True, the servos' clock and watchdog pause while this machine is late.
@@ -297,18 +297,18 @@ class Loop:
     ) -> dict[str, Any]:
         """Execute one request on the current tick.
 
-        A request that does not come from the running task ends this task.
+        A request from another source ends the running task.
 
         Parameters
         ----------
         request : command with its parameters
         age : time since the request arrived [s]
-        by_task : the request comes from the running task
+        by_task : True if the request comes from the running task
 
         Raises
         ------
         Refused
-            If the request is rejected. The message says why.
+            If the request is rejected. The message gives the reason.
         """
         name = request["command"]
         if name == "status":

@@ -1,8 +1,8 @@
 """Decide which topics to publish on each tick, and measure the actual rates.
 
-Each topic is published on every n-th tick (counted by ``seq``), where n gives the rate closest to
-the requested rate. If n is large enough, statistics are published a few ticks after the state, so
-that one tick does not publish everything. Of the tactile frames, one in n is published.
+Each topic is published on every n-th tick (counted by ``seq``); n is chosen so that the rate is
+closest to the requested rate. If n is large enough, statistics are published a few ticks after the
+state, so that one tick does not publish everything. Every n-th tactile frame is published.
 `wire.publisher` sends the messages; this module does not change the state.
 """
 
@@ -29,7 +29,7 @@ def every(rate: float, wanted: float) -> int:
 
 
 def parts(settings: Settings) -> SceneParts:
-    """List the components of the scene that these settings define."""
+    """List the components of the scene defined by the settings."""
     return SceneParts(
         fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
         has_servos=settings.servos.backend != "none",

@@ -1,9 +1,9 @@
 """Configure scheduling, memory and timers for a steady tick, and notify systemd.
 
-The measures in the ``[realtime]`` settings are applied once, after warm-up. All of them are
-optional: if the system refuses one, a warning explains the consequence and gives the command that
-grants it. `daemon.clock` implements the spin before a deadline. The `Service` class sends the
-READY, WATCHDOG and STOPPING notifications to systemd with sd_notify.
+The measures in the ``[realtime]`` settings are applied once, after warm-up. Each measure is
+optional: if the system refuses a measure, a warning explains the consequence and gives the command
+that grants the permission. `daemon.clock` implements the busy wait before a deadline. The `Service`
+class sends the READY, WATCHDOG and STOPPING notifications to systemd with sd_notify.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ class RealTime:
             self._granted("memory locked", libc.munlockall)
 
     def _hold_latency(self) -> None:
-        """Prevent deep processor idle states while the file stays open."""
+        """Prevent deep processor idle states until the opened file is closed."""
         try:
             descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -250,8 +250,8 @@ def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
 class Service:
     """Notifier for systemd via the socket in ``NOTIFY_SOCKET``. Never blocks or raises.
 
-    Each notification is one datagram. The loop calls `alive` on every tick. Most calls only compare
-    times; only a few messages are sent per watchdog period.
+    Each systemd notification is one datagram. The loop calls `alive` on every tick. Most calls only
+    compare times; only a few messages are sent per watchdog period.
     """
 
     def __init__(self, address: str, watchdog: float = 0.0) -> None:
@@ -270,7 +270,7 @@ class Service:
 
     @classmethod
     def of_environment(cls, environment: Mapping[str, str] = os.environ) -> Service | None:
-        """Return the service described by the environment, or None if not started by systemd."""
+        """Return the service described by the environment, or None without systemd."""
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@") or len(address) < 2:
             return None
@@ -280,7 +280,7 @@ class Service:
         return cls(address, watchdog)
 
     def alive(self, t: float) -> None:
-        """Send a keep-alive message if due at time ``t`` [s]; the first one also reports READY."""
+        """Send a keep-alive message if due at time ``t`` [s]; the first message reports READY."""
         if t < self._due:
             return
         self._due = t + self._every

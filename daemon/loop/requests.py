@@ -80,9 +80,9 @@ def _malformed(text: str) -> Refused:
 
 
 def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
-    """Return the range of a command's parameter, which is infinite if it depends on the grip.
+    """Return a command parameter's range, or an infinite range if it depends on the grip.
 
-    A force must be above the lower bound.
+    A force must be greater than the lower bound.
     """
     if parameter in FINGERS:
         hand, index = settings.hand, FINGERS.index(parameter)
@@ -93,7 +93,7 @@ def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
 
 
 class Lease:
-    """Exclusive control of the hand by one client for a time after its last command.
+    """Exclusive control of the hand by one client until a timeout after its last command.
 
     All unnamed clients share one lease. Commands that can only make the hand safer require no
     lease.
@@ -124,14 +124,14 @@ class Lease:
         return self._owner or "the client in control"
 
     def renew(self, command: Command, now: float) -> None:
-        """Take or extend the lease after the execution of a command."""
+        """Take or extend the lease after a command has been executed."""
         if command.name not in NO_LEASE_COMMANDS:
             self._owner = command.client
             self._until = now + self.seconds
 
 
 class Requests:
-    """Executor of requests between two stages of a tick. Only the loop thread may call it."""
+    """Request executor, called between two stages of a tick, only by the loop thread."""
 
     def __init__(
         self,
@@ -148,8 +148,8 @@ class Requests:
 
         Parameters
         ----------
-        emit : sends an event
-        command_age_max : maximum age [s] of a command that may stiffen or move the hand
+        emit : function that sends an event
+        command_age_max : maximum age [s] of a command that switches torque on or moves the hand
         """
         self._command_age_max = command_age_max
         self._settings = settings
@@ -187,7 +187,7 @@ class Requests:
         Raises
         ------
         Refused
-            If the request is rejected. The message says why.
+            If the request is rejected. The message gives the reason.
         """
         state, control = self._state, self._control
         if request["command"] == "stop":  # accepted in every mode, from any client, with any fields
@@ -229,7 +229,7 @@ class Requests:
             self._emit("warning", "silence", text)
 
     def end_grip(self, action: str) -> bool:
-        """Perform ``stop`` or ``release``; return False if it does not apply in this state."""
+        """Perform ``stop`` or ``release``; return False if it has no effect in this state."""
         control = self._control
         if action == "stop" and control.torque:
             control.stop()
@@ -258,7 +258,7 @@ class Requests:
             raise Refused(f"{text}; send it again", Reason.LATE)
 
     def _check(self, name: str, numbers: dict[str, float]) -> None:
-        """Raise Refused if the state, scene or limits prevent a valid command."""
+        """Raise Refused if the state, scene or limits rule out a valid command."""
 
         def refuse_if(condition: object, reason: Reason, text: str) -> None:
             if condition:
@@ -352,7 +352,7 @@ class Requests:
     def _reopen(self, name: str) -> None:
         """Reopen the sensors whose port was lost.
 
-        Only ``clear`` and ``arm`` reopen sensors, while torque is off.
+        Sensors are reopened only by ``clear`` and ``arm``, while torque is off.
 
         Raises
         ------

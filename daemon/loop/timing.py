@@ -1,10 +1,10 @@
 """Measure loop timing: histograms of the stages, and tick delays.
 
-A single kernel call per tick updates the histograms; they are published once per second. Each
+A single kernel call per tick updates the histograms, which are published once per second. Each
 octave above 1 ns is divided into 32 bins. A quantile is reported as the upper edge of its bin, so
 it is never too small and at most 3.2 % too large. The maximum is exact.
 
-Delays, measured in machine time, are reported in occasional events and as a possible cause of
+Tick delays, measured in machine time, are reported in occasional events and as a possible cause of
 faults. While a tick is late, real hardware is uncontrolled, whereas a simulated hand on its own
 clock waits (`daemon.clock.HandClock`).
 """
@@ -85,7 +85,7 @@ class Statistics:
         return int(self.counts[0].sum())
 
     def spreads(self) -> dict[str, TimeSpread]:
-        """Return quantiles and maximum for each name in `TIMES`; all 0 before the first tick."""
+        """Return quantiles and maximum for each name in `TIMES`, or zeros before the first tick."""
         spreads = {}
         for name, until, largest in zip(
             TIMES, self.counts.cumsum(axis=1), self.largest, strict=True
@@ -108,7 +108,7 @@ class Lateness:
     """Delay monitor for one loop's ticks."""
 
     def __init__(self, settings: Settings, timing: Timing, waits: bool) -> None:
-        """Create the monitor; in the loop's ``timing``, it writes only ``busy_s``.
+        """Create the monitor, which writes only the field ``busy_s`` of the loop's ``timing``.
 
         ``waits`` is True if the hand's clock pauses while the machine is late.
         """
@@ -122,8 +122,8 @@ class Lateness:
     def look(self, t: float, own_doing: bool) -> Event | None:
         """Evaluate the tick that began at ``t`` [s]; return an event to emit, or None.
 
-        ``timing`` must already contain the start of this tick. ``own_doing`` is True if a command
-        executed on the previous tick may have delayed this one.
+        ``timing`` must already contain the start time of this tick. ``own_doing`` is True if a
+        command executed on the previous tick may have delayed this tick.
         """
         timing = self._timing
         gap = 0.0 if own_doing else timing.tick_s - self._period
@@ -154,9 +154,9 @@ class Lateness:
 
         Parameters
         ----------
-        name : name of the broken limit
+        name : name of the violated limit
         text : description of the fault
-        at_work : time that the current tick has taken so far [s]
+        at_work : duration of the current tick so far [s]
         """
         timing = self._timing
         if self._waits or name not in _TIME_LIMITS:

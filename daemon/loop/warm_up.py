@@ -1,9 +1,9 @@
 """Compile a scene's kernels by running each part of the pipeline once before the first tick.
 
 `loop.build` runs all parts before the loop is created, and therefore before torque can be on. On
-first use, `processes.compile` has already compiled the parts in parallel processes. Each part
-builds the objects that it needs, runs them on an artificial contact and discards them. Components
-that are not in the scene are skipped.
+first use, `processes.compile` compiles the parts in parallel processes beforehand. Each part builds
+the objects that it needs, runs them on an artificial contact and discards them. Components that are
+not in the scene are skipped.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class Part(NamedTuple):
 
 
 def parts(settings: Settings) -> list[Part]:
-    """Return the parts required by ``settings``, in a suitable order for two processes.
+    """Return the parts required by ``settings``, in an order that suits two processes.
 
-    One process compiles the estimator and then the simulated sensor, which share kernels. The other
-    compiles the contact table and then the simulated hand and the filter, which use the table. The
-    shorter parts balance the load.
+    One process compiles the estimator and the simulated sensor, because they share kernels. The
+    second process compiles the contact table before the simulated hand and the filter, because both
+    use the table. The shorter parts balance the load.
     """
     simulated = needs_hand(settings.servos.backend, settings.tactile.backend)
     servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"

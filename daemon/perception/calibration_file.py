@@ -161,12 +161,12 @@ class Calibration(_StepModel):
 
 
 def now() -> str:
-    """Return the current date and time in the format of the file."""
+    """Return the current date and time in the file's format."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def sensor_of(settings: Settings, finger: int) -> Sensor:
-    """Return the sensor of ``finger``. If it has no label, its USB serial number is used."""
+    """Return the sensor of ``finger``. Without a label, the sensor's USB serial number is used."""
     tactile = settings.tactile
     return Sensor(
         finger=_NAMES[finger],
@@ -213,7 +213,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """Describe how the sensor of a file differs from ``there``; return "" if they are equal."""
+    """Describe how a file's sensor differs from ``there``; return "" if both are equal."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "unnamed", there.label or "unnamed"),
@@ -254,7 +254,7 @@ class Converter:
         pascal_per_count
             Scale factor to use if no curve has been measured.
         full_count
-            Reading of a saturated cell; None means the value in the calibration.
+            Reading of a saturated cell; None selects the value in the calibration.
         """
         sensor = calibration.sensor
         shape = (sensor.rows, sensor.cols)
@@ -273,7 +273,7 @@ class Converter:
             )
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
-        """Return the pressure [Pa] of counts [rows, cols]."""
+        """Convert counts [rows, cols] to pressures [Pa]."""
         return self.pressure(self.readings(counts))
 
     def readings(self, counts: NDArray[Any]) -> FloatArray:
@@ -283,7 +283,7 @@ class Converter:
     def pressure(self, readings: FloatArray) -> FloatArray:
         """Convert readings to pressure [Pa].
 
-        The curve is odd because noise may make readings negative.
+        The curve is an odd function, because noise may make readings negative.
         """
         exponent, c1, c2, c3 = self._curve.tolist()
         x = np.abs(readings)

@@ -53,8 +53,8 @@ def make_models(
 ) -> tuple[FingerModel, FingerModel]:
     """Create the models of both fingers.
 
-    If the modulus of a tip is not calibrated, its stress-strain law comes from the settings. A
-    finger that is not in the scene or has no sensor uses only the settings.
+    If the modulus of a tip is not calibrated, its stress-strain law comes from the settings. The
+    model of a finger that is not in the scene or has no sensor is based only on the settings.
 
     Raises the same exceptions as `profile.factory.make_table` and
     `calibration_file.calibration_for`.
@@ -101,7 +101,7 @@ def make_models(
 
 
 def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
-    """Return a finger's prior from `calibrate scales`, or else from the settings."""
+    """Return a finger's prior from `calibrate scales` or, without one, from the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales
         # The gain changes with temperature and load, so it remains uncertain after calibration.
@@ -119,7 +119,7 @@ def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
 def _measured_tip(settings: Settings, finger: int, calibration: Calibration | None) -> Fingertip:
     """Return the tip with the measured curves of its calibration file.
 
-    Raises SettingsError if the file has no curves or they do not match the settings.
+    Raises SettingsError if the file has no curves or if the curves do not match the settings.
     """
     law = None if calibration is None else calibration.law
     file = settings.tactile.calibration[finger]
@@ -156,7 +156,9 @@ def make_estimator(
     active: NDArray[np.bool_] | None = None,
     calibration: Calibration | None = None,
 ) -> ContactEstimator | MeasuredEstimator:
-    """Create a finger's estimator. It keeps the last estimate, so fingers can't share one.
+    """Create a finger's estimator.
+
+    An estimator stores its last estimate, so each finger needs its own estimator.
 
     Parameters
     ----------

@@ -6,9 +6,9 @@ footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain:                 frame
             ln F(D, θ) + MODULUS + GAIN − (∂ ln F/∂d) ḋ LATENCY
 amplitude   MODULUS + GAIN, if the gain was fitted                     2 %, frame covariance
 
-A frame shows the hand at the time of its scan. It is therefore compared with the state at that
-time, which is reconstructed from the joint history. `estimate.systematic`, the covariance that all
-frames share, is not part of the noise and is never estimated; it only increases the published
+A frame shows the hand at the time of its scan. The frame is therefore compared with the state at
+that time, which is reconstructed from the joint history. `estimate.systematic`, the covariance that
+all frames share, is not part of the noise and is never estimated; it only increases the published
 standard deviations.
 """
 
@@ -84,7 +84,7 @@ class FrameContact(NamedTuple):
 
 
 class FingerMotion(NamedTuple):
-    """Integrated predicted motion of one finger at one time."""
+    """Predicted motion of one finger, integrated up to one instant."""
 
     d: float
     spread: float
@@ -127,7 +127,7 @@ def _rates(
 ) -> tuple[float, float]:
     """Return the rates of d [m/s] and θ [rad/s] at the ``scan``, for the latency slopes.
 
-    The rates are secants over ±1 standard deviation of the latency, since the joints may have
+    The rates are secants over ±1 standard deviation of the latency, because the joints may have
     stopped in between. Rates below the velocity resolution are set to 0.
     """
     span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_INTERVAL_MIN)
@@ -173,10 +173,10 @@ def update(
     systematic: FloatArray,
     table: FloatArray,
 ) -> bool:
-    """Update with one finger's frame from time ``t``; return False if the frame is rejected.
+    """Update the state with one finger's frame from time ``t``; return False if it is rejected.
 
     ``covariance`` is the [4, 4] covariance of d, θ, tilt_y and gain; ``systematic`` is the part of
-    it that all frames share. A gain variance above 0 means that the gain was fitted.
+    this covariance that all frames share. A gain variance above 0 means that the gain was fitted.
     """
     h = hands[0]
     tip = h.tip[finger]
@@ -286,7 +286,7 @@ def _is_finite(h: HandFilter) -> bool:
 
 @inner_kernel
 def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> None:
-    """Reset one finger's states at touch; ``face`` is the angle in its first frame [rad].
+    """Reset a finger's states on first contact; ``face`` is the angle in the first frame [rad].
 
     If the other tip is not in contact, all states are reset.
     """
@@ -318,7 +318,10 @@ def _update_angle(
     theta_rate: float,
     is_new_contact: bool,
 ) -> None:
-    """Update with a frame's angle. Beyond the gate, the object has rotated unexpectedly."""
+    """Update the state with a frame's angle.
+
+    An innovation beyond the gate means that the object has rotated unexpectedly.
+    """
     before = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger]
     _set_angle_slopes(h, finger, sense, theta_rate)
     if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
@@ -331,7 +334,7 @@ def _update_angle(
 
 @inner_kernel
 def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: float) -> None:
-    """Update with the footprint, using the current slopes.
+    """Update the state with the footprint, using the current slopes.
 
     Innovations of opposite sign beyond the gate mean that the object has moved sideways. With a
     fixed gain, innovations of the same sign mean that the gain has changed.
@@ -357,7 +360,7 @@ def _is_rejected(
     d_std: float,
     joints_move: bool,
 ) -> bool:
-    """Return True if the frame of a held object is an outlier, and count such frames.
+    """Return True if a frame is an outlier while an object is held; count these outliers.
 
     A jump is an outlier unless the other tip or the joints confirm it. A rotation is accepted if
     both tips show it and either the joints move or the rotation continues. A displacement is

@@ -1,4 +1,4 @@
-"""Compute the grasp from the estimated state; update with joint torques and tip force balance.
+"""Compute the grasp from the estimated state; update it with joint torques and force balance.
 
 Channel   Measures                                                         Noise
 torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05 N·m and torque
@@ -111,7 +111,7 @@ def _set_torque_slopes(h: HandFilter) -> float:
 
 @inner_kernel
 def _update_by_torques(h: HandFilter, dt: float) -> None:
-    """Update with the mean joint torque while the joints close, and with the tip force balance."""
+    """Update the state with the mean closing torque and with the tip force balance."""
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
     h.torque_max = max(h.torque_max, torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
@@ -140,7 +140,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _relative_law_error(tip: TrackedTip, fraction: float) -> float:
-    """Return the relative error of F due to table and law at ``fraction`` = d/radius."""
+    """Return the relative error of F at ``fraction`` = d/radius, due to table and material law."""
     t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)
     return interpolate(tip.law_error[k], tip.law_error[k + 1], t - k)

@@ -10,12 +10,12 @@ the frames of both tips, starting from ``object.taper``. A shifted sensor looks 
 limit ``hand.angle`` compares the frames with ``object.taper``.
 
 A disc has no faces. φ is then the direction of the line between the contacts, and ``rotate`` acts
-on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per joint angle, which is 0.4 for a
-radius R of 20 mm and the default hand; the prediction for faces is 1.5. The frames correct the
-difference, so a rotation takes longer and the disc rolls further than commanded. A curved contact
-looks less tilted than it is, which makes φ about 5 % too small. If the fingers are straight or lean
-outwards, the line does not follow the joints: a disc with R ≥ 30 mm can be held, but its rotation
-stops at the tip limits.
+on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per joint angle. This ratio is 0.4
+for a radius R of 20 mm and the default hand, whereas the prediction for faces is 1.5. The frames
+correct the difference, so a rotation takes longer and the disc rolls further than commanded. A
+curved contact appears less tilted than it is, so φ is about 5 % too small. If the fingers are
+straight or lean outwards, the line does not follow the joints: a disc with R ≥ 30 mm can be held,
+but its rotation stops at the tip limits.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _GOAL_DISTANCE = 0.25  # rad; a joint farther than this from its goal draws the 
 
 
 class HandEstimator:
-    """Estimator for one hand. Without contact, it costs one comparison per tick."""
+    """Estimator for one hand. Without contact, the estimator costs one comparison per tick."""
 
     def __init__(
         self,
@@ -162,10 +162,11 @@ class HandEstimator:
         contact: Contact,
         has_changed: bool = True,
     ) -> None:
-        """Update with a finger's new ``frame`` and its ``estimate``; write both to ``contact``.
+        """Update the state with a finger's ``frame`` and ``estimate``; write both to ``contact``.
 
-        ``has_changed`` is False for a frame that is identical to an earlier one. During contact,
-        such a frame comes from a board that is frozen or sends old data, so it is not used.
+        ``has_changed`` is False for a frame that is identical to an earlier one. An identical frame
+        during contact comes from a board that is frozen or sends old data, so the frame is not
+        used.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
@@ -264,7 +265,10 @@ class HandEstimator:
 
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:
-    """Return the goal current [A] if the joint is too far from its goal to draw less, else 0."""
+    """Return the goal current [A] if the joint is far from its goal, otherwise 0.
+
+    A joint that is far from its goal draws the goal current.
+    """
     return goal.current[finger] if goal.q[finger] - q > _GOAL_DISTANCE else 0.0
 
 

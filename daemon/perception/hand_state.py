@@ -164,9 +164,9 @@ def predicted_variance(h: HandFilter) -> float:
 def correct(h: HandFilter, channel: int, innovation: float, variance: float, gate: float) -> None:
     """Update the state with one scalar measurement, using `slopes`, then set the slopes to 0.
 
-    ``variance`` is the noise variance. It is increased if the innovation exceeds ``gate`` standard
-    deviations, so that the innovation equals ``gate`` standard deviations. An innovation that is
-    not finite is ignored. `grasp.nis` averages the normalised innovation squared of each
+    ``variance`` is the noise variance. If the innovation exceeds ``gate`` standard deviations, the
+    variance is increased until the innovation equals ``gate`` standard deviations. An innovation
+    that is not finite is ignored. `grasp.nis` averages the normalised innovation squared of each
     ``channel``, limited to ``gate`` squared.
     """
     expected = predicted_variance(h)
@@ -365,9 +365,10 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
 
 @inner_kernel
 def is_held(h: HandFilter) -> bool:
-    """Return True if all fingers grip an object, whose width then stays constant.
+    """Return True if all fingers grip an object.
 
-    Without a grip, something else may press on the tips and move freely.
+    While an object is held, the distance between its faces is constant. Without a grip, an object
+    that presses on the tips may move freely.
     """
     both: bool = h.tip[0].in_contact and h.tip[1].in_contact
     return h.is_gripping and (both or h.is_single)
@@ -397,9 +398,10 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
-    """Update with the encoder: precisely when its count changes, otherwise to within one count.
+    """Update the state with the encoder angle, which is precise when the count changes.
 
-    ``step`` is the joint motion since the last reading according to its velocity [rad].
+    Between two changes, the angle is known to within one count. ``step`` [rad] is the joint motion
+    since the last reading, computed from the velocity.
     """
     tip = h.tip[finger]
     at = ENCODER + finger
@@ -432,9 +434,9 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
 def _measure_free_torque(
     h: HandFilter, finger: int, t: float, dt: float, speed_change: float
 ) -> None:
-    """Measure the maximum torque of a freely moving joint, which is its friction.
+    """Measure the maximum torque of a freely moving joint, which equals its friction.
 
-    The last _TOUCH_DELAY is excluded, because the tip may already be in contact.
+    The last _TOUCH_DELAY seconds are excluded, because the tip may already be in contact.
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
@@ -452,7 +454,8 @@ def _measure_free_torque(
 def _check_current(grasp: GraspState, finger: int, current: float, goal: float, dt: float) -> float:
     """Return a joint's current [A]: its ``goal`` during a grip, otherwise the measured current.
 
-    Also measures how long the two have differed by more than a servo's current controller allows.
+    Also measure the time for which both currents have differed by more than a servo's current
+    controller allows.
     """
     is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + _CURRENT_NOISE
     grasp.current_off_time[finger] = grasp.current_off_time[finger] + dt if is_off else 0.0

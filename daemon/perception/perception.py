@@ -33,7 +33,7 @@ _CHANGED_CELLS_MIN = 4  # minimum per frame; one or two noisy cells may repeat b
 
 
 class Perception:
-    """Tactile sensors and contact filter of a hand. Only the loop thread may call it."""
+    """Tactile sensors and contact filter of a hand. Only the loop thread may use this class."""
 
     def __init__(
         self,
@@ -77,12 +77,12 @@ class RepeatDetector:
     """Detector for frame sequences that repeat in the same order.
 
     A noisy sensor never repeats a frame. At standstill, a noise-free sensor may send the same frame
-    for a long time or alternate between two frames. This does not count as a repetition; the
-    frozen-sensor check handles constant frames.
+    for a long time or alternate between two frames. Constant or alternating frames do not count as
+    a repetition; the frozen-sensor check handles constant frames.
     """
 
     def __init__(self, rate: float, enabled: bool = True) -> None:
-        """Create a detector for a frame ``rate`` [Hz]; ``enabled`` makes repetition a fault."""
+        """Create a detector for a frame ``rate`` [Hz]; ``enabled`` makes repetitions a fault."""
         self._enabled = enabled
         self.period = 0  # repetition period in frames, 0 without repetition
         self._repeated_count = 0  # consecutive frames with this period
@@ -122,7 +122,7 @@ class FingerPerception:
     def __init__(
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
-        """Create the perception for one finger; each tare appends to ``events``."""
+        """Create the perception for one finger; each tare appends an event to ``events``."""
         full = getattr(sensor, "full_count", None)  # Some recordings have their own value.
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
@@ -184,7 +184,7 @@ class FingerPerception:
         self._unloaded.reset_zero()
 
     def update(self) -> Frame | None:
-        """Estimate and return the newest frame, or return None if there is no new one."""
+        """Process a new frame and return its estimate, or None if no new frame has arrived."""
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None

@@ -1,10 +1,10 @@
 """Zero shift and noise of a sensor, measured with the cells beyond the tip.
 
 An unloaded cell reads its zero offset plus noise. With a 20 mm tip, about 60 % of a 58 mm grid lies
-beyond the tip. These cells show the zero offset and noise during any contact of the tip. A second
-contact on a few of them does not change their median. Readings are clipped at 0, so a zero offset
-below 0 cannot be detected here. It is detected from the joint motion during closing
-(`perception.frame_channels`).
+beyond the tip. The cells beyond the tip show the zero offset and noise during any contact of the
+tip. A second contact on a few of these cells does not change their median. Readings are clipped at
+0, so a zero offset below 0 cannot be detected here. A negative offset is detected from the joint
+motion during closing (`perception.frame_channels`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class UnloadedCells:
     """Estimator for one sensor's zero shift and noise."""
 
     def __init__(self, grid: SensorGrid, radius: float, live: NDArray[np.bool_]) -> None:
-        """Create an estimator for a tip ``radius`` [m] and the working cells ``live``."""
+        """Create an estimator for a tip of ``radius`` [m]; ``live`` masks the working cells."""
         (pitch_x, pitch_y), (centre_x, centre_y) = grid.pitches, grid.centre
         x = (np.arange(grid.cols) - 0.5 * (grid.cols - 1)) * pitch_x - centre_x
         y = (np.arange(grid.rows) - 0.5 * (grid.rows - 1)) * pitch_y - centre_y
@@ -52,8 +52,8 @@ class UnloadedCells:
     def scatter(self) -> float:
         """Cell noise [counts]; 0 if unknown.
 
-        If no cells lie beyond the tip, the noise is computed from the changes between frames. This
-        works because most cells are constant except while a tip moves.
+        If no cells lie beyond the tip, the noise is computed from the changes between frames. The
+        changes show the noise, because most cells are constant except while a tip moves.
         """
         if self._squared_changes is None:
             return self.noise

@@ -24,7 +24,7 @@ def make_tip(settings: Settings) -> Fingertip:
 
 
 def law_problem(material: Material, limit: float) -> str:
-    """Describe a fit error of the material law above ``limit`` (relative to F), else return ""."""
+    """Describe the law's fit error if it exceeds ``limit`` (relative to F), otherwise return ""."""
     found = material.worst_force_error
     if found <= limit:
         return ""

@@ -85,7 +85,7 @@ def examine(
 ) -> ExaminedProfile:
     """Read a profile and find all of its errors. Raises SettingsError if the profile can't be read.
 
-    The arguments are those of `load`.
+    See `load` for the arguments.
     """
     name = str(path) if path else "built-in settings"
     data = _read(find(path), name) if path else {}

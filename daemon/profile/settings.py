@@ -71,9 +71,7 @@ class GeometrySettings(Section):
     )  # fmt: skip
     q_min: tuple[Angle, Angle] = setting((-0.5, -0.5), "rad", "Joint angle when fully open.")
     q_max: tuple[Angle, Angle] = setting((1.0, 1.0), "rad", "Maximum joint angle when closing.")
-    open_angle: tuple[Angle, Angle] = setting(
-        (0.0, 0.0), "rad", "Joint angle that `release` moves to."
-    )
+    open_angle: tuple[Angle, Angle] = setting((0.0, 0.0), "rad", "Target joint angle of `release`.")
 
 
 class TipSettings(Section):
@@ -232,7 +230,7 @@ class TactileSettings(Section):
         1520.0, "Pa", "Noise standard deviation of each cell (default: 0.5 % of 0.304 MPa)."
     )
     baseline_error: NonNegative = setting(
-        0.0, "Pa", "Standard deviation of the zero shift that all cells share since the last tare."
+        0.0, "Pa", "Standard deviation of the zero shift since the last tare, common to all cells."
     )
     slope_error: NonNegative = setting(
         0.0, "Pa",
@@ -263,7 +261,7 @@ class TactileSettings(Section):
     )
     open_timeout: Seconds = setting(5.0, "s", "Maximum time to wait for the first valid frame.")
     sensor: tuple[str, str] = setting(
-        ("", ""), "", "Sensor names, such as serial numbers; calibration files store them."
+        ("", ""), "", "Sensor names, such as serial numbers, which are stored in calibration files."
     )
     calibration: tuple[str, str] = setting(
         ("", ""),
@@ -294,9 +292,9 @@ class EstimatorSettings(Section):
 class LoopSettings(Section):
     """The control loop and its clock.
 
-    The clock ``real`` is the machine's time. ``hand`` is the time of a simulated hand, which pauses
-    while the machine is busy. ``virtual`` runs as fast as possible. ``hand`` and ``virtual`` need
-    simulated backends. ``auto`` selects ``hand`` for simulated backends and for the ports of
+    The clock ``real`` is the machine's time. ``hand`` is the time of a simulated hand; this clock
+    pauses while the machine is busy. ``virtual`` runs as fast as possible. ``hand`` and ``virtual``
+    need simulated backends. ``auto`` selects ``hand`` for simulated backends and for the ports of
     `softfinger emulate`, otherwise ``real``.
     """
 
@@ -307,16 +305,18 @@ class LoopSettings(Section):
 
 
 class RealtimeSettings(Section):
-    """Measures that reduce the delay of ticks. The daemon reports the ones that the system denies.
+    """Measures that reduce the delay of ticks.
 
-    All are harmless except the priority: under SCHED_FIFO, the loop can block other programs on
-    its processor.
+    The daemon reports the measures that the system denies.
+
+    All measures are harmless except the priority: under SCHED_FIFO, the loop can block other
+    programs on its processor.
     """
 
     priority: int = setting(0, "", "SCHED_FIFO priority; 0 keeps normal scheduling.", ge=0, le=80)
     slice: float = setting(
         1e-4, "s",
-            "Scheduler slice. A process with a short slice is scheduled sooner. 0 keeps the "
+            "Scheduler time slice. A process with a short slice is scheduled sooner. 0 keeps the "
             "default.",
         ge=0, le=0.1
     )  # fmt: skip
@@ -345,7 +345,10 @@ class RealtimeSettings(Section):
 
 
 class StreamSettings(Section):
-    """The published stream. A topic is sent on every n-th tick, with the n closest to its rate."""
+    """The published stream.
+
+    A topic is sent on every n-th tick; n is chosen so that the rate is closest to the setting.
+    """
 
     address: str = setting(STREAM_ADDRESS, "", "Address of the stream, tcp or ipc.")
     latest: str = setting(
@@ -387,13 +390,13 @@ class CommandSettings(Section):
 
 
 class AccessSettings(Section):
-    """Access to stream and commands. Keys are required for addresses that other machines reach."""
+    """Access to stream and commands. Keys are required if other machines can reach an address."""
 
     keys: str = setting(
         "",
         "",
-        "Folder created by `softfinger keys`. Both sockets then accept only clients that "
-        "have a key there.",
+        "Folder created by `softfinger keys`. Both sockets then accept only clients with a key in "
+        "this folder.",
     )
     ipc_mode: Literal["0600", "0660", "0666"] = setting("0600", "", "File mode of an ipc address.")
 
@@ -444,8 +447,8 @@ class ControlSettings(Section):
     damping_ratio: NonNegative = setting(
         0.7,
         "",
-        "Damping ratio of the oscillation of the joint inertia on the stiffness of the "
-        "tips and the position loop.",
+        "Damping ratio of the joint's oscillation against the stiffness of the tips and the "
+        "position loop.",
     )
     joint_friction: NonNegative = setting(
         0.05, "N·m", "Coulomb friction that is compensated while the joint is commanded to move."
@@ -496,21 +499,19 @@ class SafetySettings(Section):
 
     current_max: Positive = setting(1.2, "A", "Maximum goal current.")
     current_move: Positive = setting(0.4, "A", "Maximum goal current outside a grip.")
-    force_max: Positive = setting(
-        30.0, "N", "Normal force of a tip above which a fault is latched."
-    )
-    d_max: Length = setting(0.012, "m", "Displacement of a tip above which a fault is latched.")
+    force_max: Positive = setting(30.0, "N", "Normal tip force above which a fault is latched.")
+    d_max: Length = setting(0.012, "m", "Tip displacement above which a fault is latched.")
     theta_margin: float = setting(
-        0.05, "rad", "Distance of |θ| from the limit of the contact model below which a fault is "
+        0.05, "rad", "Distance between |θ| and the contact model's limit, below which a fault is "
         "latched.",
         ge=0, le=1
     )  # fmt: skip
     velocity_max: Positive = setting(6.0, "rad/s", "Joint speed above which a fault is latched.")
     frame_age_hold: Positive = setting(
-        3.0, "frame periods", "Age of the last frame above which the goal is frozen."
+        3.0, "frame periods", "Frame age above which the goal is frozen."
     )
     frame_age_fault: Positive = setting(
-        10.0, "frame periods", "Age of the last frame above which a fault is latched."
+        10.0, "frame periods", "Frame age above which a fault is latched."
     )
     frame_age_action: Literal["torque off", "open"] = setting(
         "torque off", "", "Reaction to the fault caused by old frames; `open` opens the hand first."
@@ -518,7 +519,7 @@ class SafetySettings(Section):
     goal_reach: Positive = setting(
         0.5,
         "rad",
-        "Maximum distance from the current joint angle for which the goal may change in one step.",
+        "Distance from the current joint angle within which the goal may jump in one step.",
     )
     goal_speed: Positive = setting(
         3.0, "rad/s", "Maximum speed of the goal angle outside `goal_reach`."
@@ -538,7 +539,7 @@ class SafetySettings(Section):
         70.0, "°C", "Servo temperature above which a fault is latched."
     )
     heat_warn: Positive = setting(
-        60.0, "s", "Predicted time until `temperature_max` below which the daemon warns and "
+        60.0, "s", "Predicted time to reach `temperature_max`, below which the daemon warns and "
         "reduces the grip force."
     )  # fmt: skip
     heat_action: Literal["hold", "release", "stop"] = setting(
@@ -552,15 +553,15 @@ class SafetySettings(Section):
     )
     residual_angle: Positive = setting(
         0.2, "rad",
-            "Difference between the object angles measured by the two fingers above which a "
+            "Difference between the object angles measured by the two fingers, above which a "
             "fault is latched."
     )  # fmt: skip
     residual_width: Positive = setting(
-        0.004, "m", "Change of the held object's width since the grip began above which a fault is "
-        "latched."
+        0.004, "m", "Change of the held object's width since the grip began, above which a fault "
+        "is latched."
     )  # fmt: skip
     residual_force: Positive = setting(
-        0.5, "", "Relative difference between the tip forces above which a warning is issued."
+        0.5, "", "Relative difference between the tip forces, above which a warning is issued."
     )
     saturated: Fraction = setting(
         0.05, "", "Fraction of saturated cells above which a warning is issued."
@@ -581,13 +582,14 @@ class ObjectSettings(Section):
 
     width: Length = setting(0.040, "m", "Distance between the object's faces.")
     taper: float = setting(
-        0.0, "rad", "Angle between the object's faces; positive if it widens towards the palm.",
+        0.0, "rad", "Angle between the object's faces; positive if the object widens towards the "
+        "palm.",
         ge=-1.5, le=1.5
     )  # fmt: skip
     width_min: NonNegative = setting(
         0.002,
         "m",
-        "Distance between the tips below which the grip counts as empty and the hand opens.",
+        "Distance between the tips, below which the grip counts as empty and the hand opens.",
     )
 
 

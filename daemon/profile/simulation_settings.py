@@ -23,7 +23,7 @@ from softfinger.daemon.profile.fields import (
 
 
 class SimulationSettings(Section):
-    """The simulated hand of the simulated backends and of `softfinger emulate`.
+    """The simulated hand used by the simulated backends and by `softfinger emulate`.
 
     The default values are plausible, but not measured.
     """
@@ -71,7 +71,7 @@ class SimulationSettings(Section):
         0.0, "m", "Standard deviation of the blur due to the layer above the cells.", ge=0, le=0.1
     )
     tactile_hysteresis: Fraction = setting(
-        0.0, "", "Relative hysteresis: excess of the reading while the load on a cell decreases."
+        0.0, "", "Relative hysteresis: excess reading while the load on a cell decreases."
     )
     tactile_creep: Fraction = setting(
         0.0, "", "Relative creep of the reading under constant pressure."
@@ -87,7 +87,7 @@ class SimulationSettings(Section):
         "Pressure above which the reading of a cell decreases again; 0 disables this effect.",
     )
     tactile_crosstalk: Fraction = setting(
-        0.0, "", "Crosstalk: fraction of the mean of its row and column that is added to each cell."
+        0.0, "", "Crosstalk: each cell receives this fraction of the mean of its row and column."
     )
     tactile_row_noise: NonNegative = setting(
         0.0, "Pa", "Standard deviation of the noise that is common to all cells of a row."
@@ -128,7 +128,7 @@ class SimulationSettings(Section):
     tip_relaxation: tuple[Fraction, Fraction, Fraction] = setting(
         (0.0, 0.0, 0.0), "",
             "Amplitudes of three Prony terms: initial excess stiffness of the tip as fractions "
-            "of its final stiffness; 0 makes it elastic."
+            "of its final stiffness; 0 makes the tip elastic."
     )  # fmt: skip
     tip_relaxation_times: tuple[Positive, Positive, Positive] = setting(
         (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "

@@ -38,7 +38,7 @@ def plausibility_warnings(settings: Settings) -> list[str]:
 
 
 def sensor_warnings(settings: Settings) -> list[str]:
-    """Return warnings about the size of the sensors under these tips, one per line."""
+    """Return warnings about sensors whose size does not suit the tips, one per line."""
     return [*_wide_sensor(settings), *_small_sensor(settings)]
 
 

@@ -61,7 +61,7 @@ def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
 
 
 class HeatWatch:
-    """Temperature monitor for a scene's servos. Only the loop thread may call it."""
+    """Temperature monitor for a scene's servos. Only the loop thread may use this class."""
 
     def __init__(self, settings: Settings, state: State) -> None:
         """Create the monitor; it reads ``state.reading`` and updates ``state.heat``."""

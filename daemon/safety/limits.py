@@ -1,6 +1,7 @@
 """Define all limits of the hand, with their checks and consequences, in the table ``LIMITS``.
 
-- ``warn``: reported once on ``hand/event``, and again only after it has been clear for a while.
+- ``warn``: reported once on ``hand/event``, and again only after the problem has been absent for a
+  while.
 - ``limit``: the goal is modified before it is sent; ``status`` counts the affected ticks.
 - ``fault``: torque off, latched until ``clear``, which is refused while the cause persists.
 
@@ -52,7 +53,8 @@ class JointMotion:
     """Consistency check of joint angles with measured velocities and the maximum velocity.
 
     An encoder may jump, freeze while the joint rotates, or drift while the joint is at standstill.
-    Its angles are then inconsistent with its velocity, and the finger's bit is set in ``jumped``.
+    A faulty encoder's angles are inconsistent with its velocity, and the finger's bit is then set
+    in ``jumped``.
     """
 
     def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:
@@ -173,7 +175,7 @@ FingerCheck = Callable[[View, State, float, int], str]
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """One row of the table. As a decorator, it adds the row with the decorated check.
+    """One row of the table. As a decorator, `Limit` adds the row with the decorated check.
 
     A row without a check is added directly, because its limit is applied elsewhere: in
     `Safety.write`, on the bus or in the gateway.

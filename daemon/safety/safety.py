@@ -1,8 +1,8 @@
 """Check every state, limit every goal, and send the goals to the servos.
 
 Goals reach the bus only through `Safety.write`, which limits them. The table `safety.limits.LIMITS`
-defines the checks. This module schedules them, reports each warning once, and raises a fault only
-after a violation has lasted long enough.
+defines the checks. This module schedules the checks, reports each warning once, and raises a fault
+only after a violation has lasted long enough.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class _Watch:
 
 
 class Safety:
-    """Checker for states and limiter for goals. Only the loop thread may call it."""
+    """State checker and goal limiter. Only the loop thread may use this class."""
 
     def __init__(
         self,
@@ -142,7 +142,8 @@ class Safety:
     def cause(self, state: State, gripping: bool = False) -> str:
         """Return the first fault that would block a command in this state, or "".
 
-        If ``gripping``, the limits for a grip are checked in every mode. The state is not modified.
+        If ``gripping`` is True, the limits for a grip are checked in every mode. The state is not
+        modified.
         """
         gripping = gripping or state.mode in GRIPPING_MODES
         view = self._view
@@ -162,7 +163,7 @@ class Safety:
     # Goals
 
     def write(self, servos: Servos, state: State) -> None:
-        """Limit the goal in place and send it; if it is not finite, mark it as invalid instead.
+        """Limit the goal in place and send it; a goal that is not finite is marked invalid instead.
 
         Raises ServoError like `Servos.write`.
         """

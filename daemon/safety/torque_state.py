@@ -1,9 +1,9 @@
-"""Track the torque state: on from the request to switch it on, off only after confirmation.
+"""Track the torque state: on as soon as torque is requested, off only after confirmation.
 
 Torque off is sent on every tick until the servo registers confirm it. If the servos do not confirm
 within half the bus watchdog time, the bus stays silent until the watchdog has stopped the motors.
-Otherwise, a servo that receives read requests but loses all writes would keep driving. The daemon
-then tries torque off again.
+If the bus were not silent, a servo that receives read requests but loses all writes would keep
+driving its motor. The daemon then tries to switch torque off again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _CLOSING_TRY_COUNT = 15  # attempts at shutdown
 
 
 class TorqueState:
-    """Torque controller that writes ``torque``, ``torque_off`` and ``write_error`` of the state."""
+    """Torque controller that writes ``torque``, ``torque_off`` and ``write_error`` in the state."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class TorqueState:
         """Request torque off immediately; return "confirmed" or "unconfirmed".
 
         The call waits for at most one reply. Each tick repeats the request until the servos confirm
-        it.
+        torque off.
         """
         state, servos = self._state, self.servos
         if servos is None:
@@ -120,7 +120,7 @@ class TorqueState:
     def end(self) -> None:
         """Turn torque off if it may be on.
 
-        If this fails, the bus stays silent, which trips the watchdogs.
+        If torque cannot be turned off, the bus stays silent, which trips the watchdogs.
         """
         for _ in range(_CLOSING_TRY_COUNT):
             if not self._state.torque:

@@ -1,8 +1,8 @@
-"""Detect swapped servo IDs, with which the joint of one finger moves the other finger's tip.
+"""Detect swapped servo IDs: each finger then receives the other finger's commands.
 
-Even then, joint angles and currents are consistent, because each servo reports its own values. Only
-the tactile sensors show the error: when one joint is stationary and the other moves, the wrong tip
-tilts or is loaded, and the object rotates opposite to the command.
+Joint angles and currents remain consistent, because each servo reports its own values. Only the
+tactile sensors show the error. When one joint is stationary and the other joint moves, the wrong
+tip tilts or is loaded, and the object rotates opposite to the command.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ Status = Literal["pass", "note", "fixed", "warn", "FAIL"]
 class Finding:
     """Result of checking one device or the machine, and how to fix any problem.
 
-    ``FAIL`` prevents the daemon from working, and ``warn`` degrades it. The other statuses require
-    no action.
+    ``FAIL`` prevents the daemon from running, and ``warn`` degrades its operation. All other status
+    values require no action.
     """
 
     status: Status
@@ -48,12 +48,12 @@ class Servos(Protocol):
       with ``servos.stiffness`` and ``servos.damping``, limited to ± ``goal.current``. Without
       readings, the current stays constant until the servo's bus watchdog stops the servo.
     - *position* (3): the servo's own position loop without a current limit. ``goal.current`` is
-      ignored, and switching torque on holds the joint immediately. This mode is suitable for moving
-      but not for grasping.
+      ignored, and switching torque on holds the joint immediately. Position mode is suitable for
+      moving but not for grasping.
 
-    ``connect`` checks the servos and never stiffens or moves the hand. ``read`` and ``write`` are
-    called once per tick. A failed exchange is reported by ``valid`` and the counters. `read` and
-    `write` raise an error only if the port itself is lost.
+    ``connect`` checks the servos and never switches torque on or moves the hand. ``read`` and
+    ``write`` are called once per tick. A failed exchange is reported by ``valid`` and the counters.
+    `read` and `write` raise an error only if the port itself is lost.
     """
 
     def connect(self) -> None:
@@ -74,7 +74,7 @@ class Servos(Protocol):
         """
 
     def torque_off(self, reading: Reading) -> bool:
-        """Request torque off once and read like `read`; return True once all servos confirm it.
+        """Request torque off once and read like `read`; return True once all servos have confirmed.
 
         This method takes no longer than `read`, so the loop can call it on every tick until it
         returns True. Raises ServoError if the port is lost.
@@ -109,7 +109,7 @@ class JointPlant(Protocol):
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
     ) -> None:
-        """Set a servo's command until the next call.
+        """Set a servo's command, which is active until the next call.
 
         ``mode`` is 5 (current-based position), 3 (position) or 0 (current). In mode 5,
         ``goal_current`` limits the magnitude of the current. Mode 3 applies the servo model's own

@@ -183,7 +183,7 @@ def check_registers(
     finger: int,
     status: Status,
 ) -> list[Finding]:
-    """Return findings with this ``status`` for registers without the required value."""
+    """Return findings with this ``status`` for registers that lack the required value."""
     found = []
     for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
         wrong = row.wrong_in(table)
@@ -265,8 +265,8 @@ def check_angle(
 ) -> Finding | None:
     """Return a finding if a joint is far outside the hand's limits, otherwise None.
 
-    Switching torque on would immediately move such a joint back. A reboot resets the servo's turn
-    count, which corrects a lost turn.
+    Switching torque on would immediately move an out-of-range joint back. A reboot resets the
+    servo's turn count, which corrects a lost turn.
     """
     low, high = hand.q_min[finger], hand.q_max[finger]
 

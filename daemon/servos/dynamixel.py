@@ -1,10 +1,10 @@
 """Drive the joints through dynamixel-sdk with one read and one write per tick.
 
 One fast sync read returns the current, velocity, position and alert bit of all servos; older
-firmware uses the normal sync read. Some of these reads cover additional registers without an extra
-exchange. Every 10 ms, a read includes the goals stored in the servo, its bus watchdog and its clock
-(28 more bytes per servo). Four times per second, a read includes supply voltage and temperature (11
-more bytes).
+firmware uses the normal sync read. Some reads cover additional registers without an extra exchange.
+Every 10 ms, a read includes the goals stored in the servo, its bus watchdog and its clock (28 more
+bytes per servo). Four times per second, a read includes supply voltage and temperature (11 more
+bytes).
 
 One sync write sends goal current and goal position as adjacent registers (:mod:`servos.torque`).
 Current mode and position mode have a single goal, so they do not need indirect addresses. Required
@@ -67,8 +67,8 @@ _CLOSING_TRY_COUNT = 10  # torque-off attempts when closing
 class DynamixelServos:
     """Servo backend over a serial port; see :class:`servos.base.Servos`.
 
-    Use it from a single thread only. ``notices`` contains the findings of `connect` that are not
-    errors.
+    Use an object from a single thread only. ``notices`` contains the findings of `connect` that are
+    not errors.
     """
 
     def __init__(self, settings: Settings, clock: Clock) -> None:

@@ -58,7 +58,7 @@ class TickReads:
         self.errors = kind(port, handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
 
     def answered(self) -> bool:
-        """Return True if all servos respond to each of these group reads."""
+        """Return True if all servos respond to each group read."""
         return all(
             any(lengths[0].exchange() == COMM_SUCCESS for _ in range(TRY_COUNT))
             for lengths in self.spans.values()
@@ -70,7 +70,7 @@ def choose_reads(
 ) -> tuple[TickReads, list[Finding]]:
     """Return the fastest group reads supported by all servos, and notices.
 
-    ``claims_fast`` is True if the firmware should support fast sync reads. If these fail, the
+    ``claims_fast`` is True if the firmware should support fast sync reads. If fast reads fail, the
     normal sync read is used and a notice is returned. Raises ServoError if the servos do not
     respond to any group read.
     """
@@ -108,8 +108,9 @@ def time_exchanges(
 ) -> ExchangeTimes:
     """Time ``count`` exchanges without pauses, with the same reads and writes as in a tick.
 
-    A read has to wait until the preceding write has been transmitted, so its duration includes
-    both. If ``write`` is None, only reads are timed. Each reply may take up to 0.1 s.
+    A read has to wait until the preceding write has been transmitted, so the duration of a read
+    includes both transmissions. If ``write`` is None, only reads are timed. Each reply may take up
+    to 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0

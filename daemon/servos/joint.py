@@ -57,7 +57,7 @@ class JointScale:
 
     @classmethod
     def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
-        """Return the scale for joint 0 (left) or 1 (right) with these settings.
+        """Return the scale for joint 0 (left) or 1 (right) according to the settings.
 
         Raises
         ------

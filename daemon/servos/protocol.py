@@ -1,7 +1,7 @@
 """Implement the client side of Protocol 2.0: packet handler, group exchanges and single servos.
 
 This module and :mod:`servos.port` override the following behaviour of the SDK (3.7.31 to 4.1.0).
-The rest of the SDK is used unchanged.
+All other SDK functions are used unchanged.
 
 - ``txPacket`` discards the stuffed packet, so the sequence FF FF FD in a goal is sent without
   stuffing and is misinterpreted.
@@ -9,12 +9,12 @@ The rest of the SDK is used unchanged.
 - ``rxPacket`` polls with non-blocking reads, which keeps a processor busy during transmission.
 - ``txPacket`` leaves ``is_using`` set if the port raises, so all later calls return −1000.
 - ``readTxRx`` accepts replies with a wrong length, so the CRC of a late reply is returned as data.
-- ``GroupSyncRead`` discards the servos' error bytes and returns 0 after a failure. Alerts are lost,
-  and a joint appears to be at 0.
+- ``GroupSyncRead`` discards the servos' error bytes and returns 0 after a failure. As a result,
+  alerts are lost, and the joint appears to be at position 0.
 - ``broadcastPing`` always waits for 253 servos, which takes 0.8 s at 1 Mbaud.
 - ``PortHandler`` measures deadlines on the wall clock and adds 34 ms. A missing servo therefore
-  causes a delay of 35 ms, and adjusting the system clock changes the deadline. It also opens ports
-  that are in use by another process.
+  causes a delay of 35 ms, and adjusting the system clock changes the deadline. ``PortHandler`` also
+  opens ports that are in use by another process.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     ) -> tuple[list[int], int, int]:
         """Read a register span; return (data, result code, error byte).
 
-        After an error, the data are 0. Replies of the wrong length are skipped. They are late
+        After an error, the data are 0. Replies of the wrong length are skipped: they are late
         replies to an action instruction, for which the SDK does not wait.
         """
         if dxl_id >= BROADCAST_ID:
@@ -162,7 +162,7 @@ class GroupRead:
     """Sync read of one register span from several servos.
 
     After a successful :meth:`exchange`, ``data[id]`` contains the span's bytes and ``errors[id]``
-    the servo's error byte. After a failure, their contents are undefined.
+    the servo's error byte. After a failure, ``data`` and ``errors`` are undefined.
     """
 
     instruction = INST_SYNC_READ
@@ -208,7 +208,7 @@ class GroupRead:
 
 
 class FastGroupRead(GroupRead):
-    """Fast sync read: all servos share one reply, whose last CRC covers all its bytes."""
+    """Fast sync read: all servos share one reply; its last CRC covers the complete reply."""
 
     instruction = _FAST_SYNC_READ
 
@@ -246,7 +246,7 @@ class GroupWrite:
         self.ids = [bytes((servo_id,)) for servo_id in ids]
 
     def send(self, values: Sequence[bytes]) -> None:
-        """Write one value per servo, in the order of the IDs, without a reply."""
+        """Write one value per servo, in the order of the IDs. Servos do not reply."""
         body = b"".join(name + value for name, value in zip(self.ids, values, strict=True))
         self._port.send(packed(BROADCAST_ID, INST_SYNC_WRITE, self._span + body))
 
@@ -270,7 +270,7 @@ class ServoLine:
         return None
 
     def ping_old(self, servo_id: int) -> bool:
-        """Return True if a servo replies to one ping in Protocol 1.0."""
+        """Return True if a servo replies to a Protocol 1.0 ping."""
         port = self.port
         body = bytes((servo_id, 2, INST_PING))
         request = _OLD_HEADER + body + bytes((~sum(body) & 0xFF,))
@@ -287,8 +287,7 @@ class ServoLine:
     def ping_all(self, wait: float) -> dict[int, tuple[int, int]]:
         """Return (model number, firmware) of each servo that replies to a ping within ``wait`` [s].
 
-        Servos reply one after the other in the order of their IDs, which takes 0.8 s for 253
-        servos.
+        Servos reply one after the other in the order of their IDs; 253 replies take 0.8 s.
         """
         found: dict[int, tuple[int, int]] = {}
         port = self.port
@@ -311,7 +310,7 @@ class ServoLine:
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write bytes of equal length to each servo without a reply or verification.
 
-        This uses a sync write, which works at every status return level.
+        The method uses a sync write, which works at every status return level.
         """
         length = len(next(iter(values.values())))
         GroupWrite(self.port, address, length, list(values)).send(list(values.values()))
@@ -319,7 +318,7 @@ class ServoLine:
     def store(self, address: int, values: Mapping[int, bytes]) -> list[int]:
         """Write each servo's bytes and read them back.
 
-        Return the IDs of servos for which this failed.
+        Return the IDs of servos for which the write failed.
         """
         waiting = dict(values)
         for _ in range(TRY_COUNT):

@@ -1,8 +1,8 @@
 """Find servos on a port and configure the hand's servos: ID, baud rate and registers.
 
-Only :func:`provision` writes a servo's EEPROM. This function runs only on request (`softfinger
-doctor --fix`) and with torque off. IDs and baud rates are written only to servos that are
-identified unambiguously (:func:`plan`).
+Only :func:`provision` writes a servo's EEPROM. `provision` runs only on request (`softfinger doctor
+--fix`) and with torque off. IDs and baud rates are written only to servos that are identified
+unambiguously (:func:`plan`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class FoundServo:
         return self.describe(str(self.baud))
 
     def describe(self, rates: str) -> str:
-        """Return the report line for a servo that replies at these baud rates."""
+        """Return the report line for a servo and the baud rates at which it replies."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
@@ -100,10 +100,10 @@ def search(
     wait: float = SEARCH_TIME,
     ids: Iterable[int] = (FACTORY_ID,),
 ) -> Found:
-    """Search the port for servos for ``wait`` [s] at each baud rate, without changing registers.
+    """Search the port for servos at each baud rate, waiting ``wait`` [s] for replies.
 
-    Baud rates that the adapter does not support are skipped. If corrupted bytes arrive, ``ids`` are
-    probed individually.
+    Baud rates that the adapter does not support are skipped. If corrupted bytes arrive, each of the
+    ``ids`` is probed individually.
 
     Raises
     ------
@@ -190,7 +190,8 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 
     If a servo of the configured model replies at another baud rate with the ID of a missing servo,
     it is assumed to be the missing servo. Otherwise, if exactly one servo is unassigned and exactly
-    one is missing, they are matched. Servos with corrupted replies are not changed.
+    one servo is missing, the unassigned servo is assumed to be the missing servo. Servos with
+    corrupted replies are not changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}

@@ -1,4 +1,4 @@
-"""List the servo registers that affect the hand and their required values.
+"""List the servo registers that affect the hand, with their required values.
 
 :func:`required_registers` returns the table in the order of the e-Manual's control table. A servo
 retains its EEPROM permanently and its RAM until power is cut, so both may contain values from
@@ -6,9 +6,10 @@ another program. The EEPROM is checked in `connect` and written only by `softfin
 RAM registers marked ``armed`` are written by `arm`, so they are correct even after a reboot.
 
 The omitted registers do not affect goal tracking, limits or bus replies in the modes used by the
-hand. ID and baud rate are found by a search. Moving threshold, LED and external ports are only
-indicators. Velocity gains and goal velocity apply only to velocity mode. `servos.torque` writes
-goal current, goal position, bus watchdog and indirect addresses on each `arm`.
+hand. ID and baud rate are found by a search. The registers for moving threshold, LED and external
+ports have no effect on the motion. Velocity gains and goal velocity apply only to velocity mode.
+`servos.torque` writes goal current, goal position, bus watchdog and indirect addresses on each
+`arm`.
 """
 
 from __future__ import annotations
@@ -88,10 +89,7 @@ _AT: Final = {register.address: register for register in REGISTERS}
 
 
 class Requirement(NamedTuple):
-    """Required value of a register.
-
-    If the value is wrong, a finding with this ``status`` is reported.
-    """
+    """Required value of a register. Other values are reported as findings with this ``status``."""
 
     register: Register
     holds: Callable[[int], bool]

@@ -1,7 +1,8 @@
-"""Switch torque on with verification of each step, switch it off, and manage the bus watchdog.
+"""Switch torque on, verifying each step, switch torque off, and manage the bus watchdog.
 
 Torque is switched on at the current angle with zero motor current. Indirect addresses make goal
-current and goal position adjacent. Indirect addresses are in RAM and are therefore set each time.
+current and goal position adjacent. Indirect addresses are in RAM and are therefore set whenever
+torque is switched on.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
 class Torque:
     """Torque control for all joints on one line.
 
-    ``goals`` writes the goals while torque is on; otherwise it is None. ``may_be_on`` is True from
-    before torque is switched on until the servos have confirmed that it is off.
+    ``goals`` writes the goals while torque is on; otherwise it is None. ``may_be_on`` becomes True
+    before torque is switched on and stays True until the servos have confirmed torque off.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class Torque:
     def ask_off(self) -> None:
         """Request torque off with one packet for all servos and one packet for each servo.
 
-        There is no reply; the caller must read the registers.
+        The servos do not reply to these packets; the caller must read the registers.
         """
         self.goals = None
         for _ in range(_PACKET_COUNT):
@@ -205,12 +206,12 @@ class Torque:
     def holds_goal(self, joint: Joint, table: bytes, start: int) -> bool:
         """Return True if a servo's goal is recent, or if this object did not switch torque on.
 
-        ``table`` contains its registers, beginning at ``start``.
+        ``table`` contains the servo's registers, beginning at ``start``.
 
         Raises
         ------
         ServoError
-            If its bus watchdog has stopped it or is no longer armed.
+            If the bus watchdog has stopped the servo or is no longer armed.
         """
         if self.goals is None:
             return True

@@ -79,7 +79,7 @@ class FaultSource:
         return bool(not reads and rates.lose_writes and self._random.random() < rates.lose_writes)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
-        """Return the copies of a corrupted reply as (extra delay [s], bytes); empty if dropped."""
+        """Return a reply's corrupted copies as (extra delay [s], bytes); none if it is dropped."""
         rates, chance = self.rates, self._random.random
         if chance() < rates.drop:
             return []
@@ -195,8 +195,8 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
       MEASUREMENT_FAULTS.
     - ``unplug`` and ``plug`` affect the servo port, and ``left:unplug`` affects a board's port.
     - ``push=15`` and ``twist=0.3`` apply a permanent load to the object; 0 removes it.
-    - ``well`` ends all faults; ``left:well`` ends those of one finger's board and measurements.
-      Loads on the object remain.
+    - ``well`` ends all faults; ``left:well`` ends the faults of one finger's board and
+      measurements. Loads on the object remain.
 
     The suffix ``@START`` is the start time [s]. With ``@START..END``, a measurement fault increases
     linearly from START to END.

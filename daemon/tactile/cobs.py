@@ -34,8 +34,8 @@ The firmware sends each scan without being asked, at any baud rate (USB boards m
 
 A 44 × 44 frame of uint16 takes at most 3903 bytes on the wire. `encode` is the reference
 implementation. A reader that starts within a frame synchronises at the next zero byte. Incomplete
-and corrupted frames are dropped: the CRC detects every error of up to 16 adjacent bits, and all but
-1 in 65536 of all other errors. Gaps in the sequence numbers indicate the number of missed frames.
+and corrupted frames are dropped: the CRC detects every error within 16 adjacent bits, and all but 1
+in 65536 other errors. Gaps in the sequence numbers indicate the number of missed frames.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
 
 
 class CobsDecoder(DelimitedDecoder):
-    """Decoder for COBS framing, with the board's sequence number and time."""
+    """Decoder for COBS framing, which contains the board's sequence number and time."""
 
     def __init__(self, rows: int, cols: int) -> None:
         super().__init__(rows, cols, b"\0", longest_frame(rows, cols))
@@ -117,7 +117,7 @@ class CobsDecoder(DelimitedDecoder):
         self._wraps = 0  # number of overflows of the board clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """Parse like :meth:`DelimitedDecoder.parse`, with the board's sequence number and time."""
+        """Parse as in :meth:`DelimitedDecoder.parse`; also read the sequence number and time."""
         if len(packet) >= self.longest:
             self._reason = f"packets of {len(packet)} bytes"
             return None

@@ -112,7 +112,7 @@ class DelimitedDecoder(Decoder):
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
         """Return the frame in a packet (without delimiter), or None after setting ``_reason``.
 
-        ``t`` [s] is the read time of its last byte.
+        ``t`` [s] is the read time of the packet's last byte.
         """
 
     def feed(self, data: bytes, t: float) -> Decoded | None:

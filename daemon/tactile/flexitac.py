@@ -35,10 +35,10 @@ class FlexiTacDecoder(Decoder):
 
     *Hold.* After locking, a frame is returned when the next marker is found at its expected
     position, which proves that no byte of the frame was lost. On a line with gaps between frames,
-    waiting for the next marker would delay every frame by one period. On such a line, a complete
-    frame is returned immediately if it can't consist of parts of two frames: its counts contain no
-    ``AA 55``, and its bytes arrived within their transmission time. Otherwise, the decoder waits
-    for the next marker or for ``settle``.
+    waiting for the next marker would delay every frame by one period. On a line with gaps, a
+    complete frame is therefore returned immediately if it can't consist of parts of two frames: its
+    counts contain no ``AA 55``, and its bytes arrived within their transmission time. Any other
+    frame is returned at the next marker or by ``settle``.
 
     *Loss.* If a marker is not at its expected position, the preceding frame is dropped, and the
     search restarts.

@@ -2,17 +2,17 @@
 
 Supported files:
 
-- ``.npz`` with ``frames`` [n, rows, cols], or with a single three-dimensional array of another
-  name. Optional arrays are ``t`` [n], ``live`` [rows, cols] bool, and the true contact of each
-  frame, if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
+- ``.npz`` with ``frames`` [n, rows, cols], or with a single three-dimensional array that has
+  another name. Optional arrays are ``t`` [n], ``live`` [rows, cols] bool, and the true contact of
+  each frame, if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
 - ``.npy`` with one frame [rows, cols] or several frames [n, rows, cols], or a folder of such files.
   The files are sorted by name, and numbers in names are sorted by value. The folder may contain
   ``t.npy`` [n].
 - Other files are read as Tekscan-style ASCII exports.
 
 Integer frames contain counts. Other frames are in Pa and are converted with ``pascal_per_count``. A
-cell that is NaN in all frames is dead. Negative readings are set to 0 if noise around a tared zero
-can explain them. Times are in seconds, unless their step or date indicates another unit.
+cell that is NaN in all frames counts as dead. Negative readings are set to 0 if noise around a
+tared zero can explain them. Times are in seconds, unless their step or date indicates another unit.
 """
 
 from __future__ import annotations

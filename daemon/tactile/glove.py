@@ -1,13 +1,13 @@
 """Read a 32 × 32 glove-style board, which is polled over a serial port.
 
 The board runs at 1,000,000 baud. The host writes ``a``, and the board replies with one frame of 2 +
-2 · rows · cols bytes: index + 11, then for each cell in row-major order the high 5 bits + 11 and
-the low 5 bits + 11, and finally a newline (10). Only the last byte can be a newline, so the decoder
-resynchronises at the next newline. There is no checksum, so a corrupted byte is not detected if its
-value is still in 11 … 42.
+2 · rows · cols bytes. A frame consists of the index + 11, then for each cell in row-major order the
+high 5 bits + 11 and the low 5 bits + 11, and finally a newline (10). Only the last byte can be a
+newline, so the decoder resynchronises at the next newline. There is no checksum, so a corrupted
+byte is not detected if its value is still in 11 … 42.
 
 Boards with a 12-bit converter use the same framing with 6 bits per half. A ``tactile.full_count``
-from 1024 to 4095 selects such a board.
+from 1024 to 4095 selects a 12-bit board.
 """
 
 from __future__ import annotations

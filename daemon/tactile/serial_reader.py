@@ -1,7 +1,7 @@
 """Read a tactile board's serial port in a thread and provide its newest complete frame.
 
-All framings for serial ports share this module. It handles the port, the thread and the timing, so
-that a :class:`Decoder` handles only bytes.
+All framings for serial ports share this module. This module handles the port, the thread and the
+timing, so that a :class:`Decoder` handles only bytes.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class SensorClock:
     def arrival(self, t_sensor: float, t: float) -> float:
         """Return a frame's arrival time [s] without jitter.
 
-        ``t_sensor`` [s] is the frame's board time, and ``t`` [s] is the local time at which it was
-        read.
+        ``t_sensor`` [s] is the frame's board time, and ``t`` [s] is the local time at which the
+        frame was read.
         """
         offset = t - t_sensor
         risen = self._offset + self._DRIFT * (t - self._t)
@@ -65,9 +65,9 @@ class SerialReader:
 
     A frame's ``t_arrival`` is the time at which its last byte was read. ``t_sample`` estimates the
     mid-scan time: ``t_arrival`` minus the transmission time of the frame's bytes and of later bytes
-    in the same read, minus ``latency`` [s] from mid-scan to the frame's first byte. It never
-    decreases from frame to frame. If frames contain the board time, :class:`SensorClock` removes
-    port jitter.
+    in the same read, minus ``latency`` [s] from mid-scan to the frame's first byte. ``t_sample``
+    never decreases from frame to frame. If frames contain the board time, :class:`SensorClock`
+    removes port jitter.
 
     A polled board receives ``request`` at the start, after each frame, and again if no frame
     arrives within its transmission time plus 0.1 s.
@@ -181,7 +181,7 @@ class SerialReader:
         return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
 
     def _run(self, port: int, stop: int) -> None:
-        """Read in the thread, which blocks in the kernel and wakes up once or twice per frame."""
+        """Read frames in the reader thread, which blocks in the kernel between reads."""
         decoder = self._decoder
         timeout = self._ask(port)
         while True:

@@ -1,9 +1,9 @@
 """Parse Tekscan-style ASCII exports of pressure frames.
 
 An export starts with lines of the form ``KEY value``, up to the line ``ASCII_DATA @@``. Each frame
-consists of a line ``Frame n``, which may contain more text, and the rows, with ``B`` where the
-sensor has no cell. A line ``@@`` may end the file. An export with a single frame has no ``Frame``
-line.
+consists of a line ``Frame n``, which may contain more text, and the rows. The letter ``B`` marks a
+position without a cell. A line ``@@`` may end the file. An export with a single frame has no
+``Frame`` line.
 
 Encoding, decimal sign and separator depend on the locale of the exporting machine. The parser
 detects them from the file. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings
@@ -66,7 +66,7 @@ class TekscanError(SoftfingerError, ValueError):
 class Export:
     """Parsed export.
 
-    ``values`` float64 [frames, rows, cols] are in Pa, or counts if ``raw``. They are 0 where
+    ``values`` float64 [frames, rows, cols] are in Pa, or counts if ``raw``. The values are 0 where
     ``live`` [rows, cols] is False. ``t`` float64 [frames] is the time since the first frame [s].
     ``pitch`` (x, y) [m] is NaN if the header does not contain it. ``full`` is the reading of a
     saturated cell, inf if unknown.
@@ -97,7 +97,7 @@ def decode(data: bytes) -> str:
 def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     """Parse an export. Raises TekscanError.
 
-    ``seconds_per_frame`` [s] is used if the header does not contain it.
+    ``seconds_per_frame`` [s] is used if the header does not state a frame period.
     """
     lines = text.splitlines()
     header, first = _header(lines)
@@ -271,8 +271,8 @@ _GROUPS = str.maketrans("", "", "'\N{RIGHT SINGLE QUOTATION MARK}\N{NO-BREAK SPA
 def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
-    If both characters occur, the last one is the decimal sign, and the other groups digits.
-    Apostrophes and narrow spaces only group digits.
+    If point and comma both occur, the last of them is the decimal sign, and the other character
+    groups digits. Apostrophes and narrow spaces only group digits.
     """
     text = text.translate(_GROUPS)
     if "," in text:

@@ -1,14 +1,14 @@
 """Unpack and answer the requests that the gateway forwards to the loop.
 
 The command server runs in the loop's thread, once per tick, without a lock. A ``stop`` takes
-precedence. Each request carries the number of stops that preceded it. If that number is lower than
-the current number of stops, the request is refused, unless it is ``status``. A ``hold`` replaces a
-queued ``hold`` that directly precedes it on the same connection.
+precedence. Each request carries the number of stops that preceded it. A request that carries fewer
+stops than the current number is refused, unless it is ``status``. A ``hold`` replaces a queued
+``hold`` that directly precedes it on the same connection.
 
-A client may add a unique ``key`` to a request and send the same map again if it was refused as
-late. The daemon then carries out the command at most once. If another command has been carried out
-since the refusal, the repeated request is refused, because the newest command prevails. Commands
-that can only make the hand safer (`NO_LEASE_COMMANDS`) are carried out every time.
+A client may add a unique ``key`` to a request and repeat the request if it was refused as late. The
+daemon carries out a command with a key at most once. If another command has been carried out since
+the refusal, the repeated request is refused, because the newest command prevails. Commands that can
+only make the hand safer (`NO_LEASE_COMMANDS`) are carried out every time.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ class FieldSource(Generic[_From]):
     ) -> _Value:
         """Declare a field.
 
-        Without ``get``, its value is the source's attribute of the same name.
+        Without ``get``, the field's value is the source's attribute of the same name.
         """
         about = {"unit": unit, "meaning": meaning, "source": self, "get": get}
         return cast(_Value, dataclasses.field(metadata=about))

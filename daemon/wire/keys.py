@@ -50,7 +50,9 @@ class ServerKeys:
     clients: dict[bytes, str]  # public key → name
 
     def left(self, folder: Path) -> ServerKeys:
-        """Return the keys without those of clients whose files were removed. Raises KeyFileError.
+        """Return the keys, except the keys of clients whose files were removed.
+
+        Raises KeyFileError.
 
         This method does not open files, so it works even if no file descriptor is free.
         """

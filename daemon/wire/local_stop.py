@@ -1,7 +1,7 @@
 """Provide a local socket for ``stop`` that other clients can't block.
 
-It is a Unix datagram socket, so connections can't run out. Only the daemon's user has access to its
-folder. `client.command_client` uses the socket if it exists.
+The socket is a Unix datagram socket, so connections can't run out. Only the daemon's user has
+access to the socket's folder. `client.command_client` uses the socket if it exists.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class LocalStop:
 def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
     """Stop this user's daemon at the command address ``address``, and return its reply.
 
-    Returns None if no such daemon runs on this machine or if it does not respond.
+    Returns None if this user's daemon is not running on this machine or does not respond.
     """
     try:
         name = _name(address)
@@ -142,7 +142,7 @@ def _folders() -> Iterator[Path]:
 
 
 def _own_folder() -> tuple[Path, str]:
-    """Return the first usable folder, creating it if necessary, and a notice about unusable ones.
+    """Return the first usable folder, created if necessary, and a notice on unusable folders.
 
     Raises OSError if all candidates are unusable.
     """

@@ -1,9 +1,9 @@
 """Connect the loop and the gateway by a socket pair; define the messages and the loop's end.
 
 Each message is a msgpack list whose first element is the message kind. Sending never blocks. If the
-socket buffer is full, the remaining bytes are sent later. Until then, stream messages are dropped,
-but replies and stops are queued. The gateway limits the number of pending requests, so this queue
-is bounded.
+socket buffer is full, the remaining bytes are sent later. While bytes remain, stream messages are
+dropped, but replies and stops are queued. The gateway limits the number of pending requests, so the
+queue of replies and stops is bounded.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Ask(NamedTuple):
 
     ``came`` is the arrival time according to `machine_time`. ``stops`` is the number of stops that
     certainly arrived before the request. An ``urgent`` request looks like a stop. ``name`` is the
-    client name that belongs to the client's key. ``route`` is the return route for the reply. Its
-    first part identifies the connection.
+    client name that belongs to the client's key. ``route`` is the return route for the reply. The
+    first part of the route identifies the connection.
     """
 
     came: float
@@ -70,7 +70,7 @@ def pair() -> tuple[socket.socket, socket.socket]:
 
 
 def repeated(message: bytes) -> bytes:
-    """Return a stream message with its ``again`` field set, if it has one."""
+    """Return a stream message after setting its ``again`` field, if this field exists."""
     return message.replace(_FIRST, _AGAIN, 1)
 
 
@@ -146,7 +146,7 @@ class Link:
         self._offered = channel
 
     def watch(self, descriptor: int) -> None:
-        """Poll an additional descriptor; `look` then sets `called` if it is readable."""
+        """Poll an additional descriptor; `look` sets `called` when the descriptor is readable."""
         self._other = descriptor
         self._poll.register(descriptor, select.POLLIN)
 
@@ -214,7 +214,7 @@ class Link:
         self.unpacked.clear()
 
     def fence(self, stops: int) -> None:
-        """Send the gateway the stop count with which it must stamp requests."""
+        """Send the current stop count to the gateway, which stamps requests with this count."""
         self._fence = stops
         if self._channel is not None and stops:
             self._channel.send(FENCE, stops)

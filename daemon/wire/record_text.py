@@ -68,7 +68,7 @@ def object_text(pose: ObjectState) -> str:
 
 
 def frame_text(frame: TactileFrame) -> str:
-    """Return the finger, the size of the grid and the largest pressure."""
+    """Return the finger, the grid size and the maximum pressure."""
     lost = "" if frame.valid else ", the board is disconnected"
     highest = 1e-3 * frame.pressure.max()
     return f"{frame.finger}, {frame.rows} × {frame.cols} cells, {highest:.1f} kPa at most{lost}"

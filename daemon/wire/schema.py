@@ -98,7 +98,7 @@ _news = FieldSource["EventSource"]()
 
 @record
 class _TickMessage:
-    """Message sent every n-th tick."""
+    """Message that is sent on every n-th tick."""
 
     schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _state(*_SEQ)
@@ -202,7 +202,7 @@ class FingerState:
     )
     gain: float = _contact("", "ratio of measured to modelled pressure")
     modulus_scale: float = _contact(
-        "", "tip modulus divided by its setting, as estimated during grips"
+        "", "tip modulus estimated during grips, divided by the configured modulus"
     )
     modulus_scale_std: float = _contact("", "standard deviation of modulus_scale")
     sensor_gain: float = _contact("", "gain of the sensor, equal to gain divided by modulus_scale")
@@ -222,9 +222,11 @@ class FingerState:
     )
     contact: bool = _contact("", "the tip is in contact")
     frame_seq: int = _contact(
-        "", "sequence number of the estimated tactile frame, 0 before the first", lambda c: c.seq
+        "",
+        "sequence number of the tactile frame used for the estimate, 0 before the first frame",
+        lambda c: c.seq,
     )
-    frame_age_s: float = _finger("s", "time since this frame was scanned", _frame_age)
+    frame_age_s: float = _finger("s", "time since the scan of the frame `frame_seq`", _frame_age)
     invalid: str = _finger(
         "", "reason why the finger is not valid, or empty", lambda f: _invalid(f).text
     )
@@ -281,7 +283,7 @@ class HandState(_TickMessage):
     fault: str = _state("", "text of the latched fault, or empty")
     fault_name: str = _state("", "name of the fault in `softfinger.daemon.safety.limits`, or empty")
     torque: bool = _state("", "torque is on, or torque off is not confirmed")
-    tick_s: float = _timing("s", "time from the start of the last tick to the start of this one")
+    tick_s: float = _timing("s", "time from the start of the last tick to the start of this tick")
     compute_s: float = _timing("s", "computing time of the last tick")
     wake_late_s: float = _timing("s", "delay of the start of this tick after its deadline")
     overruns: int = _timing("", "number of ticks that took longer than the period")
@@ -309,7 +311,10 @@ class HandState(_TickMessage):
         return record_text.state_html(self)
 
     def finger(self, name: str) -> FingerState:
-        """Return the finger named ``left`` or ``right``. Raises ValueError for other names."""
+        """Return the finger named ``left`` or ``right``.
+
+        Raises ValueError if no finger has this name.
+        """
         if name not in FINGERS:
             raise ValueError(f"found finger {name!r}, expected one of {', '.join(FINGERS)}")
         return self.left if name == FINGERS[0] else self.right
@@ -577,7 +582,7 @@ class InputReading:
     """Servo readings in ``hand/input``."""
 
     seq: int = _reading("", "sequence number of the servo reading")
-    t: float = _reading("s", "time of the last valid reading, −∞ before the first")
+    t: float = _reading("s", "time of the last valid reading, −∞ before the first reading")
     valid: bool = _reading("", "the reading of this tick is valid")
     alert: int = _reading("", "bit i: the servo of finger i reports a hardware error")
     error: str = _read("", "bus error, or empty", lambda s: s.read_error)
@@ -598,10 +603,14 @@ class InputFinger:
     temperature: float = _taken(*_TEMPERATURE, lambda f: f.reading.temperature[f.i])
     voltage: float = _taken(*_VOLTAGE, lambda f: f.reading.voltage[f.i])
     frame_seq: int = _newest(
-        "", "sequence number of the newest tactile frame, 0 before the first", lambda f: f.seq
+        "", "sequence number of the newest tactile frame, 0 before the first frame", lambda f: f.seq
     )
-    frame_t: float = _newest("s", "time of its scan on the daemon's clock", lambda f: f.t_sample)
-    frame_arrival: float = _newest("s", "arrival time of its last byte", lambda f: f.t_arrival)
+    frame_t: float = _newest(
+        "s", "time of the frame's scan on the daemon's clock", lambda f: f.t_sample
+    )
+    frame_arrival: float = _newest(
+        "s", "arrival time of the frame's last byte", lambda f: f.t_arrival
+    )
     frame_valid: bool = _newest("", "false if the board is disconnected", lambda f: f.valid)
 
 

@@ -283,8 +283,8 @@ def _power(
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
     """Set mean readings [rows, cols] over ``frames`` frames to 0 where they are within 4 σ of 0.
 
-    Clipped noise has a positive mean. Summed over all cells, this mean may be as large as the force
-    of a contact.
+    Clipped noise has a positive mean. Summed over all cells, the mean of clipped noise may be as
+    large as the force of a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)
@@ -444,8 +444,8 @@ def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
 def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
     """Fit non-negative relaxation strengths to the force of a press and the following hold.
 
-    F∞ is constant during the hold. During the press, F∞ follows from F and the strengths. Therefore
-    F∞ and the strengths are determined alternately.
+    F∞ is constant during the hold. During the press, F∞ follows from F and the strengths. The fit
+    therefore alternates between F∞ and the strengths.
 
     Parameters
     ----------

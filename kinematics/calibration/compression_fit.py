@@ -66,7 +66,7 @@ class Run:
 
     @property
     def depth(self) -> float:
-        """Largest d beyond the beginning of the curve [m]."""
+        """Maximum d relative to the beginning of the curve [m]."""
         return float(self.d.max()) - self.begin
 
     @property
@@ -88,7 +88,7 @@ class Run:
 def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
     """Find the loading branch of a test and the beginning of its curve.
 
-    If there are several cycles, the last one that reaches the full depth is used, because rubber
+    If there are several cycles, the last cycle that reaches the full depth is used, because rubber
     softens in its first cycles (Mullins, 1948). The branch ends as soon as d is within 0.5 % of its
     maximum, so that it does not include a hold.
 
@@ -202,10 +202,11 @@ class CompressionFit:
 
     ``factors`` [k] [Pa] multiply the powers 1 to k of the strain or, if k = 1, the shape ``law``.
     ``std`` is the maximum relative standard deviation of the force above a quarter of the maximum
-    d; for k = 1, it equals that of the modulus. For each run, ``zeros`` contains the zero offsets
-    of d [m] and F [N] and their standard deviations. ``residual`` [N] is the rms residual. ``chi2``
-    is its square divided by the squared scatter about a smooth curve. ``score`` is the Bayesian
-    information criterion; the best law has the lowest score.
+    d; for k = 1, this is also the relative standard deviation of the modulus. For each run,
+    ``zeros`` contains the zero offsets of d [m] and F [N] and their standard deviations.
+    ``residual`` [N] is the rms residual. ``chi2`` is the squared residual divided by the squared
+    scatter about a smooth curve. ``score`` is the Bayesian information criterion; the best law has
+    the lowest score.
     """
 
     tip: Fingertip
@@ -319,7 +320,7 @@ def compare_laws(
 
     Springs are fitted with a constant modulus, with a strain-dependent modulus and, if ``material``
     is nonlinear, with the shape of its law. Solid rubber has the given Poisson's ratio, because
-    F(d) does not determine it.
+    F(d) does not determine this ratio.
     """
     springs, solid = Fingertip(radius), Fingertip(radius, "solid", poisson)
     tried: list[tuple[str, Fingertip, Material | None]] = [("springs", springs, _UNIT)]

@@ -43,7 +43,7 @@ def fit_latency(
     latency: float,
     response: float = 0.0,
 ) -> LatencyFit:
-    """Fit the frame delay to the ramps k of a grip, in which the force rises or falls.
+    """Fit the frame delay to the ramps k of a grip. In a ramp, the force rises or falls.
 
         d(t) = scale · closing(t − delay) + offset_k
 

@@ -50,7 +50,7 @@ class Presses:
     def of(
         self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT_MATERIAL
     ) -> FloatArray:
-        """Return the modelled pressures of these presses for a modulus of 1 Pa, [used cells]."""
+        """Return the modelled pressures of the presses for a modulus of 1 Pa, [used cells]."""
         made = [
             grid.pressure(tip, law, float(depth), float(tilt))
             for depth, tilt in zip(np.maximum(d, 1e-9), self.theta, strict=True)
@@ -60,7 +60,7 @@ class Presses:
 
 @dataclass(frozen=True)
 class Trend:
-    """Modulus E [n] [Pa] of each press versus d [n] [m], to check that one E fits all presses.
+    """Modulus E [n] [Pa] of each press versus d [n] [m], to check that one value fits all presses.
 
     ``drift`` is the relative change of a fitted line from the minimum to the maximum d, and ``std``
     is its standard deviation, derived from the scatter about the line.
@@ -119,11 +119,11 @@ class TipFit:
 
     ``law`` is the material law for a modulus of 1 Pa at zero strain. The fit determines ``modulus``
     [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the mean
-    squared residual per cell divided by the noise variance. The following errors are errors of the
-    estimator for this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors.
-    ``force_error`` is the rms difference between the estimated force and the frame sum, divided by
-    the rms frame sum. The errors include only frames with a valid estimate; ``valid`` is the
-    fraction of such frames. ``trend`` contains the value of E from each individual press.
+    squared residual per cell divided by the noise variance. The errors below are the estimator's
+    errors for this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors. ``force_error``
+    is the rms difference between the estimated force and the frame sum, divided by the rms frame
+    sum. The errors include only frames with a valid estimate; ``valid`` is the fraction of such
+    frames. ``trend`` contains the value of E from each individual press.
     """
 
     tip: Fingertip

@@ -12,13 +12,14 @@ search dozens of candidates for each operation and let LLVM parse a module for e
 A `BitcodeKernel` can be called only by other kernels and is compiled to LLVM bitcode, never to
 machine code. By default, Numba compiles each function called by a kernel as if Python might call
 it. Numba then optimises the function together with its callees, compiles it to machine code, adds
-two wrappers and caches it. The callers link the bitcode and repeat this work. Stopping at bitcode
-reduces the compile time by a third and the cache size to a quarter.
+two wrappers and caches it. The callers link the bitcode and repeat the optimisation and
+compilation. Stopping at bitcode reduces the compile time by a third and the cache size to a
+quarter.
 
-`KernelCache` stores the machine code of a kernel but not its bitcode. If another kernel calls the
-stored kernel, it needs the bitcode and therefore compiles the kernel again. Before loading a stored
-kernel, Numba normally imports all its implementations of Python and NumPy functions, which takes a
-third of a second and 50 MB. `KernelCache` skips this import.
+`KernelCache` stores the machine code of a kernel but not its bitcode. A kernel that calls the
+stored kernel needs the bitcode and therefore compiles the stored kernel again. Before loading a
+stored kernel, Numba normally imports all its implementations of Python and NumPy functions, which
+takes a third of a second and 50 MB. `KernelCache` skips this import.
 """
 
 from __future__ import annotations

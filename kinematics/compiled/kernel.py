@@ -83,8 +83,8 @@ def fast_inner_kernel(function: Function) -> Function:
 def inlined_kernel(function: Function) -> Function:
     """Compile an :func:`inner_kernel` inline into its callers; products and sums may be fused.
 
-    Use it for the innermost functions of a hot path, where a call costs as much as the function
-    body. The code is repeated in each caller, so it should be short.
+    Use this decorator for the innermost functions of a hot path, where a call costs as much as the
+    function body. The code is repeated in each caller, so it should be short.
     """
     return _inner(function, fastmath={"contract"}, forceinline=True)
 

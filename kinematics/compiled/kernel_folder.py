@@ -1,4 +1,4 @@
-"""Manage the cache folders for compiled kernels, one for each state of the sources and compiler.
+"""Manage the cache folders for compiled kernels, one for each version of sources and compiler.
 
 The folder name is a digest of all sources that a kernel may depend on, the versions of Python,
 Numba, llvmlite and NumPy, and the processor. Outdated kernels are therefore never loaded. The files
@@ -139,7 +139,7 @@ def mark(folder: OwnFolder, part: str) -> None:
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove other cache folders except the newest few and those used recently."""
+    """Remove other cache folders, except the newest few and recently used folders."""
     oldest = time.time() - _RECENT
     others = [
         each

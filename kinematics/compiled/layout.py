@@ -51,7 +51,10 @@ class _Slotted(type):
 
 
 class Record(metaclass=_Slotted):
-    """Base class of records. A subclass declares its fields as annotations; see the module docs."""
+    """Base class of records.
+
+    A subclass declares its fields as annotations; see the module docstring.
+    """
 
     __slots__ = ("_fields", "array")
 

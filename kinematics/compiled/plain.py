@@ -1,8 +1,9 @@
 """Replacement for `compiler` that uses only Numba's public interface and works with any version.
 
-The computed results are identical. The first start takes twice as long, and later starts import
-Numba's implementations of Python and NumPy functions. Numba stores the kernels in the same folder,
-but without a digest; the folder name depends on the sources and the Numba version.
+Kernels compiled by either module return identical results. The first start takes twice as long, and
+later starts import Numba's implementations of Python and NumPy functions. Numba stores the kernels
+in the same folder, but without a digest; the folder name depends on the sources and the Numba
+version.
 """
 
 from __future__ import annotations

@@ -52,9 +52,9 @@ class Fingertip:
     poisson
         Poisson's ratio of a solid tip, 0.45 to 0.4995.
     base
-        Whether a solid tip is "bonded" to the sensor or "lying" on it.
+        "bonded" if a solid tip is bonded to the sensor, "lying" if it lies on the sensor.
     face
-        Whether the surface of a solid tip is "frictionless" or "sticking" on the object.
+        Contact of a solid tip with the object: "frictionless" or "sticking".
     law
         Measured curves; required if ``physics`` is "measured", otherwise None.
 
@@ -156,8 +156,7 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 
     ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN input.
-    The formulas are valid up to the limit on θ. Beyond the limit, they are evaluated without
-    change.
+    The formulas are valid up to the limit on θ. Beyond the limit, the same formulas are evaluated.
     """
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)

@@ -107,8 +107,8 @@ class Material:
         the slope'). These slopes are used as the tangent modulus dσ/dε: 0.135 MPa at zero strain,
         then 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at strains of 20 to 100 %. The modulus is
         interpolated by the lowest-degree polynomial with zero slope at zero strain, because the
-        paper calls the first value the smallest. This polynomial increases on [0, 1]. The largest
-        modulus in the paper, 0.304 MPa, occurs above 100 % strain and is not used.
+        paper calls the first value the smallest. The interpolating polynomial increases on [0, 1].
+        The largest modulus in the paper, 0.304 MPa, occurs above 100 % strain and is not used.
         """
         return cls(tuple(map(Fraction, _TABLE_I.split())), name="table_i")
 
@@ -193,9 +193,9 @@ class Material:
     def expansions(self) -> FloatArray:
         """Return the law's expansions divided by E₀, for the quadrature, float64 [7, order].
 
-        Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. With
-        X_1 = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε, the rows are S_1, W_1, T_1, S_2, S_2′, T_2
-        and T_2′. All are polynomials, so there is no cancellation at small strain.
+        Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. With X_1
+        = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε, the rows are S_1, W_1, T_1, S_2, S_2′, T_2 and
+        T_2′. All expansions are polynomials, so there is no cancellation at small strain.
         """
         unit = [value / self.coefficients[0] for value in self.coefficients]
         secant = unit[1:] or [Fraction(0)]

@@ -14,8 +14,8 @@ moment ∂U/∂θ. With the base force F, the base pressure is
 
 Without friction, F = N cos θ. A sticking face holds each point of the tip at the position where the
 point first touched it. The plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ
-is the derivative of the energy of such presses with respect to the tilt. A shear force T = −N sin θ
-cos θ q_0 pulls the tip up the slope, and F = N cos θ (1 − sin² θ q_0).
+is the derivative of the energy of straight presses with respect to the tilt. A shear force T = −N
+sin θ cos θ q_0 pulls the tip up the slope, and F = N cos θ (1 − sin² θ q_0).
 
 A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). The shear force is
 assumed to act at height a, so its moment about the base centre is T a.

@@ -3,9 +3,9 @@
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
 higher coefficients, and rounding. The bound assumes that the reference integrals have only rounding
-errors, and that coefficients beyond the computed ones continue to decrease. Both assumptions hold
-for all supported laws, because each law is a single polynomial. Pieces are halved until the bound
-is within the tolerance.
+errors, and that the higher coefficients continue to decrease. Both assumptions about the
+coefficients hold for all supported laws, because each law is a single polynomial. Pieces are halved
+until the bound is within the tolerance.
 """
 
 from __future__ import annotations
@@ -157,10 +157,11 @@ def _bound(
     """Return the bound on a piece's relative error and the approximate location of the maximum.
 
     ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` contains the Chebyshev
-    coefficients of the difference between ratios and table. The sum of their magnitudes bounds this
-    difference. Coefficients beyond the computed ones contribute less than twice the last two
-    coefficients in each direction, because each coefficient is less than half of its predecessor.
-    The reason is that the ratios are analytic well beyond the piece. ``rounding`` [5] is absolute.
+    coefficients of the difference between ratios and table. The sum of the magnitudes of these
+    coefficients bounds the difference. Higher coefficients, which are not computed, contribute less
+    than twice the last two coefficients in each direction, because each coefficient is less than
+    half of its predecessor. The coefficients decrease this fast because the ratios are analytic
+    well beyond the piece. ``rounding`` [5] is absolute.
     """
     everywhere = _dense_nodes(len(h)) @ _terms(values) @ _dense_nodes(len(y)).T
     size = np.abs(everywhere)

@@ -92,7 +92,7 @@ def sums_inside(m: Moments, frame: FloatArray, cells: Cells, u: float, v: float,
 
 @inner_kernel
 def next_above(frame: FloatArray, height: FloatArray, start: int, last: int, level: float) -> int:
-    """Return the first cell in start..last reading at least ``level``, or ``last`` if none does."""
+    """Return the first cell in start..last with a reading ≥ ``level``, or ``last`` if none."""
     while start < last and not (frame[start] >= level and height[start] >= 0.0):
         start += 1
     return start

@@ -92,7 +92,7 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
 def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
     """Return True if the cells of a frame without contact scatter by more than their noise.
 
-    Only cells above a centre are used, since readings may be clipped at 0. The centre is the mean
+    Only cells above a centre are used, because readings may be clipped at 0. The centre is the mean
     reading, or 0 if more than a quarter of the cells read 0. With half of 788 cells, the noise is
     determined with a standard deviation of 4 %.
     """

@@ -110,7 +110,7 @@ def _energy_inside(frame: FloatArray, cells: Cells, first: int, last: int) -> tu
 def free_noise(square: float, floor: float) -> float:
     """Return a cell's noise σ [Pa] from the mean ``square`` [Pa²] of unloaded cells.
 
-    These cells read 0 below ``floor`` [Pa], so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. For a
+    Unloaded cells read 0 below ``floor`` [Pa], so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. For a
     floor of 0, E[y²] is half the variance. If all cells read below the floor, the result is
     slightly less than a third of the floor.
     """
@@ -159,9 +159,9 @@ def _clip_noise(
 def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
     """Compute ``residual`` and ``factor`` of each cell, and their sums, from readings and model.
 
-    A cell cannot read below the floor, or below 0 even where the rubber is in tension. A saturated
-    cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the noise is
-    clipped at the floor; otherwise, cells with a model below the floor are excluded.
+    A cell never reads below the floor, and never below 0 even where the rubber is in tension. A
+    saturated cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the
+    noise is clipped at the floor; otherwise, cells with a model below the floor are excluded.
     """
     fit = state.fit
     saturation = state.signal.saturation
@@ -300,8 +300,8 @@ def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 def solve(fit: Fit, first: int, last: int) -> bool:
     """Solve the normal equations for parameters first to last; set step, inverse and decrement.
 
-    Returns False if a pivot of the scaled matrix is too small. In this case, the frame does not
-    contain enough information to determine all parameters.
+    Returns False if a pivot of the scaled matrix is too small, i.e. if the frame does not determine
+    all parameters.
     """
     normal = fit.normal
     lower = fit.lower

@@ -106,7 +106,7 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
 def _sums_of_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
     """Compute the same sums as :func:`sums_above` for pressures of a few times the noise.
 
-    Single noisy cells would distort the sums. Therefore the sums include only cells that read at
+    Single noisy cells would distort the sums. The sums therefore include only cells that read at
     least twice the noise and have a significant neighbourhood.
     """
     m = state.moments
@@ -149,7 +149,7 @@ def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Refine the contact in ``state.moments`` using the moments over its widened footprint."""
+    """Refine the contact in ``state.moments`` using the moments over the widened footprint."""
     m = state.moments
     grid = state.grid
     face = state.around

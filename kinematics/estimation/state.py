@@ -183,8 +183,8 @@ class EstimatorState(Record):
 class Cells(NamedTuple):
     """Arrays over the cells of `EstimatorState.grid`, float64 [cells].
 
-    ``planes`` [4, rows, cols] contains ``stress`` to ``by_y`` in one array: the modelled pressure
-    at a gain of 1, and its partials.
+    ``planes`` [4, rows, cols] combines the arrays ``stress`` to ``by_y``: the modelled pressure at
+    a gain of 1, and its partials.
     """
 
     planes: FloatArray

@@ -38,7 +38,7 @@ def tip_position(
 ) -> tuple[float, float]:
     """Return the centre (x, y) [m] of a tip at joint angle ``q`` [rad].
 
-    ``side`` is +1 for the left finger and −1 for the right one.
+    ``side`` is +1 for the left finger and −1 for the right finger.
     """
     sine = math.sin(q)
     cosine = math.cos(q)

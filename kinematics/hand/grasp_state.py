@@ -7,8 +7,8 @@ moments ∂U/∂θ are subtracted from the torques. The residual is the shear fo
 about the pivot.
 
 The object's faces may be inclined by a taper α, which is positive if the object is wider at the
-palm. Then θ = φ + q1 − α/2 at the left tip and θ = φ − q2 + α/2 at the right tip, where the
-bisector of the faces is at angle φ.
+palm. With this taper, θ = φ + q1 − α/2 at the left tip and θ = φ − q2 + α/2 at the right tip, where
+the bisector of the faces is at angle φ.
 """
 
 from __future__ import annotations
@@ -236,8 +236,8 @@ def load_torques(
     W turn_i.
 
     δ_i is the residual of τ_i at L = 0. For a load, (δ1 + δ2)/2 = moment_arm L + curvature L² holds
-    exactly. The function returns (δ1, δ2, moment_arm, curvature). All four are zero if a tip is not
-    in contact or if a load would not change the torques.
+    exactly. The function returns (δ1, δ2, moment_arm, curvature). All four results are zero if a
+    tip is not in contact or if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -267,8 +267,7 @@ def load_torques(
 def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
     """Solve torque = moment_arm L + curvature L² [N·m]; return L [N] and the slope ∂torque/∂L [m].
 
-    Torques beyond the parabola's vertex cannot be caused by a load; for them, the minimum slope is
-    used.
+    Torques beyond the parabola's vertex cannot be caused by a load; the minimum slope is then used.
     """
     slope_min = _SLOPE_MIN * moment_arm
     slope = math.sqrt(

@@ -1,11 +1,11 @@
 """Forward model of a spring tip on a grid of cells: pressure and its partials.
 
 A cell reads the mean over sample points that are distributed evenly over its area. Above a point
-(x, y) of the base, the spring has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ with
-z = u − v x − w y; see `footprint`. Each point represents a small rectangle and uses the mean strain
-over it. Inside the footprint, the mean strain follows from tabulated means of 1/ℓ, x/ℓ and y/ℓ.
-Where the outline cuts the rectangle, only the part with f = ℓ² − z² > 0 contributes. In such a
-rectangle, f is approximated by a plane, and its values by a uniform distribution.
+(x, y) of the base, the spring has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ with z = u − v
+x − w y; see `footprint`. Each point represents a small rectangle and uses the mean strain over it.
+Inside the footprint, the mean strain follows from tabulated means of 1/ℓ, x/ℓ and y/ℓ. Where the
+outline cuts the rectangle, only the part with f = ℓ² − z² > 0 contributes. In a rectangle cut by
+the outline, f is approximated by a plane, and its values by a uniform distribution.
 
 The point weights include the sensor's blur; see `blur`.
 """

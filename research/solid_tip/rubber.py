@@ -1,11 +1,11 @@
 """Neo-Hookean finite elements of the hemisphere under a rigid plane, in the deformed configuration.
 
-The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and
-κ = E/(3 − 6ν), where E and ν are the small-strain values. Elements have 27 nodes. In the volumetric
-part, J − 1 is projected onto linear functions in each element (mean dilatation to first order),
-which avoids locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a
-tilted plane, it covers half a turn, with the symmetry plane y = 0. For an upright plane, it is one
-thin wedge, and all nodes at the same r and z have the same motion.
+The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and κ = E/(3 −
+6ν), where E and ν are the small-strain values. Elements have 27 nodes. In the volumetric part, J −
+1 is projected onto linear functions in each element (mean dilatation to first order), which avoids
+locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a tilted plane, the
+mesh covers half a turn, with the symmetry plane y = 0. For an upright plane, the mesh is one thin
+wedge, and all nodes at the same r and z have the same motion.
 
 Contact occurs between the plane and nodes. An active node lies in the plane and transmits a normal
 force. An active node moves freely along the plane unless the face is sticking. Each Newton step
@@ -259,8 +259,8 @@ class Body:
         """Return the energy, the dof forces and, if ``pressures`` are given, the upper tangent.
 
         ``pressures`` are the coefficients (e, 4) of each element's linear functions, updated as in
-        the Newton steps of a mixed method. Without these pressures, the second-order volume change
-        in a step, multiplied by κ, would distort the next tangent.
+        the Newton steps of a mixed method. If each step recomputed the pressures, the second-order
+        volume change, multiplied by κ, would distort the next tangent.
         """
         if self.at_rest is not None:
             out = self.times_tangent(self.at_rest, motion)

@@ -3,7 +3,7 @@
 The program reads the linear model from the file written by ``python -m research.solid_tip`` and
 writes the neo-Hookean model in the same format. To obtain the effect of finite strain, the linear
 and neo-Hookean elements of `rubber` are compared on the same mesh, so the mesh error cancels. The
-ratio of their energies scales the energy of the linear model. The difference of their base
+ratio of the two energies scales the energy of the linear model. The difference between the two base
 pressures, relative to the normal force, is added to the base pressure of the linear model. Upright
 presses use a fine mesh. Tilted presses use a coarse mesh and are compared with upright presses on
 that mesh.

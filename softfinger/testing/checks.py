@@ -76,9 +76,9 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
 def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0) -> None:
     """Connect to the servos twice and read them.
 
-    If ``torque`` is True, the torque is also switched on at the current position and off again. In
-    this case, the joints must not move by more than 0.05 rad. ``patience`` [s] limits each waiting
-    time.
+    If ``torque`` is True, the torque is also switched on at the current position and off again.
+    While torque is on, the joints must not move by more than 0.05 rad. ``patience`` [s] limits each
+    waiting time.
     """
     servos = make_servos(settings, make_clock(settings), None)
     assert servos is not None, "servos.backend: found none, expected servos"

@@ -30,7 +30,7 @@ _STALL = 0.5  # s; longer pauses of this process count only up to this value as 
 
 
 class EmulatedHand:
-    """Emulated hand in a `softfinger emulate` process, which ends with this context.
+    """Emulated hand in a `softfinger emulate` process that ends with this context.
 
     The first start on a machine compiles kernels, which takes minutes.
 
@@ -68,15 +68,14 @@ class EmulatedHand:
         """Send requests or faults in the same way as `softfinger emulate --send`; return the reply.
 
         For example, ``"place"`` puts the object back, and ``"press depth=3mm"`` presses a plate
-        onto the tips and waits until the plate has arrived. Raises Refused if the words are not
-        understood.
+        onto the tips and waits until the plate has arrived. Raises Refused if a word is unknown.
         """
         return carry_out(self.folder, words)
 
     def fault(self, *words: str) -> None:
         """Start faults such as ``"left:silent"`` or ``"drop=0.01@2"``; ``"well"`` ends all faults.
 
-        `softfinger help emulate` lists all faults. Raises Refused if a word is not understood.
+        `softfinger help emulate` lists all faults. Raises Refused if a word is unknown.
         """
         self.send(" ".join(words))
 

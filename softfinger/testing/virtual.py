@@ -263,9 +263,9 @@ class VirtualTimeHand(Hand):
 
 
 class VirtualHand(VirtualTimeHand):
-    """Simulated hand and its daemon in virtual time, which run as fast as this machine permits.
+    """Simulated hand and its daemon, which run in virtual time as fast as this machine permits.
 
-    On the same machine, identical calls give states that are identical bit for bit.
+    On the same machine, identical calls produce bit-for-bit identical states.
 
     Parameters
     ----------
@@ -324,8 +324,7 @@ class VirtualHand(VirtualTimeHand):
         Raises
         ------
         FaultError
-            If the words are not understood, or if they require servos and boards as in
-            `EmulatedHand`.
+            If a word is unknown, or if a fault requires servos and boards as in `EmulatedHand`.
         """
         for event in parse_faults(words, ()):
             self._faults.append(event._replace(after=event.after + self.t))
@@ -374,7 +373,7 @@ def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
 
 
 class RecordedHand(VirtualTimeHand):
-    """Recording in the form of a `Hand` on virtual time; commands do not have an effect.
+    """Recording with the interface of a `Hand`, in virtual time; commands have no effect.
 
     Iterating over a stream stops, and `run` returns, when the recording ends.
 

@@ -1,7 +1,8 @@
 """Find and kill processes that tests started, directly or indirectly.
 
 When run as a program with a word as its argument, this module waits until its standard input
-closes. At that point, the module kills every process whose environment contains the word.
+closes. When standard input has closed, the module kills every process whose environment contains
+the word.
 """
 
 import contextlib

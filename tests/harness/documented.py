@@ -1,7 +1,7 @@
 """Execute `softfinger` commands from the documentation's shell blocks in the test process.
 
 Commands that run until interrupted are only parsed, together with their profile. An emulated hand
-runs in a separate process and replaces the previous one.
+runs in a separate process and replaces any earlier emulated hand.
 """
 
 import contextlib

@@ -62,7 +62,7 @@ class Served:
         return self.link.stops == self.server._stops
 
     def settle(self, times: int = 3) -> None:
-        """Transfer the messages in transit on the link."""
+        """Deliver all messages that are in transit on the link."""
         for _ in range(times):
             self.service.step(0.0)
             self.link.look()

@@ -54,8 +54,8 @@ class ReferenceHand(HandGeometry):
         """Return joint angles (2,) that indent each tip by ``d`` (2,) [m] on an object at ``pose``.
 
         The solution is closed-form: O1·n = −B cos φ + L sin θ1 + e cos θ1, and the mirror image for
-        the other finger. A negative ``d`` is a gap. Raises ValueError if a finger cannot reach that
-        far.
+        the other finger. A negative ``d`` is a gap. Raises ValueError if a finger cannot reach this
+        position.
         """
         x, y, angle = vector(pose, 3, "pose")
         d1, d2 = vector(d, 2, "d")

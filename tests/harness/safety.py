@@ -1,4 +1,4 @@
-"""Provide states for tests of the limits, and a `Safety` object to check them."""
+"""Provide states for tests of the limits, and a `Safety` object that checks these states."""
 
 from typing import Any, cast
 

@@ -43,7 +43,7 @@ def put_fault(bus: ServoBus, text: str, t: float) -> None:
 
 
 def backend_settings(path: str, **servos: Any) -> Settings:
-    """Return Dynamixel backend settings for the port, with time-outs for a busy machine."""
+    """Return Dynamixel backend settings for the port, with timeouts for a busy machine."""
     waits = {"reply_timeout": 1.0, "watchdog": 2.0}
     values = {"backend": "dynamixel", "port": path} | waits | servos
     return Settings.model_validate({"servos": values})

@@ -61,7 +61,7 @@ SCRIPT: list[tuple[float, dict[str, Any]]] = [
 
 
 class Watch(event.Listener):
-    """Record each time a kernel is compiled or loaded from the cache, which delays a tick."""
+    """Record each compilation of a kernel and each load from the cache; both delay a tick."""
 
     def __init__(self) -> None:
         self.heard: list[str] = []
@@ -80,7 +80,7 @@ class Watch(event.Listener):
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Run the script; report compilations during start-up, outside the warm-up parts, and later."""
+    """Run the script; report compilations during startup, outside the warm-up parts, and later."""
     watch = Watch()
     modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch):

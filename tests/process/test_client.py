@@ -470,7 +470,7 @@ def test_commands_fail_at_once_for_an_unknown_host(inline, monkeypatch, words, g
 
 
 def in_a_thread(use: Callable[[], object]) -> BaseException | None:
-    """The exception that a call raises in a separate thread."""
+    """Return the exception that a call raises in a separate thread."""
     with ThreadPoolExecutor(1, "other") as pool:
         return pool.submit(use).exception(60.0)
 

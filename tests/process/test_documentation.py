@@ -95,7 +95,7 @@ class Shell:
             )  # fmt: skip
 
     def run(self, text: str) -> str:
-        """Run commands; return the failed ones with their exit statuses."""
+        """Run commands; return the failed commands with their exit statuses."""
         (self._folder / "block.sh").write_text(text)
         print(
             "failed=; trap 'failed+=\"$? $BASH_COMMAND; \"' ERR; "

@@ -64,7 +64,7 @@ print(c.caller(1.0), sum(c.caller.stats.cache_hits.values()))
 
 
 class Package:
-    """The small package in a folder, next to its own cache folder."""
+    """A small test package in its own folder, next to its cache folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

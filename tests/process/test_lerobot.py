@@ -1,4 +1,4 @@
-"""Test the hand as a LeRobot robot and environment, found and used by the real package."""
+"""Test that the real LeRobot package finds and uses the hand as a robot and environment."""
 
 import math
 import runpy

@@ -1,4 +1,4 @@
-"""Test replayed recordings: published unchanged, and recomputed to equal states."""
+"""Test replayed recordings: published unchanged, and recomputed with identical states."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Test the manufacturer's SDK on emulated servos, with its packet handler and with ours."""
+"""Test the manufacturer's SDK on emulated servos, with its own and softfinger's packet handler."""
 
 from collections.abc import Iterator
 

@@ -3,9 +3,9 @@
 The daemon's process runs on an emulated hand, with a recorder, three subscribers and a client that
 grasps, turns, moves, releases and streams setpoints at 50 Hz. Meanwhile, faults disturb servos,
 boards and the daemon itself. Every few seconds the emulated hand's record of the servo bus is
-checked. The memory of each process must stay constant, all lost messages must be counted, the ticks
-at the end must be as punctual as at the beginning, and three of ten grasps must reach a hold.
-Faults caused by a busy machine are counted, reported and cleared.
+checked. The memory of each process must stay constant, and all lost messages must be counted. The
+ticks at the end must be as punctual as at the beginning. At least three of ten grasps must lead to
+a hold. Faults caused by a busy machine are counted, reported and cleared.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Account:
 
 
 def soak(seconds: float, seed: int = 1) -> Account:
-    """Run the soak; raise RigError if the set-up does not work."""
+    """Run the soak; raise RigError if the setup does not work."""
     chance = random.Random(seed)
     account = Account()
     with Rig() as rig, ExitStack() as others:

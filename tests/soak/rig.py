@@ -68,7 +68,7 @@ class Rig:
         self._states: zmq.Socket[bytes] | None = None
 
     def start(self, *words: str) -> None:
-        """Start processes that are not running, the daemon with ``words``; may raise RigError."""
+        """Start the missing processes; ``words`` are the daemon's arguments; may raise RigError."""
         if self.hand is None or self.hand.poll() is not None:
             self.hand = self._running.enter_context(
                 emulator_process("--dir", self.ports, "--config", self.config, *self.hand_words)

@@ -261,7 +261,7 @@ class FaultyServos:
 
 
 class FaultySensor:
-    """Sensor whose frames stop, freeze or become wrong on demand."""
+    """Sensor whose frames stop, freeze or become incorrect on demand."""
 
     def __init__(self, sensor: Any, settings: Settings, source: np.random.Generator) -> None:
         self._sensor = sensor
@@ -443,7 +443,7 @@ class Soak:
         return 1 + int(self._random.expovariate(1.0 / mean))
 
     def _may_be_disturbed(self) -> bool:
-        """Return True in mode holding, and occasionally in other modes."""
+        """Return True in the mode ``holding``, and occasionally in other modes."""
         return self.daemon.loop.state.mode == "holding" or self._random.random() < 1e-3
 
     # Actions
@@ -690,7 +690,7 @@ class Soak:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:
-        """Check that a channel reported as faulty really is, unless the object has slipped away."""
+        """Check that only faulty channels are reported as faulty, unless the object has slipped."""
         t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1

@@ -1,4 +1,4 @@
-"""Test the command line's first steps, profile listing, and numbers with units."""
+"""Test the command line without a daemon: first steps, profile list, and numbers with units."""
 
 import json
 import math

@@ -217,7 +217,7 @@ SECTIONS = {
 
 
 def smooth_error(pressure, width, kind, rng):
-    """Return a smooth error, like that of cell gains, another response curve or crosstalk."""
+    """Return a smooth error, e.g. due to cell gains, another response curve or crosstalk."""
     if kind == 0:
         x, y = np.indices(pressure.shape) - 0.5 * (len(pressure) - 1)
         waves, phases = rng.normal(0.0, 1.0 / width, (64, 2)), rng.uniform(0.0, 2.0 * math.pi, 64)

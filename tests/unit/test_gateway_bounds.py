@@ -96,7 +96,7 @@ def test_unknown_topics_are_not_stored(served, context, addresses):
 def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
     served, context, addresses, clock
 ):
-    """Repeats go to all subscribers, so repeating 50 events each time would be a flood."""
+    """A repeated message goes to all subscribers, so 50 repeated events would flood them."""
     served.publisher.event(0.0, 0.0, "info", "test", "told again")
     # Send the event before anyone subscribes, so that it cannot reach an unregistered reader later.
     served.settle()
@@ -120,7 +120,7 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
 
 
 def test_unread_replies_are_dropped(served, context, addresses):
-    """Unread replies neither block the gateway nor fill its memory, as their queue is limited."""
+    """Unread replies neither block the gateway nor fill its memory: their queue is limited."""
     client = context.socket(zmq.DEALER)
     client.setsockopt(zmq.RCVHWM, 1)
     client.setsockopt(zmq.RCVBUF, 4096)

@@ -18,7 +18,7 @@ RATE = 0.229 * 2.0 * math.pi / 60.0  # rad/s, one velocity count
 
 
 class Joint:
-    """A moving joint as its servo reports it: in whole counts, some milliseconds late."""
+    """A moving joint as reported by its servo: in whole counts and some milliseconds late."""
 
     def __init__(self, seed: int = 1) -> None:
         self.reading = Reading(valid=True, t=0.0)
@@ -148,7 +148,7 @@ def test_a_joint_fault_ends_a_grip(make, how, name, within):
     "mode", ["current-based position", pytest.param("current", marks=pytest.mark.extended)]
 )
 def test_grips_turns_stops_and_pushes_cause_no_false_alarm(make, mode):
-    """Grips last long, and joints are at a stop, on an object, or pushed away from their goals."""
+    """Long grips, with joints at a stop, on an object, or pushed away from their goals."""
     daemon = make(servos={"mode": mode})
     hand: Any = daemon.hand
     command(daemon, "arm")

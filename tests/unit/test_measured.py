@@ -40,7 +40,7 @@ WEIRD = 1e6  # N/m²; no model predicts this force: F = WEIRD d^1.8 A^0.2 cos θ
 
 
 def weird(d: float, theta: float) -> np.ndarray:
-    """Return a blunt pressure peak with the given force that moves half as far as for springs."""
+    """Return a blunt peak with the given force, which moves half as far as a spring tip's."""
     x, y = np.meshgrid(*(pitch * (np.arange(32) - 15.5) for pitch in TRUE.pitches))
     x, y = x - TRUE.centre[0], y - TRUE.centre[1]
     c, s = math.cos(TRUE.rotation), math.sin(TRUE.rotation)

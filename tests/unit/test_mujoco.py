@@ -1,4 +1,4 @@
-"""Test soft tips in MuJoCo against the contact table, and a grip against our own plant."""
+"""Test soft tips in MuJoCo against the contact table, and a grip against softfinger's plant."""
 
 import math
 import re

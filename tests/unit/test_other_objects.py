@@ -114,7 +114,7 @@ def test_a_declared_sheet_is_not_mistaken_for_a_missing_object():
 
 
 def test_a_small_disc_is_not_mistaken_for_another_tip():
-    """The disc's misfit hides more than half of d, although no declared uncertainty covers it."""
+    """The disc causes a misfit that could change d by more than half."""
     with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
         rig.grasp(8.0)
         assert rig.state.mode == "holding"

@@ -105,7 +105,7 @@ def test_a_disc_is_touched_in_the_direction_of_its_centre():
 
 
 def springs_on_a_cylinder(d, theta, curved):
-    """Return force and energy of the springs under a cylinder, relative to those under a plane."""
+    """Return force and energy of springs under a cylinder, divided by the values for a plane."""
     away = RADIUS - d + curved
     centre = away * np.array([math.sin(theta), math.cos(theta)])
     x = np.linspace(-RADIUS, min(RADIUS, centre[0] + curved), 50_001)

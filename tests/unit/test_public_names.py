@@ -128,7 +128,7 @@ def test_the_site_finds_inherited_methods_and_fields():
         assert {each for each in dir(getattr(softfinger, cls)) if each[0] != "_"} <= methods
         grasp = package[cls].all_members["grasp"]
         assert str(grasp.returns) == "None"
-        assert grasp.docstring.value.startswith("Close and grip with ``force`` [N]")
+        assert grasp.docstring.value.startswith("Close the fingers and grip with ``force`` [N]")
     told = package["HandState"].docstring.value
     assert told == inspect.getdoc(softfinger.HandState)
     assert "mode : str\n    disarmed, armed" in told

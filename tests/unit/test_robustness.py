@@ -47,7 +47,7 @@ def test_unknown_hand_parameters_do_not_change_the_force(name, seed):
     ],
 )
 def test_a_falling_zero_offset_is_named_and_the_grip_continues(name, seed):
-    """If readings are clipped at 0, only closing joints show how far the offset has fallen."""
+    """With readings clipped at 0, only the joints' motion shows how far the offset has fallen."""
     found = grip(ROW[name], seed)
     assert found.end == "holding"
     assert found.settled == pytest.approx(1.0, abs=0.2)

@@ -1,6 +1,6 @@
 """Test requirements for every servo backend in each operating mode, simulated and Dynamixel.
 
-The same tests run for both backends; to test another one, add it to ``RIGS``.
+The same tests run for both backends. To test another backend, add it to ``RIGS``.
 """
 
 import math

@@ -28,7 +28,7 @@ def test_a_non_finite_goal_is_a_fault_even_after_a_refused_command(make):
 
 
 def test_joints_are_held_at_their_positions_once_torque_is_on(make):
-    """Switching torque on takes a while, during which the joints may still move."""
+    """While torque is being switched on, the joints may still move."""
     daemon = make()
     daemon.loop.advance(daemon.loop.period)
     command(daemon, "arm")

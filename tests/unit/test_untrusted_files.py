@@ -103,7 +103,7 @@ def begin(file: IO[bytes], frames: int) -> None:
 
 
 def claiming(path: Path) -> None:
-    """Write an array whose header claims 3.5 TiB."""
+    """Write an array whose header states a size of 3.5 TiB."""
     with path.open("wb") as file:
         begin(file, 10**9)
         file.write(bytes(100))

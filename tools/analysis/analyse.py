@@ -114,7 +114,7 @@ _NOISE_RATIO = 1.5  # multiple of tactile.noise above which the noise is reporte
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
-    """Explain a lack of contacts by the maximum reading, the threshold and the likely cause."""
+    """Explain why no contact was found: maximum reading, threshold and likely cause."""
     from softfinger.kinematics.estimation.estimator import PEAK_LEVEL
 
     scale = tactile.pascal_per_count if recording.whole else 1.0
@@ -277,7 +277,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Contacts:
-    """Contacts of one sensor, one row per frame; the keys of ``values`` [SI] are in COLUMNS."""
+    """One sensor's contacts, one row per frame; COLUMNS lists the keys of ``values`` [SI]."""
 
     finger: str
     t: FloatArray

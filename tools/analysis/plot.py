@@ -138,7 +138,7 @@ class RecordedRun:
         return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
 
     def contacts(self) -> dict[str, ContactTable]:
-        """Return the contact table of each finger that touched; raise Missing if none did."""
+        """Return the contact table of each finger that touched; raise Missing if no finger did."""
         if not self.t.size:
             raise Missing("the recording does not contain hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
@@ -277,7 +277,7 @@ def _depths(d: FloatArray) -> FloatArray:
 
 
 def draw_landscape(run: RecordedRun) -> Figure:
-    """Draw paths on U(d, θ) with its minimum over θ, and their height above U(d, 0) versus time."""
+    """Draw paths on U(d, θ) and its minimum over θ; plot their height above U(d, 0) versus time."""
     tables = run.contacts()
     figure = style.new_figure(7.0, 2.2 + 4.0 * len(tables))
     panels = figure.subplots(len(tables) + 1, 1, height_ratios=[*[1.0] * len(tables), 0.4])

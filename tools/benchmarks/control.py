@@ -196,7 +196,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
-    """Return the deviation of each plant from the settings, which is the same for all laws."""
+    """Return each plant's deviations from the settings; all control laws use the same plants."""
     rng = np.random.default_rng(16)
     return [
         {

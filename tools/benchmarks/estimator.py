@@ -2,7 +2,7 @@
 
 All measured functions take turns in one run. All lookups use the same points: |θ| up to 30° and d
 up to 8 mm. Half of the displacements are evenly spaced, and half are logarithmically spaced down to
-1 µm. The reported error is the maximum relative deviation from integrals with many nodes.
+1 µm. The reported error is the maximum relative deviation from quadrature with many nodes.
 
 Each frame has 44 × 44 cells on 58 mm and shows a contact with d = 4 mm and a tilt of 15°. The noise
 is 0.2 % of the modulus. As in the control loop, the estimator is called from Python, for spring

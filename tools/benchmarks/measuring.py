@@ -48,7 +48,8 @@ class Report:
 def attempt(title: str, part: Callable[[], Report]) -> Report:
     """Run one part of a measurement; after an error, return a failed report with the reason.
 
-    The other parts then still run, e.g. if a hand loses its grip on a busy machine.
+    The remaining parts of the measurement still run, e.g. if a hand loses its grip on a busy
+    machine.
     """
     try:
         return part()

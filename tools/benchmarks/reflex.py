@@ -1,6 +1,6 @@
 """Measure how a grip reacts to a sudden load increase.
 
-A 10 N grip carries a standing load along the object faces, away from the palm. A larger load is
+A 10 N grip carries a constant load along the object faces, away from the palm. A larger load is
 then applied and maintained: either a push, or a twist with the same force at the faces. Trials run
 on virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
 object is no longer between the tips. *Slid*: object displacement along its faces. The displacement
@@ -103,7 +103,7 @@ def _table(
 
 
 def row(name: str, found: Sequence[Overload]) -> Row:
-    """Return the percentage of held objects, their maximum slide, and the reaction times."""
+    """Return the percentage of held objects, their maximum displacement, and the reaction times."""
     answers = [1e3 * each.answer for each in found if math.isfinite(each.answer)]
     times: Row = figure(name, "ms", answers, _RESPONSE_AIM) if answers else {"name": name}
     held = [each for each in found if not each.lost]

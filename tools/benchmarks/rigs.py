@@ -148,7 +148,7 @@ class CannedSensor(_Canned):
 
 
 def can(daemon: Daemon) -> None:
-    """Replace a daemon's backends with canned ones, so that only the tick itself is timed.
+    """Replace a daemon's backends with canned backends, so that only the tick itself is timed.
 
     The canned backends repeat the next frames and the last reading. Several frames are used,
     because the daemon would detect a single repeated frame as a frozen sensor.

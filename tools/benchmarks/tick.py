@@ -60,7 +60,7 @@ def _simulated(title: str, seconds: int) -> Report:
 
 
 def _in_turns(title: str, rounds: int) -> Report:
-    """Measure only the pipeline: back to back, with and without subscribers; in place, at 3 rates.
+    """Measure only the pipeline: back to back with or without subscribers, or in place at 3 rates.
 
     SCHED_FIFO is used if permitted.
     """
@@ -119,7 +119,7 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
 
 
 def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Measure ticks over ptys during a hold, and the servo exchanges separately, alternately.
+    """Measure ticks over ptys during a hold, alternating with the servo exchanges alone.
 
     A ``baud`` of 0 disables pacing, and ``changes`` override the profile. Raises RigError if the
     hand loses its grip, e.g. on a busy machine.

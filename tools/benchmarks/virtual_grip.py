@@ -74,8 +74,8 @@ class VirtualGrip(SimulatedDaemon):
     def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:
         """Build daemon and hand.
 
-        ``hand`` contains the hand's settings if they differ. ``torque`` is the true torque constant
-        divided by the one in the settings.
+        ``hand`` contains the hand's settings if they differ from the daemon's settings. ``torque``
+        is the true torque constant divided by the configured value.
         """
         self.alarms: list[tuple[float, str]] = []  # (time [s], kind) of warnings and errors
         super().__init__(merged(daemon, {}), None if hand is None else merged(hand, {}))
@@ -120,7 +120,7 @@ class VirtualGrip(SimulatedDaemon):
             self.plant.apply_fault(event._replace(after=self.state.t + event.after))
 
     def watched(self, asked: float) -> Watch:
-        """Start to record each tick, and return the `Watch`."""
+        """Start recording each tick, and return the `Watch`."""
         watch, hand, state = Watch(asked), self.plant, self.state
         self.look = lambda: watch.see(
             state.t, hand.force.tolist(), hand.object_pose[:2].tolist(), state.torque

@@ -209,7 +209,7 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
 
     The sensor gain changes whenever the sensor is remounted, and the tip modulus may be known only
     roughly. Gain and modulus are estimated during a grip (`daemon.perception.hand_state`). A daemon
-    that starts with these factors reaches the correct force in its first grip.
+    that starts with the stored factors reaches the correct force in its first grip.
 
     Raises
     ------

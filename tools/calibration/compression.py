@@ -1,7 +1,7 @@
 """Calibrate a tip's material law from test machine CSV files: `calibrate law --compression`.
 
-A file contains either displacement and force, with the tilt in a column or from ``--theta``, or
-strain and stress.
+A file contains strain and stress, or displacement and force. With displacement and force, the tilt
+is in a column or given by ``--theta``.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def _is_number(cell: str) -> bool:
 
 @dataclass(frozen=True)
 class _Test:
-    """A test run, with its name for messages."""
+    """A test run, and its name in messages."""
 
     name: str
     run: Run

@@ -208,7 +208,7 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Tabulate the quantity versus d up to 8 mm at each tilt, with ratios to θ = 0 and exponents.
+    """Tabulate the quantity, its ratio to θ = 0, and exponents versus d up to 8 mm at each tilt.
 
     Ratios and exponents are computed from the double integral, so that they do not depend on the
     closed form. The exponents for Table I's law are computed from its own integral.

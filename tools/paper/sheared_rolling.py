@@ -1,7 +1,7 @@
-"""Explain the minimum slightly before 0° (Sec. IV-B): part of the rolling motion shears the tip.
+"""Explain the minimum slightly before 0° (section IV-B): part of the rolling shears the tip.
 
-The finger is tilted to −11.5°. Then the object rolls to 9.2° at constant displacement d. A fraction
-s of the face motion is not followed by rolling and shears the tip by
+The finger is tilted to −11.5°. From this tilt, the object rolls to 9.2° at constant displacement d.
+The tip does not follow a fraction s of the face motion by rolling. This fraction shears the tip by
 
     ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
 

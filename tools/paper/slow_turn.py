@@ -1,7 +1,7 @@
-"""Compute quasi-static manipulation (Sec. V) from equations and compare with the simulated hand.
+"""Compute quasi-static manipulation (section V) and compare it with the simulated hand.
 
-Both tips consist of the paper's springs and stick to the object. The model does not include any
-other friction. For a tip with shear ζ
+Both tips consist of the paper's springs and stick to the object. Apart from the sticking tips, the
+model is frictionless. For a tip with shear ζ
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
@@ -9,8 +9,8 @@ The shear rate is the rolling speed minus two other terms: the speed along the f
 component along a tilted face due to increasing d. s, d and θ are defined in
 `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium if Σ δU = 0
 for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ +
-T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies this condition. `turned` solves this
-condition step by step, without time, mass or damping.
+T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies the equilibrium condition, which
+`turned` solves step by step, without time, mass or damping.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def swing() -> list[dict[str, float]]:
     """Rotate the object in the simulated hand back and forth; return one row every 20 ms.
 
     The holding force deviates by a few percent from `FORCE`. ΣU and T are therefore scaled to
-    `FORCE`, since ΣU is proportional to F^(3/2) and T to F.
+    `FORCE`, because ΣU is proportional to F^(3/2) and T to F.
     """
     sections: dict[str, dict[str, Any]] = {
         "material": {"law": "constant", "modulus": MODULUS},

@@ -1,6 +1,6 @@
 """Compile a scene's kernels on all cores, for ``softfinger compile`` and first starts.
 
-The daemon then only loads the kernels, which keeps its memory use small. Each process compiles one
+The daemon itself only loads the kernels and therefore uses less memory. Each process compiles one
 pipeline part (`loop.warm_up`) after another. Parts that need the contact table wait for it.
 """
 

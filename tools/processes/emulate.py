@@ -138,7 +138,7 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT, SIGTERM or SIGHUP. Return 1 after a message if the set-up fails."""
+    """Emulate until SIGINT, SIGTERM or SIGHUP. If the setup fails, print a message and return 1."""
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder with --dir")
@@ -214,7 +214,7 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def _ready(ports: dict[str, Path]) -> str:
-    """Return the output of a ready emulator as one text, since readers may wait for its end."""
+    """Return the output of a ready emulator as one text, because readers may wait for its end."""
     return "".join(["ready\n", *(f"{name}: {path}\n" for name, path in ports.items())])
 
 

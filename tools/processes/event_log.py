@@ -3,7 +3,7 @@
 A stopped terminal (Ctrl-S), a full pipe or a full disk blocks writes. Therefore ticks never write,
 and lines that cannot be written are dropped.
 
-Plain lines are intended for people. With ``form="json"``, each line is an object with the fields
+Plain lines are for human readers. With ``form="json"``, each line is an object with the fields
 ``timestamp`` (Unix time [s] at which the line was queued), ``level`` (``info``, ``warning``,
 ``error``), ``kind`` and ``text``, as in ``hand/event``. Numbers are in additional fields. In
 systemd's journal, each line has a priority.
@@ -30,7 +30,7 @@ _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warnin
 
 
 class EventLog:
-    """Log that is readable by people or programs; the ``line`` method never blocks or fails.
+    """Log in plain text or JSON; the ``line`` method never blocks or fails.
 
     Lines are appended to an existing ``file``. Raises OSError if the file cannot be opened.
     """

@@ -88,10 +88,10 @@ class Recording:
 
     ``counts`` (number of messages by channel), ``start`` and ``end`` (Unix time [s], NaN if empty)
     are read from the summary at the end of the file. If the summary is incomplete, or if there are
-    other programs' channels, the whole file is read once instead. A killed recorder leaves a file
-    without an end, which is marked ``truncated``. Corrupted chunks are skipped. Messages in other
-    programs' channels are ignored; ``others`` counts them. ``say`` is called once for each of these
-    findings.
+    other programs' channels, the whole file is read once instead. If the recorder was killed, the
+    file has no end and is marked ``truncated``. Corrupted chunks are skipped. Messages in other
+    programs' channels are ignored; ``others`` counts them. ``say`` is called once for each kind of
+    problem found.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
@@ -141,7 +141,7 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last message [s], or 0 if empty."""
+        """Time from the first to the last message [s], or 0 for an empty recording."""
         return 0.0 if math.isnan(self.start) else self.end - self.start
 
     @property
@@ -315,7 +315,7 @@ class Recording:
             self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
-        """Check the file's end; return the header's profile, or PROFILE if it is unreadable."""
+        """Check the file's end; return the profile in the header, or PROFILE without a header."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Header
 

@@ -108,8 +108,8 @@ class RecordingWriter:
         """Write one message, possibly modifying its map. Raises RecordingError.
 
         A repeated message (``again``) contains its original time, which precedes the recording. To
-        keep all log times within the recording, its log time is set to the log time of the previous
-        message.
+        keep all log times within the recording, the repeated message gets the previous message's
+        log time.
         """
         assert not self._ended
         stamp = message.get("timestamp")
@@ -126,7 +126,7 @@ class RecordingWriter:
         self._write(topic, message, when)
 
     def flush(self) -> None:
-        """End the chunk and pass it to the system, so that it is safe if this process is killed."""
+        """End the chunk and pass it to the system, which keeps it if this process is killed."""
         try:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._wrote()

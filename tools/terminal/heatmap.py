@@ -135,7 +135,7 @@ class FullScale:
         self.value = smallest
 
     def follow(self, peak: float, now: float) -> float:
-        """Update the scale with the signal's ``peak`` at time ``now`` [s]; return its end."""
+        """Update the scale with the signal's ``peak`` at time ``now`` [s]; return full scale."""
         end = max(self._smallest, round_up(peak)) if peak > 0.0 else self._smallest
         if end >= self.value:
             self.value = end

@@ -1,8 +1,8 @@
 """Run ``softfinger monitor``, which shows a live page about the hand in the terminal.
 
 This module parses the arguments, handles keys and signals, and redraws the page. If the output is
-not a terminal, it prints plain lines. `stream_state` collects the data and `monitor_page` draws the
-page.
+not a terminal, the monitor prints plain lines. `stream_state` collects the data and `monitor_page`
+draws the page.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class HandKeys:
         return self._feed.mode in _GRIPPING
 
     def _adding(self, now: float) -> bool:
-        """Return True shortly after a force key, when the stream may not have the new force yet."""
+        """Return True shortly after a force key; the stream may still contain the old force."""
         reply = self._commander.reply
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
         return now - self._pressed < _ACCUMULATION_TIME and not refused
@@ -112,7 +112,7 @@ class HandKeys:
             self._commander.send(now, label, "grasp", force=self._chosen)
 
     def _rotate(self, step: float, now: float) -> None:
-        """Rotate by one step from the last target, not the current angle, so presses add up."""
+        """Rotate by one step from the last target angle, so that repeated key presses add up."""
         reply, pose = self._commander.reply, self._feed.state.object
         refused = reply is not None and not reply.ok
         if self._target is None or refused or self._feed.mode not in ("rotating", "holding"):

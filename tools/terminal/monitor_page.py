@@ -300,7 +300,7 @@ class MonitorPage:
         return lines + [Text() for _ in range(count - len(lines))]
 
     def _footer(self, width: int) -> Text:
-        """List the keys; on a narrow terminal, only those that are useful in the current mode."""
+        """List the keys; a narrow terminal shows only keys that are useful in the current mode."""
         if not self.keys:
             return Text(" no keyboard input: send commands with softfinger send", DIM)
         force = f"{self.force:.3g} N" if math.isfinite(self.force) else "N"

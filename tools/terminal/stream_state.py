@@ -115,9 +115,9 @@ class ShownEvent(NamedTuple):
 class StreamState:
     """Process stream messages and store the data that a page shows.
 
-    In all methods ``now`` is monotonic time [s]. ``events`` are sorted by time of occurrence. After
-    a late subscription, this order differs from the order of arrival, in which `news` returns the
-    events.
+    In all methods ``now`` is monotonic time [s]. ``events`` are sorted by time of occurrence,
+    whereas `news` returns events in the order of arrival. The two orders differ after a late
+    subscription.
     """
 
     def __init__(self) -> None:
@@ -325,8 +325,8 @@ class Commander:
 
     Each command uses its own request socket, so a missing reply does not delay other commands. If
     the same user runs the daemon on this machine, a stop bypasses the requests of all clients. The
-    daemon replies on the next tick. If the daemon is stalled, the client waits for this reply only
-    briefly.
+    daemon replies on the next tick. If the daemon is stalled, the client waits only briefly for the
+    reply to a stop.
     """
 
     OPEN_LIMIT = 8  # maximum number of open commands; further commands are dropped, except stop

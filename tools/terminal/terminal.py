@@ -1,4 +1,4 @@
-"""Control the terminal for a full-screen page: screen modes, key decoding, output, restoring.
+"""Control the terminal of a full-screen page: screen modes, key decoding, output, restoration.
 
 A redraw sends all changed lines in a single write operation, which is fast over ssh and avoids
 flicker.
@@ -64,7 +64,7 @@ class KeyDecoder:
         return [key for key in known if key]
 
     def settle(self) -> None:
-        """Drop an incomplete key if no more bytes are queued, for example after a single Escape."""
+        """Drop an incomplete key code if no more bytes are queued, e.g. after a single Escape."""
         if not self._rest.startswith(b"\x1b[200~"):
             self._rest = b""
 

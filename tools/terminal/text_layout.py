@@ -16,7 +16,7 @@ DIM = "#8b929c"
 
 
 def plain_table(*, heads: bool = True) -> Table:
-    """Create a table without rules, whose columns are separated by two blanks."""
+    """Create a table without rules and with two blanks between columns."""
     return Table(box=None, padding=(0, 2, 0, 0), show_header=heads)
 
 

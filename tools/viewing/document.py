@@ -1,4 +1,4 @@
-"""Put the page's parts together in one document, for the server or with a recording in it."""
+"""Combine the page's parts into one document, for the server or with an embedded recording."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Compute lines for drawings: fingers, soft tips, object, forces, and footprints on frames.
 
 Coordinates are in the hand's plane [m]: x from the left to the right pivot, y away from the palm. A
-tip's own axes are x along its base and z normal to the base. In these axes the object's face is
-``x sin θ + z cos θ = a − d``. `hand.geometry` computes the tip positions.
+tip's own axes are x along its base and z normal to the base. In the tip's own axes, the object's
+face is ``x sin θ + z cos θ = a − d``. `hand.geometry` computes the tip positions.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Serve the ``softfinger view`` page, its pictures and its commands on the loopback interface.
 
 A single thread serves the pages. The main thread reads the stream or plays a recording, and creates
-each picture once for all pages. A page requests the next picture after drawing the last one, so a
-slow page skips pictures without delaying the others. The terminal prints a token. Pages with this
-token may send commands, and each page is a separate client.
+each picture once for all pages. A page requests the next picture after drawing the last picture, so
+a slow page skips pictures without delaying other pages. The terminal prints a token. Pages with
+this token may send commands, and each page is a separate client.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _say = to_stderr("view")
 
 
 class _Published(NamedTuple):
-    """Picture, with the other data that a page needs."""
+    """Picture, with additional data for the page."""
 
     scene: str
     picture: str
@@ -72,8 +72,8 @@ class Site:
     """Serve the page, its pictures and commands, and Foxglove clients.
 
     Requests must name this server as their host. A browser's requests must also come from this
-    server's pages. The first rule blocks DNS rebinding, in which the host has another name. The
-    second rule blocks requests from other sites' pages, which have another origin. Pages with the
+    server's pages. The host rule blocks DNS rebinding, in which the host has another name. The page
+    rule blocks requests from other sites' pages, which have another origin. Pages with the
     ``token`` may send commands through ``send``. All pages may control a recording's playback
     through ``wish``. If other machines can reach the server, the token is required even for
     watching. A browser then obtains the token with a one-time code.
@@ -157,7 +157,7 @@ class Site:
         await asyncio.gather(*others, return_exceptions=True)
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the page or a refusal, or None to accept a WebSocket."""
+        """Return the HTTP response (page or refusal), or None to accept a WebSocket connection."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         path, upgrade = urlsplit(request.path).path, "Upgrade" in request.headers
         known = [[], *([f"http://{host}"] for host in hosts)]
@@ -210,7 +210,7 @@ class Site:
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Send a page the next picture each time it requests one, together with the missing rows.
+        """Send a page the next picture and the missing rows, each time it requests a picture.
 
         A new scene is sent before the picture.
         """

@@ -324,7 +324,7 @@ class Pictures:
         return {"lines": lines, "texts": texts}
 
     def _maps(self, now: float) -> dict[str, Any]:
-        """Draw each tip's frame with its rim, and the contact's footprint and centroid."""
+        """Draw each tip's pressure frame and rim, and the footprint and centroid of its contact."""
         frames, tip = self.feed.frames, self._settings.tip.radius
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)

@@ -55,7 +55,7 @@ def _pictures(
 ) -> tuple[list[tuple[str, list[str]]], str, int]:
     """Return each scene with its pictures, all plot rows, and the number of states.
 
-    All of them are JSON, as the server sends them to a page.
+    All results except the number are JSON texts in the form that the server sends to a page.
     """
     scenes: list[tuple[str, list[str]]] = []
     kept: dict[int, str] = {}

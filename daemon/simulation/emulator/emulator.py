@@ -3,9 +3,9 @@
 On a busy machine, the emulator and the daemon wait for each other, unless the daemon's
 ``loop.clock`` is ``real``; see `EmulatorClock`.
 
-One thread runs one event loop, which waits for bytes on the servo pty or for the next event. It
-serves the servos first, then does at most one slower task (a physics step or a frame) before it
-checks for bytes again.
+One thread runs one event loop, which waits for bytes on the servo pty or for the next event. The
+loop serves the servos first, then does at most one slower task (a physics step or a frame) before
+it checks for bytes again.
 """
 
 from __future__ import annotations
@@ -74,13 +74,13 @@ class EmulatorError(SoftfingerError):
 
 
 class EmulatorClock:
-    """Clock of the emulated hand: real time from 0, without interruptions of the emulator process.
+    """Clock of the emulated hand: real time since the start, minus interruptions of the emulator.
 
     If interruptions were included, a process that was stopped for a minute would have to simulate
     that minute and could not reply in the meantime. A daemon whose own clock pauses while the
-    machine is busy sets deadlines. While such a daemon uses the ``servos`` and their torque is on,
-    the emulator clock advances from one deadline to the next by the same amount as the daemon
-    clock, within `_AHEAD_TIME`.
+    machine is busy sets deadlines. While a daemon that sets deadlines uses the ``servos`` and their
+    torque is on, the emulator clock advances from one deadline to the next by the same amount as
+    the daemon clock, within `_AHEAD_TIME`.
     """
 
     pauses_when_late = False
@@ -126,7 +126,7 @@ class EmulatorClock:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedServos:
-    """Emulated servo options that are not part of the settings."""
+    """Options of the emulated servos that are not part of the settings."""
 
     baud: int = 0  # 0: reply immediately at any baud rate
     factory: bool = False  # factory defaults except for IDs and baud rate
@@ -151,7 +151,8 @@ class Emulator:
     ) -> None:
         """Create the hand, which does not respond until :meth:`run` is called.
 
-        Signal handlers must not raise during this call, because files would be left behind.
+        Signal handlers must not raise exceptions during this call, because files would be left
+        behind.
 
         Parameters
         ----------
@@ -241,7 +242,7 @@ class Emulator:
         self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Serve the ports until :meth:`end`; call ``on_ready`` once all parts respond."""
+        """Serve the ports until :meth:`end` is called; call ``on_ready`` once all parts respond."""
         ready = False
         while not self._stopping:
             self._turn()
@@ -255,7 +256,7 @@ class Emulator:
         return find_ports(self._links.path)
 
     def end(self) -> None:
-        """End :meth:`run`. Signal handlers and other threads may call this."""
+        """End :meth:`run`. Signal handlers and other threads may call this method."""
         self._stopping = True
         with contextlib.suppress(OSError):
             os.write(self._wake[1], b"x")
@@ -315,11 +316,12 @@ class Emulator:
     def request(self, text: str) -> str:
         """Handle words from the control socket; return ``ok`` or ``error: `` with the reason.
 
-        Words are faults, with times relative to now, or these requests:
+        Each word is a fault, whose times are relative to the current time, or one of these
+        requests:
 
         - ``report``: the reply is :meth:`report` as JSON.
         - ``forget``: clear the bus record.
-        - ``place``: move the object back to its start pose with no velocity or load, and remove
+        - ``place``: move the object back to its start pose, at rest and without load, and remove
           plates.
         - ``press …`` (first word): see :meth:`press`.
         - ``turn …`` (first word): see :meth:`turn`.
@@ -353,7 +355,7 @@ class Emulator:
         """Start the presses in ``text``; return their state as JSON or ``error: `` with a reason.
 
         The JSON object contains ``wait``, the remaining time until the last press is reached [s].
-        An empty text only queries this state.
+        If the text is empty, no press is started, and the state is returned.
         """
         now = self.clock.now()
         if text.strip():

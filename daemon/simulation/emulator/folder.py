@@ -191,7 +191,7 @@ def carry_out(folder: Path, text: str) -> str:
     Raises
     ------
     NoEmulator
-        If no emulator runs there, or if it does not reply.
+        If no emulator is running in the folder, or if the emulator does not reply.
     Refused
         If the emulator rejects the text; the message lists the expected words.
     """
@@ -216,7 +216,7 @@ def send_words(folder: Path, text: str) -> str:
     Raises
     ------
     NoEmulator
-        If no emulator is running there or it does not respond.
+        If no emulator is running in the folder, or if the emulator does not reply.
     """
     try:
         with _directory(folder) as descriptor:
@@ -243,5 +243,5 @@ def _directory(folder: Path) -> Iterator[int]:
 
 
 def _address(folder: int) -> str:
-    """Return the socket's address via the folder's descriptor; paths are limited to 107 bytes."""
+    """Return the socket's address via the folder's descriptor, because long paths are invalid."""
     return f"/proc/self/fd/{folder}/{_CONTROL}"

@@ -46,7 +46,7 @@ class PlatePress:
     """Press to ``d`` [m] at ``theta`` [rad], or with uniform ``pressure`` [Pa] on all cells.
 
     ``force`` [N] is the resulting force on the tip base. The press is held for ``hold`` [s], or
-    until the next command if this is inf.
+    until the next command if ``hold`` is inf.
     """
 
     d: float
@@ -74,7 +74,7 @@ def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, lis
 
     Each press has either a depth (0 lifts off), a force or a pressure (uniform, like a bladder).
     Optional words are tilt, speed, hold, and tip (left, right or both; default both). If ``hold``
-    is not given, the last press is held and each of the others lasts one second. Forces are
+    is not given, the last press is held and every earlier press lasts one second. Forces are
     ``scale`` times the ``table`` forces. Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
@@ -133,7 +133,7 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
 
 
 class Plate:
-    """Plate above one tip. Its path is piecewise linear in the hand's time [s]."""
+    """Plate above one tip. The plate's path is piecewise linear in the hand's time [s]."""
 
     def __init__(self) -> None:
         self._t = [0.0]

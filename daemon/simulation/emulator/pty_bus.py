@@ -39,7 +39,8 @@ _LAG_TIME = 0.0005
 def open_pty() -> tuple[int, int, str]:
     """Open a pty; return its non-blocking master, the raw slave for clients, and the slave path.
 
-    The slave stays open here, so that clients can connect and disconnect without an error.
+    The slave stays open in this process, so that clients can connect and disconnect without an
+    error.
     """
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -100,7 +101,7 @@ class PtyServoBus:
         self._master, self._slave, self.path = open_pty()
 
     def unplug(self) -> None:
-        """Remove the terminal, as if an adapter were unplugged; the servos continue."""
+        """Remove the terminal, as if an adapter were unplugged; the servos keep running."""
         self._due.clear()
         self.bus.parser.reset()
         if self.plugged:
@@ -120,7 +121,7 @@ class PtyServoBus:
             self.bus.fault(kind, value, t)
 
     def client_baud(self) -> int:
-        """Return the baud rate of the terminal."""
+        """Return the terminal's baud rate."""
         raw = bytearray(_TERMIOS2.size)
         fcntl.ioctl(self._master, _TCGETS2, raw, True)
         return int(_TERMIOS2.unpack(raw)[-1])

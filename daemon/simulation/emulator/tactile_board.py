@@ -172,7 +172,7 @@ class TactileBoard:
         return self._due
 
     def service(self, t: float) -> None:
-        """Send the newest frame if a new one is due at time t [s]."""
+        """Send the newest frame if a new frame is due at time t [s]."""
         if self.plugged:
             self._writer.flush()
         # The due time may be rounded up or down.
@@ -225,7 +225,7 @@ Encode = Callable[[NDArray[np.uint16], int, float], bytes]
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """Framing of a board and the byte that requests a frame (empty if it sends continuously)."""
+    """Framing of a board, and its frame request byte (empty if it needs no requests)."""
 
     encode: Encode
     request: bytes = b""

@@ -1,11 +1,11 @@
 """Compute the plant energy, and prevent integration steps from creating energy.
 
-With smooth forces, the integration error is small and decreases with the step size. With non-smooth
-forces (for example, when a light object hits the stiff rim of the backing plate) or an excessively
-long step, the energy could increase by more than the work of the motors and loads. In these cases,
-the guard removes the excess from the kinetic energy. If the kinetic energy is smaller than the
-excess, the motion stops at an earlier point of the step. Without damping, the energy should be
-constant; the method's small drift is then allowed in smooth steps.
+With smooth forces, the integration error is small and decreases with the step size. If forces are
+not smooth (for example, when a light object hits the stiff rim of the backing plate) or a step is
+too long, the energy could increase by more than the work of the motors and loads. The guard removes
+any excess energy from the kinetic energy. If the kinetic energy is smaller than the excess, the
+motion stops at an earlier point of the step. Without damping, the energy should be constant; the
+method's small drift is then allowed in smooth steps.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def is_on_rim(plant: Plant) -> bool:
 
 @inner_kernel
 def open_guard(plant: Plant) -> None:
-    """Accept the current energy if it was changed from outside since the last step."""
+    """Accept the current energy if the state was changed externally since the last step."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy

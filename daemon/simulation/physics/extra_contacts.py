@@ -13,7 +13,8 @@ by a rigid plane, with d = a − D/2, where D is the distance between the centre
 both tips is U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With
 different tilts, a real contact surface would bulge towards the softer tip, so this energy is
 slightly too high (second order in the difference of cos² θ). The plane sticks equally to both tips:
-each tip shears by half of the relative sliding of their surfaces, minus its tan θ ḋ.
+the shear rate of each tip is half of the relative sliding velocity of the two surfaces, minus the
+tip's tan θ ḋ.
 """
 
 from __future__ import annotations
@@ -215,7 +216,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
 def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
     """Add the tip-to-tip torques if the tips are close or there is no object.
 
-    In the first stage, this function also sets their rows in the full matrix.
+    In the first stage, this function also sets the tips' rows in the full matrix.
     """
     near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
     touching = near and tip_on_tip(plant, table, now, stage)

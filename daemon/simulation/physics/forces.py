@@ -54,8 +54,8 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 def set_motor_slopes(plant: Plant, g: float) -> None:
     """Set the motor torque derivatives (angle and velocity), divided by (τ + g).
 
-    The derivatives are 0 unless the motors are stiff relative to a step ``g``. They are upper
-    bounds, since the current may enter or leave its limits within the step.
+    The derivatives are 0 unless the motors are stiff relative to a step ``g``. The derivatives are
+    upper bounds, because the current may enter or leave its limits within the step.
     """
     p, goals = plant.parameters, plant.goals
     constant = p.torque_constant
@@ -122,10 +122,10 @@ def friction_level(plant: Plant, finger: int, rate: float, current: float) -> fl
 def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
     """Return a joint's bristle torque [N·m] and set the bristle damping as the joint's drag.
 
-    Elastic bristles with deflection z connect the gears and slip at the friction level f. This is
-    the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE Trans. Automatic
-    Control 47(5), 2002), with the same deflection z_p = ``presliding`` for break-away and steady
-    slip:
+    Elastic bristles with deflection z connect the gears and slip at the friction level f. The
+    bristles follow the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE
+    Transactions on Automatic Control 47(5), 2002), with the same deflection z_p = ``presliding``
+    for break-away and steady slip:
 
         torque = f z/z_p    ż = q̇ while |z| ≤ z_p
 

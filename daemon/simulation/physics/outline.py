@@ -86,8 +86,8 @@ def rim_on_plane(p: Parameters, tip: TipContact) -> float:
 def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
     """Evaluate the rim on a disc like :func:`rim_on_plane`, with one spring for the plate chord.
 
-    ``away`` is the distance between the disc and tip centres. The depth is the disc radius minus
-    the distance of the disc centre from the chord, which is smooth.
+    ``away`` is the distance between the disc and tip centres. The depth, which is the disc radius
+    minus the distance of the disc centre from the chord, is a smooth function.
     """
     across = away * tip.sine
     up = away * tip.cosine

@@ -71,8 +71,8 @@ def bounded(value: float, limit: float) -> float:
 def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
     """Add the motors to the load; set the currents of ``k``, without the effect of the solution.
 
-    A current lags behind its reference: i' = (r(q, ω) − i)/τ. Its rate k decreases by (r_q g + r_ω)
-    g/(τ + g) per unit of acceleration; the matrix contains this term.
+    A current lags behind its reference: i' = (r(q, ω) − i)/τ. The current's rate k decreases by
+    (r_q g + r_ω) g/(τ + g) per unit of acceleration; the matrix contains this term.
     """
     p = plant.parameters
     lag = p.electric_time
@@ -215,7 +215,7 @@ def store_bristles(plant: Plant) -> None:
 
 @inner_kernel
 def senses_other_tip(plant: Plant, finger: int) -> bool:
-    """Return True if a tip senses the other tip because that contact is stronger."""
+    """Return True if a tip senses the other tip rather than the object."""
     if not plant.tips_may_touch:
         return False
     stage = plant.stages[0]

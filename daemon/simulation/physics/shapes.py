@@ -70,7 +70,7 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
 
     The corners may refer to any origin; they are shifted so that the centre of mass is at 0. The
     area integrals are closed-form sums over the triangles between the centre and each edge. Raises
-    ValueError if the outline is not such a polygon.
+    ValueError if the outline is not a convex polygon with 3 to 8 corners.
     """
     points = np.array(corners, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or not 3 <= len(points) <= CORNERS:

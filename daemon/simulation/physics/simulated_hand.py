@@ -201,11 +201,12 @@ class SimulatedHand:
 
     ``settings.scene.fingers`` selects the tips. With one finger, the object is fixed to the test
     bench, as in a compression test. Without servos (``settings.servos.backend`` is ``none``), the
-    joints stay at ``settings.hand.open_angle``. In this case, if ``simulation.compression_speed``
-    is above 0, the object moves back and forth between both tips and compresses each by 0.4 radii.
+    joints stay at ``settings.hand.open_angle``. If there are no servos and
+    ``simulation.compression_speed`` is above 0, the object moves back and forth between both tips
+    and compresses each tip by 0.4 radii.
 
-    The array attributes are views of the state with shape (2,), left finger first. They are valid
-    until the next call to ``advance``.
+    The array attributes are views of the state with shape (2,), left finger first. These views are
+    valid until the next call to ``advance``.
     """
 
     def __init__(
@@ -309,7 +310,7 @@ class SimulatedHand:
         self._run(0)
 
     def place_object(self) -> None:
-        """Move the object back to its start pose with no velocity or load."""
+        """Move the object back to its start pose, at rest and without load."""
         self.object_pose[:], self.object_velocity[:] = self._first_pose, 0.0
         self.load()
         self.refresh()
@@ -353,8 +354,8 @@ class SimulatedHand:
     def load(self, push: float = 0.0, twist: float = 0.0) -> None:
         """Apply a permanent ``push`` [N] and ``twist`` [N·m] to the object; zeros remove the load.
 
-        The push acts along the faces, away from the palm. Its direction stays the same when the
-        object rotates.
+        The push acts along the faces, away from the palm. The direction of the push stays the same
+        when the object rotates.
         """
         angle = self.object_pose.item(2)
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)

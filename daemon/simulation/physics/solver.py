@@ -1,4 +1,6 @@
-"""Solve the linear equations of a step by L D Lᵀ factorisation. ``g`` is γh of `plant`.
+"""Solve the linear equations of a step by L D Lᵀ factorisation.
+
+``g`` is the product γh from `plant`.
 
 The matrix always includes the tip contacts with the object. Extra rows are added for the object on
 the palm and for tip-to-tip contact.
@@ -45,7 +47,7 @@ def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract g K r from the load; K is the first stage's, r are positions and shears in ``k``."""
+    """Subtract g K r from the load: first-stage stiffness K, positions and shears r in ``k``."""
     for finger in range(2):
         tip = plant.stages[0].on_object[finger]
         rows, stiffness = tip.rows, tip.stiffness
@@ -135,7 +137,7 @@ def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract the extra rows' g K r from the load; r are positions and extra shears in ``k``."""
+    """Subtract the extra rows' g K r from the load: positions and extra shears r in ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.stiffness == 0.0:

@@ -21,35 +21,35 @@ terms can therefore be tested with ``"bristles"``, a tip without these terms.
 
 The tip touches the nearest point of the object. On a face, the contact direction is the face
 normal. At a corner, the direction is that of the line to the corner, as for a plane normal to that
-line. On a disc, it is the line to the centre. A disc's axis is normal to the hand plane, so its
-face is curved about one axis only, with radius R. To leading order in d, the spring model's contact
-with a disc differs in two ways from its contact with the tangent plane. First, the footprint is
-narrower along the tilt by the factor κ² = R/(R + a), because the curvatures add to 1/a + 1/R.
-Second, force and energy are κ times those of the plane for any θ. For a constant modulus, a = 20 mm
-and d up to 8 mm, integrals over the springs agree with these factors to within 1.6 % upright and
-4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9 % for R = 10 mm. The sensor frame is
-computed from the springs (`sensor.sensor_model`), so the sum of its cells differs from the force by
-the same amount. The force of a solid tip is proportional to d^(3/2) and √κ, as in Hertz's theory
-for a sphere on a cylinder in the limit of small d. The frame of a solid tip is that of a plane
-multiplied by √κ.
+line. On a disc, the direction is that of the line to the centre. A disc's axis is normal to the
+hand plane, so its face is curved about one axis only, with radius R. To leading order in d, the
+spring model's contact with a disc differs in two ways from its contact with the tangent plane.
+First, the footprint is narrower along the tilt by the factor κ² = R/(R + a), because the curvatures
+add to 1/a + 1/R. Second, force and energy are κ times those of the plane for any θ. For a constant
+modulus, a = 20 mm and d up to 8 mm, integrals over the springs agree with these factors to within
+1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9 % for R = 10 mm. The
+sensor frame is computed from the springs (`sensor.sensor_model`), so the sum of its cells differs
+from the force by the same amount. The force of a solid tip is proportional to d^(3/2) and √κ, as in
+Hertz's theory for a sphere on a cylinder in the limit of small d. The frame of a solid tip is that
+of a plane multiplied by √κ.
 
 Coulomb friction limits d_t to the range between the two shears at which |T| = μN. If the model's
 ratio |T|/N can't reach μ (with a constant E and s = 1, its maximum at θ = 0 is 1), the tip slips at
 the maximum ratio. Damping is viscous and proportional to the stiffness of the soft part, so it
 increases as the contact grows.
 
-The shear of a stuck tip may relax by creep and by micro-slip. Both are off by default. In this
-case, a tip sticks or slips as a whole and has no memory. Micro-slip occurs because each spring has
-its own Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed by w = ℓ − h, has the
-pressure Ew/ℓ. When the face has moved by u, the spring has the shear traction Eu/ℓ and slips if u >
-μw. All layers w = 0 … d are equally stiff, since r dr = −ℓ dℓ. Starting from zero shear,
-integration gives
+The shear of a stuck tip may relax by creep and by micro-slip. Creep and micro-slip are off by
+default. Without creep and micro-slip, a tip sticks or slips as a whole and has no memory.
+Micro-slip occurs because each spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² −
+r²), compressed by w = ℓ − h, has the pressure Ew/ℓ. When the face has moved by u, the spring has
+the shear traction Eu/ℓ and slips if u > μw. All layers w = 0 … d are equally stiff, because r dr =
+−ℓ dℓ. Starting from zero shear, integration gives
 
     T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
 
-where the whole tip slips at u = μd. This is an Iwan model with uniformly distributed limits. Its
-layers scale with the footprint. Their mean is the tip's d_t, and their variance adds to d_t² in the
-tip energy.
+where the whole tip slips at u = μd. The layers form an Iwan model with uniformly distributed
+limits. The layers scale with the footprint. The mean of the layer shears is the tip's d_t, and
+their variance adds to d_t² in the tip energy.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def fade(theta: float) -> tuple[float, float]:
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
     """Return the maximum ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of maximum ratio.
 
-    Here, ζ is measured from the shear at which T = 0.
+    In this function, ζ is measured from the shear at which T = 0.
     """
     if friction <= 0.0 or n0 <= 0.0:
         return 0.0

@@ -4,11 +4,12 @@
 profiles ``velostat`` and ``capacitive`` use them.
 
 `sensing.pressure_grid` computes the pressure of a plane face; this module computes the pressure of
-a cylindrical face, as on a disc. Both use the same spring model: above each point of the base, the
-face compresses a vertical spring whose length is the height of the hemisphere. An estimator that
-assumes a plane face interprets the narrower footprint as a smaller d: it finds 0.72 of the true
-value for R = a, and 0.83 for R = 2a. Its θ is 1 % to 12 % too small (the error increases with d),
-and its gain is above 1, which compensates for the underestimated force.
+a cylindrical face, as on a disc. Both calculations use the same spring model: above each point of
+the base, the face compresses a vertical spring whose length is the height of the hemisphere. An
+estimator that assumes a plane face interprets the narrower footprint as a smaller d: it finds 0.72
+of the true value for R = a, and 0.83 for R = 2a. The estimated θ is 1 % to 12 % too small (the
+error increases with d), and the estimated gain is above 1, which compensates for the underestimated
+force.
 """
 
 from __future__ import annotations
@@ -140,7 +141,7 @@ class SensorModel:
 
         ``curvature`` [1/m] is the face curvature in the plane of ``tilt_x``, 0 for a plane. The
         face is a cylinder with its axis along the finger's y. All pressures are multiplied by
-        ``fraction``. For a solid tip, the curvature acts only through this factor, and the frame
+        ``fraction``. For a solid tip, the curvature acts only through ``fraction``, and the frame
         also shows the ``shear`` [N] along x, applied at height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
@@ -174,7 +175,7 @@ class SensorModel:
         """Sample points: their positions across the cylinder axis, and the hemisphere heights [m].
 
         Both arrays have the shape [lines, points per line]; the height is 0 beyond the rim. The
-        other two results are matrices that average over cells along y and x, including blur.
+        last two results are matrices that average over cells along y and x, including blur.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -250,11 +251,11 @@ class SensorModel:
 def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
     """Apply hysteresis: each cell reads higher during unloading than during loading.
 
-    This is a Prandtl-Ishlinskii model: the output of a cell is the mean of PLAY_COUNT generalised
+    In this Prandtl-Ishlinskii model, the output of a cell is the mean of PLAY_COUNT generalised
     play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each operator follows an
     increasing pressure p immediately. An operator follows a decreasing pressure only when its state
-    is above (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. The loading curve is
-    therefore the pressure itself, the unloading curve ends at (1 + excess) p, loops are closed,
+    is above (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. Therefore, the loading
+    curve is the pressure itself, and the unloading curve ends at (1 + excess) p. Loops are closed,
     inner loops lie inside outer loops, and zero pressure always reads 0.
     """
     widths = 2.0 * excess * (np.arange(PLAY_COUNT) + 0.5) / PLAY_COUNT

@@ -47,14 +47,14 @@ class SimulatedTactile:
     """Source of frames for one fingertip of a :class:`SimulatedHand`.
 
     The hand's settings define the sensor. Frame k samples the contact at k / ``tactile.rate`` after
-    the hand's start. It arrives ``simulation.tactile_delay`` later, with an additional delay, or
-    not at all (see :class:`Arrivals`). As on hardware, the sample time is unknown; it is assumed to
-    be ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is computed,
-    and only on request; ``seq`` also counts the frames that are not computed. The hand's
+    the hand's start. The frame arrives ``simulation.tactile_delay`` later, with an additional
+    delay, or not at all (see :class:`Arrivals`). As on hardware, the sample time is unknown; it is
+    assumed to be ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is
+    computed, and only on request; ``seq`` also counts the frames that are not computed. The hand's
     ``measurement_faults`` are applied to the frames.
 
-    If ``stage`` is set, it replaces the contact with the object. It is a function of the time since
-    the hand's start [s].
+    If ``stage`` is set, it replaces the contact with the object. ``stage`` is a function of the
+    time since the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:
@@ -124,7 +124,7 @@ class SimulatedTactile:
         self._open = False
 
     def _read(self, number: int, arrival: float) -> None:
-        """Compute a sample's frame if the plant still stores it, and make it the newest."""
+        """Compute the frame of a sample that the plant still stores; make it the newest frame."""
         # If readings depend on earlier contacts, samples whose frame is not computed also matter.
         first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
@@ -194,7 +194,7 @@ class SimulatedTactile:
 class Arrivals:
     """Arrival times of the frames 0, 1, … of a sensor.
 
-    Frame k is sampled at start + k · period and is due ``delay`` [s] later. It is lost with
+    Frame k is sampled at start + k · period and is due ``delay`` [s] later. A frame is lost with
     probability ``dropped``. A frame that is not lost is late by a uniformly distributed time of up
     to ``jitter`` [s]. Frames never overtake each other.
     """

@@ -35,7 +35,7 @@ _UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 class Item:
     """One register.
 
-    ``low`` and ``high`` are the limits in the manual's table; other registers may narrow them.
+    ``low`` and ``high`` are the limits in the manual's table. Other registers may narrow the range.
     """
 
     address: int
@@ -175,7 +175,7 @@ class ControlTable:
     def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
         """Restore factory defaults from address ``first`` on, except for the items in ``keep``.
 
-        If ``first`` is `control_table.RAM`, this has the effect of a power-up.
+        If ``first`` is `control_table.RAM`, the reset has the effect of a power-up.
         """
         for item in self.items:
             if item.address >= first and item.address not in keep:

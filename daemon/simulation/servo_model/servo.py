@@ -94,7 +94,7 @@ class EmulatedServo:
 
     @property
     def shadow(self) -> int:
-        """Secondary ID, whose instructions are executed without a reply; disabled from 253 on."""
+        """Secondary ID, to which the servo listens without replying; 253 and above disable it."""
         return self._memory[reg.SHADOW_ID]
 
     @property

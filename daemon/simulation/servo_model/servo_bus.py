@@ -137,7 +137,7 @@ class ServoBus:
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
-        """Return the replies to ``data`` with their delays; ``baud`` 0 reaches all servos."""
+        """Return the replies to ``data`` with their delays; ``baud`` 0 suits all servos."""
         if t >= self._due or t > self._now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []

@@ -100,7 +100,7 @@ class ServoJoint:
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_current(self, counts: int) -> float:
-        """Return a goal current [A], positive when closing; ignore the sign of a current limit."""
+        """Convert a goal current to A, positive when closing; a limit's sign has no meaning."""
         return self._scale.amperes(self.sign * counts)
 
     # --- trajectory --------------------------------------------------------------------------
@@ -286,7 +286,7 @@ class Profile:
 class ServoHeat:
     """Thermal model of one servo. ``ambient`` [°C] may be changed at any time.
 
-    This model is independent of the daemon's model (`kinematics.hand.servo_heat`) and uses
+    `ServoHeat` is independent of the daemon's model (`kinematics.hand.servo_heat`) and uses
     different constants. Copper resistance increases with temperature, convection at the case
     increases with the temperature difference, and the thermometer lags behind the case temperature.
     ``heating``, ``cooling`` and ``capacity`` scale the servo model's values.
