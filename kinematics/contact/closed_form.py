@@ -127,7 +127,7 @@ def theta_limit(radius: float, d: float) -> float:
     if d >= radius:
         return 0.0
     h = radius - d
-    # cos θ is the footprint radius divided by a. Unlike asin(h/a), this form is accurate for small d.
+    # cos θ is the footprint radius divided by a. Unlike asin(h/a), it is accurate for small d.
     return math.atan2(h, math.sqrt(d * (radius + h)))
 
 
