@@ -17,13 +17,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 CHANGELOG = "CHANGELOG.md"
-# Files that contain the version, with the pattern of the version line.
+# Files that contain the version, and the pattern of their version line.
 VERSION_LINES = {
     "softfinger/__init__.py": r'(?m)^(__version__ = ")(.*)(")$',
     "lerobot_robot_softfinger/pyproject.toml": r'(?m)^(version = ")(.*)(")$',
     "CITATION.cff": r"(?m)^(version: )(.*)()$",
 }
-MAX_LINES = 40  # lines per release in the changelog, without blank lines
+MAX_LINES = 40  # maximum number of changelog lines per release, not counting blank lines
 _UNRELEASED = "## [Unreleased]\n"
 
 

@@ -35,7 +35,7 @@ class Backend(NamedTuple):
 
     load: Callable[[], Any]
     metal: bool = True  # True for real hardware
-    hand: Any = False  # True if it needs a simulated hand; servos may give a hand class instead
+    hand: Any = False  # True if a simulated hand is needed; a servo backend may specify its class
     source: str = ""  # plugin name, package and version
     section: type[BaseModel] | None = None  # plugin's settings model
 

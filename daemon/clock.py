@@ -19,7 +19,7 @@ from softfinger.daemon.types import FINGERS
 class Clock(Protocol):
     """The pipeline's time source, in seconds."""
 
-    pauses_when_late: bool  # True if the hand's time pauses whenever this machine is late
+    pauses_when_late: bool  # True if the hand's clock pauses while this machine is late
 
     def now(self) -> float:
         """Return the monotonic time [s]."""
@@ -37,7 +37,7 @@ class Clock(Protocol):
 class LoopClock(Clock, Protocol):
     """The loop's clock, which also provides the machine's real time."""
 
-    behind: float  # s, total delay of `now` relative to the machine's time
+    behind: float  # total delay of `now` relative to the machine's time [s]
 
     def host(self) -> float:
         """Return the machine's monotonic time [s], used to measure computing time and delay."""
@@ -63,7 +63,7 @@ def emulated(settings: Settings) -> bool:
         ports.append(settings.servos.port)
     if backend("tactile", settings.tactile.backend).metal:
         ports += [settings.tactile.port[FINGERS.index(name)] for name in settings.scene.fingers]
-    # The emulator's port links and its control socket are in one folder.
+    # The emulator creates its port links and its control socket in the same folder.
     return bool(ports) and all(Path(port).with_name("control").is_socket() for port in ports)
 
 
@@ -189,7 +189,7 @@ class VirtualClock:
         return self._now
 
     wall = now
-    host = now  # Computations take zero virtual time.
+    host = now  # Computations take no virtual time.
 
     def sleep_until(self, t: float) -> float:
         """Advance the time to ``t`` unless ``t`` has passed; return a wake-up delay of 0."""

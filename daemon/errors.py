@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-_SIMILAR = 0.75  # minimum similarity of a suggested word: about one wrong letter in four
+_SIMILAR = 0.75  # minimum similarity of a suggested word; allows about one wrong letter in four
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

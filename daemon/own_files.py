@@ -21,7 +21,7 @@ from softfinger.kinematics.compiled.own_folder import (
     user_cache,
 )
 
-SIZE_MAX = 16 << 20  # bytes, maximum size of a file read at once, or of an unpacked part
+SIZE_MAX = 16 << 20  # maximum size of a file read at once, or of an unpacked part [bytes]
 
 _WORLD_WRITABLE = stat.S_IWOTH
 
@@ -31,7 +31,7 @@ def open_regular(path: Path) -> BinaryIO:
 
     Raises OSError on failure, and if the path is a device or a pipe.
     """
-    mode = path.stat().st_mode  # Check before opening, because opening can affect a device.
+    mode = path.stat().st_mode  # Check first, because opening can affect a device.
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, "found a device or a pipe, expected a regular file", str(path))
     no_wait = getattr(os, "O_NONBLOCK", 0)

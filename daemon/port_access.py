@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join just to open a port
+_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join merely to open a port
 
 
 def port_group_remedy(path: str) -> str:
@@ -14,11 +14,8 @@ def port_group_remedy(path: str) -> str:
 
 
 def serial_group() -> str:
-    """Return the group of serial ports on this system:
-
-    ``dialout``, or ``uucp`` if there is no ``dialout``.
-    """
-    import grp  # missing on some systems that run a client
+    """Return the group of serial ports: ``dialout``, or ``uucp`` on systems without ``dialout``."""
+    import grp  # Some client systems lack this module.
 
     groups = {each.gr_name for each in grp.getgrall()}
     return "uucp" if "uucp" in groups and "dialout" not in groups else "dialout"
@@ -26,7 +23,7 @@ def serial_group() -> str:
 
 def grant(path: str) -> str:
     """Return the command that gives this user access, usually by joining the port's group."""
-    import grp  # not available on some client systems
+    import grp  # Some client systems lack this module.
 
     try:
         status = Path(path).stat()

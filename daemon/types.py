@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # Clients that only send commands do not need NumPy.
 FINGERS = ("left", "right")
 STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # default addresses
 COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
-# commands that can only make the hand safer
+# Commands that can only make the hand safer.
 NO_LEASE_COMMANDS = frozenset({"stop", "disarm", "status"})
 GRIP_FRACTION = 0.9  # maximum grip force as a fraction of `safety.force_max`
 Event = tuple[str, str, str]  # level, kind, text
@@ -78,19 +78,19 @@ class Contact:
     gain: float = 1.0  # ratio of measured to modelled pressure
     modulus_scale: float = 1.0  # ratio of the tip modulus to its setting
     modulus_scale_std: float = 0.0
-    sensor_gain: float = 1.0  # `gain` is modulus_scale · sensor_gain
+    sensor_gain: float = 1.0  # The `gain` is modulus_scale · sensor_gain.
     sensor_gain_std: float = 0.0
     torque_scale: float = 1.0  # ratio of the torque constant setting to the true value
     torque_scale_std: float = 0.0
-    # Average normalised innovation squared of each sensor channel; consistent channels give about
-    # 1.
+    # Average normalised innovation squared of each sensor channel. A consistent channel has a value
+    # of about 1.
     nis_angle: float = 1.0
     nis_footprint: float = 1.0
     nis_amplitude: float = 1.0
-    misfit: bool = False  # True if no model contact fits the frame; d and theta may then be biased
+    misfit: bool = False  # True if no model contact fits the frame; d and theta may be biased
     force: float = 0.0  # normal force from the table, modulus_scale · F(d, total tilt) [N]
     energy: float = 0.0  # modulus_scale · U(d, total tilt) [J]
-    force_std: float = 0.0  # [N], including table and material-law errors
+    force_std: float = 0.0  # standard deviation [N], including table and material-law errors
     shear_x: float = 0.0  # shear force from the newest frame of a solid tip [N]
     shear_y: float = 0.0
     inside: bool = True  # True if (d, θ) is inside the model's domain
@@ -133,7 +133,7 @@ class ServoHeatEstimate:
     winding_std: float = 0.0  # standard deviation [°C]
     case: float = 0.0  # case temperature without the thermometer's quantisation [°C]
     case_std: float = 0.0
-    ambient: float = 0.0  # [°C]
+    ambient: float = 0.0  # ambient temperature [°C]
     time_to_limit: float = 3600.0  # time to `safety.temperature_max` at this current, capped [s]
 
 
@@ -145,9 +145,9 @@ class Timing:
     compute_s: float = 0.0  # computing time of the previous tick
     wake_late_s: float = 0.0  # delay of this tick's start relative to its deadline
     overruns: int = 0  # number of ticks that took longer than the period
-    late_in_row: int = 0  # number of consecutive late ticks; 0 if the hand's clock pauses
+    late_in_row: int = 0  # number of consecutive late ticks, or 0 if the hand's clock pauses
     behind_s: float = 0.0  # total time for which a simulated hand has waited for this machine
-    busy_s: float = 0.0  # duration of a recent stall of this machine, otherwise 0
+    busy_s: float = 0.0  # duration of a recent stall of this machine, or 0
 
 
 @dataclass(slots=True)
@@ -160,7 +160,7 @@ class State:
     mode: str = "disarmed"
     fault: str = ""
     fault_name: str = ""  # limit name in `safety.limits`
-    torque: bool = False  # True if torque is on, or if torque off is not confirmed
+    torque: bool = False  # True if torque is on or torque off is not confirmed
     torque_off: bool = False  # True if the servos confirmed torque off on this tick
     read_error: str = ""  # error of this tick's servo bus read
     write_error: str = ""
@@ -202,7 +202,7 @@ class SensorInfo(NamedTuple):
     unit: str  # unit of the published data: "count" or "Pa"
     scale: float  # pressure per data step [Pa]
     calibrated: bool
-    calibration: str  # name and date of the calibration, empty if uncalibrated
+    calibration: str  # name and date of the calibration, or empty if uncalibrated
 
 
 class HandInfo(NamedTuple):

@@ -251,7 +251,7 @@ def limits() -> str:
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
         after = f"{lasts:g} s + " if lasts else ""
         if row.in_turn:
-            turns = 2 if lasts else 1  # one to detect the violation, one to confirm it
+            turns = 2 if lasts else 1  # one turn to detect the violation, and one to confirm it
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
         elif row.check:
             when = f"{after}one tick ({tick:g} ms)"
@@ -488,7 +488,7 @@ def _grips() -> list[tuple[str, float, float, float, float]]:
     return found
 
 
-_FORCE, _WIDTH = 10.0, 0.040  # N, m; grip force and object width on the pages
+_FORCE, _WIDTH = 10.0, 0.040  # grip force [N] and object width [m] on the pages
 
 
 def upright_grips() -> str:
@@ -714,7 +714,7 @@ def save_grasp(path: Path) -> None:
         save(path, Recording(recorded), 0.1, print)
 
 
-@cache  # `mkdocs serve` builds the site after each change
+@cache  # `mkdocs serve` builds the site again after each change.
 def grasp_page() -> str:
     """Return the page that plays the recorded grasp."""
     with TemporaryDirectory() as folder:
@@ -770,7 +770,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "events.md": events,
     "api.md": api,
 }
-# Links to these project files are replaced with links to pages.
+# Links to these project files are replaced with links to documentation pages.
 _LINKS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -835,7 +835,7 @@ def _formula(found: re.Match[str]) -> str:
     from latex2mathml.converter import convert
 
     tex, display = html.unescape(found[2]).strip(), "block" if found[1] == "div" else "inline"
-    # TeX adds space around function names; MathML needs explicit spaces.
+    # TeX adds space around function names, whereas MathML needs explicit spaces.
     function = r"\\(?:arcsin|cos|ln|sin|tan)(?:\^\d)?(?![a-z])"
     tex = re.sub(rf"(?<=[\w)}}])\s*(?={function})", r" \, ", tex)
     tex = re.sub(rf"({function})\s*(?=[\\\w])", r"\1 \, ", tex)

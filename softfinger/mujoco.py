@@ -55,8 +55,8 @@ __all__ = ["MujocoHand", "SoftTips"]
 
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
-_ROWS = 4  # rows per tip: d, θ, shear along and across the tilt
-_GAP_MAX = 0.005  # m, maximum gap that can close within the next step
+_ROWS = 4  # number of rows per tip: d, θ, shear along the tilt, shear across the tilt
+_GAP_MAX = 0.005  # maximum gap that can close within the next step [m]
 _VALUE_MIN = 1e-9  # smallest nonzero contact depth [m], friction force [N] and sin θ
 _SHEAR = 2  # row index of the shear along the tilt
 _UNSUPPORTED = (
@@ -66,7 +66,7 @@ _UNSUPPORTED = (
     "joint_load_friction",
     "joint_stribeck",
 )
-# Impedance of joint friction; with MuJoCo's default of 0.9, the joints creep at several mrad/s.
+# Impedance of joint friction. With MuJoCo's default of 0.9, the joints creep at several mrad/s.
 _IMPEDANCE = 0.9999
 
 
@@ -74,10 +74,10 @@ class Touch(Record):
     """Contact of one tip with a face in 3D; vectors are in world coordinates."""
 
     contact: TipContact
-    normal: FloatTriple  # m, unit vector from the tip's centre into the face
-    along: FloatTriple  # t, unit vector in the face, opposite to the tip axis's tilt
+    normal: FloatTriple  # unit vector m from the tip's centre into the face
+    along: FloatTriple  # unit vector t in the face, opposite to the tip axis's tilt
     across: FloatTriple  # m × t, the rotation axis of θ
-    shear: FloatTriple  # m, face displacement relative to the tip
+    shear: FloatTriple  # displacement of the face relative to the tip [m]
     shear_across: float  # m
 
 
@@ -112,7 +112,7 @@ def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -
         total = math.hypot(tip.tangential, stiffness * touch.shear_across)
         if total <= limit * (1.0 + 1e-9):
             break
-        # The tip slips, so scale both shear components so that the force returns to the friction
+        # The tip slips, so scale both shear components until the force is back on the friction
         # cone.
         tip.shear += (limit / total - 1.0) * tip.tangential / stiffness
         touch.shear_across *= limit / total
@@ -191,13 +191,13 @@ def solve(
     p = parameters[0]
     rows, force, implicit = work
     n = len(force)
-    matrix = np.eye(n, n + 1)  # last column: right-hand side
+    matrix = np.eye(n, n + 1)  # The last column is the right-hand side.
     for i in range(n):
         push = p.step * implicit[i] * rows[i]
         matrix[i, :n] += (push * inertial).sum(axis=1)
         matrix[i, n] = force[i] + (push * (acceleration - own)).sum()
-    # Pivoting is unnecessary: B ≥ 0 is diagonal and A is positive semidefinite, so all leading
-    # minors are > 0.
+    # Pivoting is unnecessary. All leading minors are positive, because B ≥ 0 is diagonal and A is
+    # positive semidefinite.
     for i in range(n):
         matrix[i] /= matrix[i, i]
         for k in range(n):
@@ -341,7 +341,7 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
     for k, (name, side) in enumerate((("left", 1), ("right", -1))):
         end = f"{side * p.offset:.9g} {p.length:.9g} 0"
         # z is the hemisphere's axis. The sensor's x axis points away from the palm on the left
-        # finger and towards it on the right finger. The y axis points towards the viewer.
+        # finger and towards the palm on the right finger. The y axis points towards the viewer.
         fingers += f"""
 <body pos="{-side * p.half_separation:.9g} 0 0">
 <joint name="{name}" axis="0 0 {-side}" range="{p.stop_low[k]:.9g} {p.stop_high[k]:.9g}"
@@ -385,7 +385,7 @@ def feel(plants: Records[Plant], touches: Records[Touch], ring: Records[Sample])
     for k in range(2):
         plant.stages[0].on_object[k] = touches[k].contact
         tip = plant.stages[0].on_object[k]
-        if touches[k].across[2] < 0.0:  # Planar θ, shear and force are signed.
+        if touches[k].across[2] < 0.0:  # In the plane, θ, shear and force are signed.
             tip.theta, tip.sine = -tip.theta, -tip.sine
             tip.tangential, tip.shear = -tip.tangential, -tip.shear
     settle(plant, ring)
@@ -394,7 +394,7 @@ def feel(plants: Records[Plant], touches: Records[Touch], ring: Records[Sample])
 class Options(Section):
     """Settings in the profile table ``[plugins.mujoco]``."""
 
-    timestep: Annotated[float, Field(ge=1e-4, le=0.002)] = 0.001  # s, MuJoCo's time step
+    timestep: Annotated[float, Field(ge=1e-4, le=0.002)] = 0.001  # MuJoCo's time step [s]
 
 
 class MujocoHand(SimulatedHand):
@@ -424,7 +424,7 @@ class MujocoHand(SimulatedHand):
                 set_currents(plant.array, data.ctrl)
                 data.qfrc_applied[2:] = plant.goals.load
                 mujoco.mj_step2(self.model, data)
-                mujoco.mj_step1(self.model, data)  # update the contacts for `feel`
+                mujoco.mj_step1(self.model, data)  # Update the contacts for `feel`.
                 state.position[:], state.velocity[:] = data.qpos, data.qvel
                 state.current[:] = data.act
                 self._done = plant.step_count = self._done + 1
@@ -439,4 +439,4 @@ class MujocoServos(SimulatedServos):
     Settings = Options
 
     def __init__(self, *scene: Any) -> None:
-        super().__init__(*scene[:3])  # The last argument contains the hand's options.
+        super().__init__(*scene[:3])  # The last element contains the hand's options.

@@ -32,7 +32,8 @@ from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
 from tests.harness.perturbed import Perturbation
 
-# All machines test the same examples, without a deadline; --hypothesis-profile=search tries others.
+# All machines test the same examples, without a deadline. --hypothesis-profile=search tries other
+# examples.
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("same")
@@ -58,7 +59,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """Treat SIGTERM like Ctrl-C, and adopt orphaned descendants of tests."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     descendants.adopt_orphans()
-    # Start the resource tracker here: one started by a test would be killed with that test.
+    # Start the resource tracker here, because a tracker started by a test would be killed with that
+    # test.
     resource_tracker.ensure_running()
     _OUR_OWN.update(descendants.running())
     if not hasattr(config, "workerinput"):
@@ -105,7 +107,7 @@ def ended_with_the_test() -> Iterator[None]:
     yield
     for each, handler in handlers.items():
         signal.signal(each, handler)
-    gc.enable()  # daemons in this process disable it
+    gc.enable()  # Daemons in this process disable the garbage collector.
     descendants.end(descendants.running() - before)
 
 
@@ -182,7 +184,7 @@ Start = Callable[..., Running]
 @pytest.fixture
 def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Inline:
     """Return a function that runs a subcommand in the test process."""
-    monkeypatch.setattr(os, "nice", lambda _: 0)  # keep the test process's priority
+    monkeypatch.setattr(os, "nice", lambda _: 0)  # Keep the priority of the test process.
     # Suppress messages about kernel compilation, which only the first test on a machine prints.
     monkeypatch.setattr(kernels, "print_event", lambda *_: None)
 
@@ -190,7 +192,7 @@ def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
         capsys.readouterr()
         try:
             status = main(list(map(str, words)))
-        except SystemExit as ended:  # raised by argparse
+        except SystemExit as ended:  # argparse raises this exception.
             status = int(ended.code or 0)
         return Told(status, *capsys.readouterr())
 

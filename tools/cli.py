@@ -87,7 +87,7 @@ def _open_standard_streams() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
-            os.set_inheritable(descriptor, True)  # let child processes inherit the descriptor
+            os.set_inheritable(descriptor, True)  # Let child processes inherit the descriptor.
             setattr(sys, name, os.fdopen(descriptor, mode))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -188,7 +188,7 @@ def _main(argv: Sequence[str] | None) -> int:
         return 0
     if words[:1] == ["help"]:
         words = [*words[1:2], "--help"]
-    # Import only the called subcommand.
+    # Import only the subcommand that was called.
     called = next((word for word in words if word in SUBCOMMANDS), "")
     if called in _LINUX and sys.platform != "linux":
         print(
@@ -216,12 +216,12 @@ def _main(argv: Sequence[str] | None) -> int:
         status: int = module.run(arguments)
         sys.stdout.flush()
     except KeyboardInterrupt:
-        return 130  # shell convention for Ctrl-C
+        return 130  # exit status for Ctrl-C by shell convention
     except BrokenPipeError:
-        # The reader has closed the pipe, e.g. `| head`. Discard the remaining output.
+        # The reader has closed the pipe, as with `| head`. Discard the remaining output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except SettingsError as error:  # one line per key
+    except SettingsError as error:  # The error has one line per key.
         print(error, file=sys.stderr)
         return 2
     except SoftfingerError as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from softfinger.daemon.errors import SoftfingerError
 
-_EXTRAS = {  # extra: (reason in the error message, modules)
+_EXTRAS = {  # maps each extra to the reason in the error message and its modules
     "plot": ("plots require matplotlib", ("matplotlib",)),
     "record": ("recordings require mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
     "view": ("the web page requires websockets and orjson", ("websockets", "orjson")),
@@ -37,6 +37,6 @@ def _install() -> str:
     """Return the command for installing packages in this environment."""
     if (Path(sys.prefix) / "pipx_metadata.json").exists():
         return "pipx runpip softfinger install"
-    if importlib.util.find_spec("pip") is None:  # environment created by uv
+    if importlib.util.find_spec("pip") is None:  # This environment was created by uv.
         return f"uv pip install --python {sys.executable}"
     return f"{sys.executable} -m pip install"

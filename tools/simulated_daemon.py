@@ -24,9 +24,9 @@ class TrueStates:
     """True state of the simulated hand at each tick."""
 
     t: NDArray[np.float64]  # s
-    force: NDArray[np.float64]  # N, [n, 2]
+    force: NDArray[np.float64]  # force per tip [n, 2] [N]
     angle: NDArray[np.float64]  # rad
-    slip: NDArray[np.float64]  # 1, larger |T|/μN of both tips
+    slip: NDArray[np.float64]  # ratio |T|/μN, the larger one of both tips
 
     def since(self, index: int) -> TrueStates:
         """Return the record from tick ``index`` on."""

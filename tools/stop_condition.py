@@ -76,11 +76,11 @@ class StopCondition:
     def wake(self, *_: object) -> None:
         """Interrupt a wait."""
         # Do not use an Event here, because the interrupted thread may hold its lock.
-        with contextlib.suppress(BlockingIOError):  # a full buffer also wakes the thread
+        with contextlib.suppress(BlockingIOError):  # A full buffer also wakes the thread.
             self._wake.send(b"!")
 
     def __enter__(self) -> Self:
-        self._wakes, self._wake = socket.socketpair()  # on Windows, select requires sockets
+        self._wakes, self._wake = socket.socketpair()  # On Windows, select requires sockets.
         self._wake.setblocking(False)
         self._before = {number: signal.signal(number, self.end) for number in self.signals}
         return self
@@ -96,8 +96,8 @@ class Interrupted(BaseException):
     """A signal arrived before the daemon was running; deliberately not an `Exception` subclass."""
 
 
-# The default action of these signals ends the process immediately, so that only the servo watchdog
-# would switch torque off. SIGHUP means that the terminal was closed.
+# By default, these signals end the process immediately, so that only the servo watchdog would
+# switch torque off. SIGHUP means that the terminal was closed.
 _TERMINATING = available_signals("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
 
 
@@ -131,5 +131,5 @@ class Signals:
         first, self._has_ended = not self._has_ended, True
         if self._end_running is not None:
             self._end_running()
-        elif first and not self._deferred:  # a second signal must not interrupt the shutdown
+        elif first and not self._deferred:  # A second signal must not interrupt the shutdown.
             raise Interrupted

@@ -32,8 +32,8 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-_CONNECT_TIMEOUT = 10.0  # s, time limit for connecting to the scheduler
-_REDRAW_INTERVAL = 0.1  # s, time between two redraws of a bar
+_CONNECT_TIMEOUT = 10.0  # time limit for connecting to the scheduler [s]
+_REDRAW_INTERVAL = 0.1  # time between two redraws of a bar [s]
 _BAR_WIDTH = 20  # columns
 
 
@@ -150,7 +150,7 @@ class Sweep(Generic[Case, Result]):
                 if len(self._results) > before:
                     before, workers = len(self._results), processes
                 elif workers > 1:
-                    # Run one case at a time, to identify the case that crashes its worker.
+                    # Run one case at a time to identify the case that crashes its worker.
                     workers = 1
                 else:
                     case = self._cases[self._left()[0]]
@@ -201,7 +201,7 @@ class Sweep(Generic[Case, Result]):
             try:
                 k, result = json.loads(line)
             except ValueError:
-                break  # incomplete last line
+                break  # The last line is incomplete.
             self._results[int(k)] = result
 
 
@@ -211,7 +211,7 @@ def _pool(processes: int) -> Iterator[Executor]:
         processes,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),  # only the parent process handles Ctrl-C
+        initargs=(signal.SIGINT, signal.SIG_IGN),  # Only the parent process handles Ctrl-C.
     )
     try:
         yield executor

@@ -35,10 +35,10 @@ _Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)
 
-RETRY_DELAY = 0.05  # s, delay before a late command is sent again
+RETRY_DELAY = 0.05  # delay before a late command is sent again [s]
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux only
-LOCAL_STOP_TIMEOUT = 0.5  # s, timeout for a stop over the local socket
-# This warning is logged if ``torque_off`` is ``unconfirmed``.
+LOCAL_STOP_TIMEOUT = 0.5  # timeout for a stop over the local socket [s]
+# Warning that is logged if ``torque_off`` is ``unconfirmed``.
 UNCONFIRMED_TEXT = "the servos have not confirmed torque off yet"
 
 
@@ -93,7 +93,7 @@ def send(
     reply = send_once(address, attempts, keys)
     while attempts.again(reply):
         time.sleep(RETRY_DELAY)
-        if not attempts.remaining():  # the computer was suspended
+        if not attempts.remaining():  # the computer was suspended in the meantime
             break
         reply = send_once(address, attempts, keys)
     return reply

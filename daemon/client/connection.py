@@ -14,11 +14,12 @@ import zmq
 from softfinger.daemon.errors import SettingsError, WrongThread
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
-REPLY_TIMEOUT = 5.0  # s, default timeout for a reply or a first message
-SILENCE_TIME = 1.0  # s, waiting time before a warning is logged
+REPLY_TIMEOUT = 5.0  # default timeout for a reply or a first message [s]
+SILENCE_TIME = 1.0  # waiting time before a warning is logged [s]
 
 _QUEUE_LENGTH = 100_000  # maximum number of messages queued for a slow program
-_MESSAGE_SIZE_MAX = 4_000_000  # bytes; a frame of the largest grid has 131 kB
+# Maximum message size [bytes]. A frame of the largest grid has 131 kB.
+_MESSAGE_SIZE_MAX = 4_000_000
 
 
 def default_addresses() -> tuple[str, str]:
@@ -65,7 +66,8 @@ def require_host(address: str) -> None:
     """
     if not address.startswith("tcp://"):
         return
-    host = address[6:].rpartition(";")[2].rpartition(":")[0].strip("[]")  # after a source address
+    # A source address may precede the host, separated by a semicolon.
+    host = address[6:].rpartition(";")[2].rpartition(":")[0].strip("[]")
     try:
         getaddrinfo(host, None)
     except (OSError, UnicodeError) as error:

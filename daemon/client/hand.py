@@ -83,7 +83,7 @@ class Hand(HandClient[None]):
     """
 
     _states: Subscription[HandState] | None = None
-    _now = staticmethod(time.monotonic)  # time of `wait_for` [s]
+    _now = staticmethod(time.monotonic)  # clock used by `wait_for` [s]
 
     def __enter__(self) -> Self:
         return self

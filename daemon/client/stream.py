@@ -35,7 +35,7 @@ __all__ = ["read", "to_columns"]
 
 _Record = TypeVar("_Record")
 
-_STORED_MESSAGE_COUNT = 1000  # message numbers stored to detect repetitions
+_STORED_MESSAGE_COUNT = 1000  # number of message numbers stored to detect repeated messages
 
 _log = logging.getLogger(__name__)
 

@@ -22,13 +22,13 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_ERROR_SIGMA = 2.0  # torque-constant standard deviations included in the force limit
+_TORQUE_ERROR_SIGMA = 2.0  # number of torque-constant standard deviations in the force limit
 _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
-_DISTRIBUTE_BANDWIDTH = 2.0  # Hz, integral control of the tip force difference
-_DISTRIBUTE_ANGLE = 3e-3  # rad, maximum object rotation due to this control
-_DITHER_STEP_MAX = 0.05  # s, maximum dither time step after a delayed tick
-_STIFFNESS_MIN = 100.0  # N/m, lower bound because gains are divided by stiffness
-ROTATION_MIN = 0.1  # minimum object rotation per antisymmetric joint angle
+_DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the integral control of the tip force difference [Hz]
+_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation that this integral control may cause [rad]
+_DITHER_STEP_MAX = 0.05  # maximum dither time step after a delayed tick [s]
+_STIFFNESS_MIN = 100.0  # minimum stiffness, because gains are divided by stiffness [N/m]
+ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
 
 
 class GripLaw(Record):
@@ -39,14 +39,14 @@ class GripLaw(Record):
     force_bandwidth: float  # [rad/s]
     rotate_bandwidth: float  # [rad/s]
     rotate_speed: float  # [rad/s]
-    damping: float  # 2 ζ √J; multiply by √stiffness for damping [N·m·s/rad]
+    damping: float  # 2 ζ √J; multiplied by √stiffness, it gives the damping [N·m·s/rad]
     friction: float  # joint friction [N·m]
     driving: float  # ratio of motor torque to tip torque when closing
-    friction_speed: float  # speed for full friction compensation [rad/s]
+    friction_speed: float  # joint speed at which friction is fully compensated [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
-    turn_decay: float  # decay factor per tick of the turning rate without frames
-    is_blind: bool  # dither brings the object upright; its angle is not used
+    turn_decay: float  # decay factor per tick of the rotation rate while no frames arrive
+    is_blind: bool  # True if dither brings the object upright without using its measured angle
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
     offset: float  # fingertip offset [m]
@@ -66,7 +66,7 @@ class GripState(Record):
     commanded: float  # commanded force [N]
     force_rate: float  # [N/s]
     joint_stiffness: float  # [N·m/rad]
-    is_steering: bool  # the object angle has a target
+    is_steering: bool  # True if the object angle has a target
     integral: float  # [N]
     grip_force: float  # sum of feed-forward and feedback [N]
     offset_rate: float  # rate of the offset that rotates the object [rad/s]
@@ -182,7 +182,7 @@ def single_torque(
     closing_rate = 0.0
     if not frames_late:
         target = setpoint.advance(g.force, force_windows, g.force_rate)
-        # The object can't yield, so friction between tip and object may take some of the torque.
+        # The object is fixed, so friction between tip and object may carry part of the torque.
         q, law = grasp.q[finger], g.law
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
         limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
@@ -241,7 +241,8 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
     offset_rate = g.angle.speed / rotation
     if not math.isnan(angle):
         error = target - angle
-        if setpoint.has_arrived(g.angle):  # With the dead band, joints at rest do not follow noise.
+        # The dead band keeps joints at rest from following noise.
+        if setpoint.has_arrived(g.angle):
             noise = GATE * grasp.angle_std
             error -= min(max(error, -noise), noise)
         g.offset += g.law.rotate_bandwidth * error / rotation * g.law.dt
@@ -334,15 +335,15 @@ def _equal_torques(
             upright_spring(closed, depth, target, grasp.tilt_moment_ratio, lengths),
             g.joint_stiffness,
         )
-        # The subsequent hold must start with the current spring torque.
+        # The hold that follows the dither must start with the current spring torque.
         g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
-        # The amplitude increases during the first period, and it fades throughout the dither.
+        # The dither amplitude ramps up during the first period and fades over the whole dither.
         phase = law.dither_rate * g.dither_elapsed
         amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
         steering = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
         if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-            # Use the clock instead of counting ticks. Otherwise late ticks could slow the dither to
-            # the resonance of the fingers on the tips, at 1 to 2 Hz.
+            # Measure the dither time with the clock instead of counting ticks. Late ticks could
+            # otherwise slow the dither down to the resonance of the fingers on the tips, 1 to 2 Hz.
             g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     else:
         steering += g.joint_stiffness * (g.offset - antisymmetric)

@@ -35,7 +35,7 @@ class Parameter(NamedTuple):
 
     required: bool
     unit: str
-    range: str  # in words, by the settings that define it
+    range: str  # range in words, with the settings that define it
     meaning: str
 
 

@@ -28,8 +28,8 @@ class SetpointState(Record):
     target: float
     value: float
     speed: float  # [1/s]
-    ramp: float  # value before smoothing; moves to the target at the given rate
-    idle_count: int  # ticks since the ramp reached the target
+    ramp: float  # unsmoothed value, which moves to the target at the given rate
+    idle_count: int  # number of ticks since the ramp reached the target
     dt: float  # [s]
     first: RunningMean
     second: RunningMean

@@ -55,20 +55,21 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
-_AVERAGE_TIME = 0.1  # s; velocities fluctuate by one unit of 0.024 rad/s
-_SETTLING_TIME = 1.0  # s, settling time of the residual, for which an increase is also held
-_DECAY_TIME = 2.0  # s for a decrease by `grip_raise_max`; decay time of rotations
-_SUDDEN_SHARE = 0.7  # fraction of the usable friction force above which a sudden load counts
-_ROTATION_INCREASE = 0.5  # relative increase after an object rotation
-_ROTATION_MARGIN = 1.5  # multiple of the rotation due to shear deformation
-_GATE = 4.0  # standard deviations beyond which a jump is not noise
-_JUMP_MIN = 0.01  # N·m, minimum torque jump
-_SHEAR_JUMP = 0.6  # N, minimum shear jump of solid tips: six standard deviations
-_AGREEMENT = 0.25  # fraction of the mean that each joint and each tip must show
-_FRICTION_MAX = 0.3  # N·m; a larger torque during free approach is not friction
-_UNCONFIRMED_SHARE = 0.3  # fraction of the commanded force
+_AVERAGE_TIME = 0.1  # averaging time, because velocities fluctuate by one count (0.024 rad/s) [s]
+_SETTLING_TIME = 1.0  # settling time of the residual and hold time of a force increase [s]
+_DECAY_TIME = 2.0  # time to decrease the force by `grip_raise_max`, and decay time of rotations [s]
+_SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
+_ROTATION_INCREASE = 0.5  # relative force increase after an object rotation
+_ROTATION_MARGIN = 1.5  # minimum object rotation, relative to the rotation due to shear deformation
+_GATE = 4.0  # number of standard deviations above which a jump is not noise
+_JUMP_MIN = 0.01  # minimum torque jump [N·m]
+_SHEAR_JUMP = 0.6  # minimum shear jump of solid tips [N], six standard deviations
+_AGREEMENT = 0.25  # minimum share of each joint and each tip in a change, as a fraction of the mean
+_FRICTION_MAX = 0.3  # maximum joint friction derived from the torque during free approach [N·m]
+# Maximum increase for an unconfirmed load, relative to the commanded force.
+_UNCONFIRMED_SHARE = 0.3
 _RELAXATION_SHARE = 0.2  # fraction of the tip force that rubber may lose during a hold
-ARM_MIN = 0.1  # fraction of the finger length, minimum moment arm
+ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
 _SPARE_MIN = 0.3  # minimum fraction of the friction that remains after rolling
 
 
@@ -79,16 +80,16 @@ class SlipLaw(Record):
     width: float  # object width [m]
     arm_min: float  # minimum moment arm [m]
     yield_speed: float  # minimum speed change of a yielding joint [rad/s]
-    standstill: float  # maximum deviation of a stationary joint from its average [rad]
+    standstill: float  # maximum deviation of a stationary joint from its average angle [rad]
     force_max: float  # [N]
     friction: float  # Coulomb coefficient between tip and object
-    margin: float  # fraction of friction that stays unused
+    margin: float  # fraction of the friction that is kept as a margin
     joint_friction: float  # [N·m]
     load_friction: float  # fraction of the tip moment that gears hold until the joint opens
     object_load: float  # [N]
     has_shear: bool  # frames measure shear
     increase_max: float  # [N]
-    increase_ratio: float  # fraction of the commanded force
+    increase_ratio: float  # maximum force increase as a fraction of the commanded force
 
 
 class SlipState(Record):
@@ -101,7 +102,7 @@ class SlipState(Record):
     speed: Pair  # average joint speeds [rad/s]
     q: Pair  # joint angles, averaged over _SETTLING_TIME [rad]
     torque: float  # mean torque of both joints on the previous tick [N·m]
-    is_watched: bool  # the initial residual of the hold is known
+    is_watched: bool  # True if the initial residual of the hold is known
     offset: float  # residual without a load [N·m]
     start_offset: float  # part of the initial offset that exceeds friction [N·m]
     deviation: float  # residual attributed to a load [N·m]
@@ -109,17 +110,17 @@ class SlipState(Record):
     holding_time: float  # time since holding began, up to _SETTLING_TIME [s]
     load: float  # load per tip, including the hidden part [N]
     assumed_load: float  # maximum of `load`, solid-tip shear and declared load [N]
-    is_confirmed: bool  # the load may increase the force by more than _UNCONFIRMED_SHARE
+    is_confirmed: bool  # True if the load may increase the force by more than _UNCONFIRMED_SHARE
     pull: float  # average pull measured by solid tips [N]
     twist: float  # average twist measured by solid tips [N]
-    usable_friction: float  # Coulomb coefficient less slip margin and rolling
-    rotation_seen: Pair  # `unexplained_rotation` at the previous update [rad]
+    usable_friction: float  # Coulomb coefficient minus the shares for slip margin and rolling
+    rotation_seen: Pair  # value of `unexplained_rotation` at the previous update [rad]
     rotation: Pair  # unexplained rotation per tip over the last _DECAY_TIME [rad]
-    has_turned: bool  # the object has rotated in the grip on this tick
-    reflex_triggered: bool  # sudden event on this tick
+    has_turned: bool  # True if the object has rotated in the grip on this tick
+    reflex_triggered: bool  # True if a sudden event occurred on this tick
     needed_force: float  # required force, held for _SETTLING_TIME [N]
     force_limit: float  # [N]
-    idle_time: float  # time since the force was last required [s]
+    idle_time: float  # time since a force increase was last required [s]
 
 
 def configure(s: SlipState, settings: Settings) -> None:
@@ -210,7 +211,7 @@ def update(
     free_torque = max(mean(grasp.free_torque), law.joint_friction)
     s.friction = min(free_torque, _FRICTION_MAX) + law.load_friction * moment
     is_held = holding and s.is_watched and grasp.load_arm > 0.0
-    # Rolling uses part of the friction that grows with the grip force.
+    # Rolling uses part of the friction, in proportion to the grip force.
     spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
     s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
     sudden_min = _SUDDEN_SHARE * max(spare_friction, 0.0) * mean(grasp.normal)
@@ -226,7 +227,7 @@ def update(
     # Ignore the torques if joint friction hides more load than the grip can bear.
     if law.friction * commanded * grasp.load_arm <= s.friction:
         s.load = 0.0
-    if law.has_shear:  # A load above the measured shear is a force error.
+    if law.has_shear:  # A load estimate above the measured shear is due to a force error.
         s.load = min(s.load, pull + _SHEAR_JUMP)
     if grasp.sensor_fault:
         s.load = pull = s.needed_force = 0.0
@@ -334,7 +335,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     smaller = 0.0
     if s.residual[0] * s.residual[1] > 0.0:
         smaller = min(abs(s.residual[0]), abs(s.residual[1]))
-    residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load affects both joints.
+    residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     is_standing = True
     for k in range(2):
@@ -357,7 +358,8 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
-    # From half the hidden load to the hidden load, the estimate rises from 0 to |L| + hidden.
+    # While the detected load rises from half to all of the load that friction can hide, the
+    # estimate rises from 0 to |L| + hidden.
     threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
     hidden = s.friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)

@@ -47,35 +47,42 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
-# rad, maximum distance between a joint and its goal on arrival. It is five times the position error
-# due to the default joint friction at the default servos.stiffness.
+# Maximum distance between a joint and its goal on arrival [rad]. This is five times the position
+# error that the default joint friction causes at the default servos.stiffness.
 _ARRIVAL_DISTANCE = 0.03
-# s allowed for a joint to arrive after its setpoint; friction then holds the joint.
+# Time allowed for a joint to arrive after its setpoint [s]. A joint that takes longer is held by
+# friction.
 _ARRIVAL_TIMEOUT = 1.0
-# Fraction of the force target. The force noise is 0.3 to 0.6 % (1 σ) with simulated sensors.
+# Force tolerance as a fraction of the force target. With simulated sensors, the force noise is 0.3
+# to 0.6 % (1 σ).
 _FORCE_TOLERANCE = 0.03
-# Fraction of the force target: maximum excess force that gear friction may hold. It is 6 % in the
-# small hand.
+# Maximum excess force that gear friction may hold, as a fraction of the force target. In the small
+# hand, this excess is 6 %.
 _HELD_FORCE_MAX = 0.12
-# Fraction of the force target: error that joint friction may cause. For the default finger, 0.05
-# N·m corresponds to a tenth of 6 N. The integral term removes this error within seconds.
+# Force error that joint friction may cause, as a fraction of the force target. For the default
+# finger, a friction of 0.05 N·m corresponds to a tenth of 6 N. The integral term removes this error
+# within seconds.
 _FRICTION_TOLERANCE = 0.1
-# s after which a force with this error counts as reached: ten times the frictionless settling time.
+# Time after which the force counts as reached despite a friction error [s]. This is ten times the
+# settling time without friction.
 _STUCK_TIME = 2.0
-# rad from the target angle. The angle noise is 0.5 to 2 mrad (1 σ) with simulated sensors.
+# Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
-# s for which force and angle must stay at their targets. It is five frames at 25 Hz and twice the
-# default smooth_time.
+# Time for which force and angle must stay at their targets [s]. This is five frames at 25 Hz and
+# twice the default smooth_time.
 _SETTLING_TIME = 0.2
-# Fraction of the force target. A streamed target may change continuously, so a grip also settles
-# when it follows a setpoint that is within this distance of the target.
+# Tolerance of a streamed force, as a fraction of the force target. A streamed target may change
+# continuously, so a grip also settles while it follows a setpoint within this distance of the
+# target.
 _STREAM_TOLERANCE = 0.25
-# Smaller changes in a streamed setpoint or in the force increase are ignored as noise: fraction of
-# the force, and rad (1 σ of the angle).
+# Smaller changes in a streamed setpoint or in the force increase are treated as noise. The units
+# are fractions of the force, and rad (1 σ of the angle).
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
-# s without contact after which it counts as lost. Two frames at 25 Hz fit into this time.
+# Time without contact after which the contact counts as lost [s]. Two frames at 25 Hz fit into this
+# time.
 _CONTACT_LOSS_TIME = 0.1
-# s for which the tips must appear to touch each other, more than one frame period at 25 Hz.
+# Time for which the tips must appear to touch each other before the grip counts as empty [s]. It is
+# longer than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 
 
@@ -98,7 +105,7 @@ class Armed(ControlState):
 
     mode = Mode.ARMED
     current: float  # current limit [A]
-    following_count: int = 0  # remaining ticks during which setpoints follow the joints
+    following_count: int = 0  # number of remaining ticks during which setpoints follow the joints
 
 
 @dataclass
@@ -114,7 +121,7 @@ class GraspCommand:
     """Values commanded for a grasp, stored until the grasp has settled."""
 
     force: float  # [N]
-    is_streamed: bool  # the force is a streamed setpoint
+    is_streamed: bool  # True if the force is a streamed setpoint
     angle: float | None = None  # target after the grasp has settled [rad]
 
 
@@ -233,8 +240,8 @@ class Control:
 
     def arm(self) -> None:
         """Switch torque on and hold the joints at their positions."""
-        # Torque is switched on at the end of the first tick. The joints may move until the second
-        # tick.
+        # Torque is switched on at the end of the first tick, so the joints may move until the
+        # second tick.
         self._enter(Armed(self._settings.safety.current_move, following_count=2))
 
     def disarm(self) -> None:
@@ -353,7 +360,7 @@ class Control:
             self._travel(self.state, dt)
         elif isinstance(self.state, Approaching):
             self._approach(self.state, dt)
-        if isinstance(self.state, Gripping):  # also if the grip began on this tick
+        if isinstance(self.state, Gripping):  # This also applies if the grip began on this tick.
             self._step_grip(self.state, dt, goal)
         else:
             self.fingers.follow_setpoints(goal, current)
@@ -380,8 +387,8 @@ class Control:
         # The tip must not exceed the commanded force if it reaches the object before the sensor
         # detects contact.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
-        # If this torque does not move a joint in free motion, its friction exceeds the setting.
-        # `free_torque` is the measured value.
+        # A joint that this torque does not move in free motion has more friction than the setting
+        # states. `free_torque` is the measured friction torque.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 
@@ -438,7 +445,7 @@ class Control:
         if not fingers.in_contact:
             self._handle_contact_loss(history, dt, goal)
             return
-        if history.loss is not None:  # Joint motion is not a load while the force increases again.
+        if history.loss is not None:  # Joint motion while the force recovers is not a load.
             history.loss, state.reached_for = None, 0.0
             if isinstance(state, Settled):
                 self._enter(state := Changing(history))
@@ -453,7 +460,7 @@ class Control:
         """Hold the joints while a contact is missing; end the grip after _CONTACT_LOSS_TIME."""
         if history.loss is None:
             self.fingers.hold_here()
-            # A sensor failure must not increase the joints' pressing force.
+            # A sensor failure must not increase the force with which the joints press.
             pressed = max(goal.current[index] for index in self.fingers.indices)
             history.loss = ContactLoss(min(pressed, self._settings.safety.current_move))
         loss = history.loss

@@ -18,7 +18,7 @@ from softfinger.daemon.types import State
 Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, subsequent pause [s]
 
 _STEP_TIMEOUT = 10.0  # s
-_RESTART_PAUSE = 2.0  # s before a restart, to give the user time to read the message
+_RESTART_PAUSE = 2.0  # pause before a restart, so that the user can read the message [s]
 
 
 class TaskEnded(SoftfingerError):

@@ -52,8 +52,8 @@ from softfinger.daemon.servos.torque import goal_address
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS, Frame
 
-_LISTEN_TIME = 0.5  # s, duration of frame reception
-_REST_NOISE_RATIO = 3.0  # median pressure limit at rest, as a multiple of the cell noise
+_LISTEN_TIME = 0.5  # time for which frames are received [s]
+_REST_NOISE_RATIO = 3.0  # maximum median pressure at rest, as a multiple of the cell noise
 _RATE_TOLERANCE = 0.1  # tolerated relative frame rate error
 _POISSON_TOLERANCE = 0.02  # tolerance for ν, limited by the accuracy of the calibration
 
@@ -63,7 +63,7 @@ def check_servos(settings: Settings) -> list[Finding]:
     servos = settings.servos
     model = by_name(servos.model)
     try:
-        # Low-latency mode is not requested, because this would change the adapter's settings.
+        # Low-latency mode is not requested, because it would change the adapter's settings.
         with open_line(servos.port, servos.baud, low_latency=False) as line:
             _wait_for(line, settings)
             found = examine(line, settings, model)
@@ -232,7 +232,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
     try:
         before, start = sensor.counters(), time.monotonic()
         time.sleep(_LISTEN_TIME)
-        frame = sensor.latest()  # Some plugins read the board only in this call.
+        frame = sensor.latest()  # Some plugins read the board only when `latest` is called.
         after, spent = sensor.counters(), time.monotonic() - start
     finally:
         sensor.close()
@@ -251,7 +251,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
         )
         fix = "run `softfinger calibrate tare` once, or `softfinger send tare` after each start"
         return Finding("warn", name, text, fix)
-    # The frame count is uncertain by ±1, depending on the timing.
+    # Depending on the timing, the frame count may be off by one.
     if abs(frames - tactile.rate * spent) > max(_RATE_TOLERANCE * tactile.rate * spent, 1.5):
         text = f"{found}, expected {tactile.rate:g}"
         fix = f"set tactile.rate = {rate:.0f} unless this machine is busy"

@@ -17,10 +17,11 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_folder
 
-_MEMORY = 1 << 30  # bytes, upper bound on the daemon's mapped memory
+_MEMORY = 1 << 30  # upper bound on the daemon's mapped memory [bytes]
 _WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
-_CLOCK_MIN = 1_700_000_000.0  # Unix time [s]; an earlier time means that the clock was never set
+# Minimum plausible Unix time [s]. An earlier time means that the clock was never set.
+_CLOCK_MIN = 1_700_000_000.0
 
 
 def check_machine() -> list[Finding]:

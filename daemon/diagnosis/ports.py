@@ -162,7 +162,7 @@ def _pseudo_terminal(folder: Path, link: Path) -> int:
     return int(match[1]) if match else -1
 
 
-_TIMEOUT = 0.5  # s, timeout for a daemon's reply
+_TIMEOUT = 0.5  # timeout for a daemon's reply [s]
 
 
 def check_addresses(settings: Settings) -> list[Finding]:

@@ -22,8 +22,8 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
 from softfinger.daemon.types import FINGERS
 
-_FILE_SIZE_MAX = 1 << 20  # bytes, maximum file size
-_PASS_COUNT = 2  # A lower limit may be rejected until the upper limit has been written.
+_FILE_SIZE_MAX = 1 << 20  # maximum file size [bytes]
+_PASS_COUNT = 2  # number of passes; a lower limit may be rejected until its upper limit is written
 
 
 class StoredServo(Section):
@@ -112,7 +112,7 @@ def _restore(
         result.append(Finding("warn", name, "not restored: torque could not be switched off"))
         return
     tables: list[bytes] = []
-    # Write the operating mode first, because it resets gains, profiles and goals.
+    # Write the operating mode first, because this write resets gains, profiles and goals.
     order = sorted(REGISTERS, key=lambda each: each.address != reg.OPERATING_MODE)
     for turn in range(_PASS_COUNT + 1):
         table = line.read(servo_id, 0, CHECKED)

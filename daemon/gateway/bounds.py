@@ -9,48 +9,48 @@ from __future__ import annotations
 from typing import NamedTuple
 
 # The process
-MEMORY_MAX = 128 << 20  # bytes of data segment; Python and libzmq use a third of this limit
-DESCRIPTOR_COUNT = 64  # file descriptors in addition to those of clients
-CLIENT_COUNT_MAX = 256  # connections, commands and stream combined
-STEP_CPU_TIME_MAX = 3.0  # s, CPU time limit of one step; the kernel then ends the process
-# s, elapsed time limit of one step. It is higher than the CPU limit because the process may
-# have to wait on a busy machine.
+MEMORY_MAX = 128 << 20  # data segment limit [bytes]; Python and libzmq use a third of this limit
+DESCRIPTOR_COUNT = 64  # number of file descriptors in addition to those of clients
+CLIENT_COUNT_MAX = 256  # maximum number of connections, commands and stream combined
+STEP_CPU_TIME_MAX = 3.0  # CPU time limit of one step [s], after which the kernel ends the process
+# Elapsed time limit of one step [s]. It is higher than the CPU limit, because the process may have
+# to wait on a busy machine.
 STEP_TIME_MAX = 30.0
-# s, longest poll interval. After a longer interval, new requests are stamped with the time of the
+# Longest poll interval [s]. After a longer interval, new requests are stamped with the time of the
 # previous poll.
 POLL_GAP_MAX = 0.05
 
 # Connections
 HANDSHAKE_TIMEOUT = 2.0  # s
-SOCKET_QUEUE_LENGTH = 64  # requests, replies or subscriptions in one client's socket queue
+SOCKET_QUEUE_LENGTH = 64  # number of requests, replies or subscriptions queued in a client's socket
 PART_SIZE_RATIO = 4  # size limit of one message part, as a multiple of commands.max_bytes
-PART_COUNT_MAX = 16  # parts of a request, including routing frame and envelope
-ENVELOPE_SIZE_MAX = 1024  # bytes, routing frame and envelope combined
-SUBSCRIPTION_SIZE_MAX = 1024  # bytes, enough for handshake messages, which are longer than topics
+PART_COUNT_MAX = 16  # maximum number of parts in a request, including routing frame and envelope
+ENVELOPE_SIZE_MAX = 1024  # maximum combined size of routing frame and envelope [bytes]
+SUBSCRIPTION_SIZE_MAX = 1024  # maximum size [bytes]; handshake messages are longer than topics
 SUBSCRIPTIONS_PER_TURN = 64
-REPEAT_INTERVAL = 0.1  # s, minimum interval between message repetitions for late subscribers
-KEY_CHECK_INTERVAL = 0.5  # s, interval between key folder checks
+REPEAT_INTERVAL = 0.1  # minimum interval between message repetitions for late subscribers [s]
+KEY_CHECK_INTERVAL = 0.5  # interval between key folder checks [s]
 
 # Stops
-# s, time after a stop in which all requests except status are refused; a flood extends it.
+# Time after a stop in which all requests except status are refused [s]. A flood extends this time.
 REFUSAL_TIME = 0.02
-ANSWER_DELAY_MAX = 0.25  # s, limit for holding replies back until the refusal time ends
+ANSWER_DELAY_MAX = 0.25  # maximum time for which replies are held back after a stop [s]
 
 # Requests
-UNANSWERED_MAX = 16  # requests that await the loop's reply
+UNANSWERED_MAX = 16  # maximum number of requests that await the loop's reply
 # Requests that look like a stop are counted separately.
 URGENT_UNANSWERED_MAX = 32
-URGENT_SIZE_MAX = 256  # bytes, size limit of an urgent request
+URGENT_SIZE_MAX = 256  # size limit of an urgent request [bytes]
 CLIENT_QUEUE_LENGTH = 64  # queued requests per client
 TOTAL_QUEUE_LENGTH = 2048  # queued requests of all clients
 TOTAL_RATE = 2000.0  # requests per second, all clients combined
 CLIENT_RATE_MIN = 2.0  # requests per second, guaranteed to each client
-RECOVERY_TIME = 0.05  # s, pause after which a client that exceeded its rate is accepted again
+RECOVERY_TIME = 0.05  # pause after which a client that exceeded its rate is accepted again [s]
 
 # Steps
-STEP_WAIT_MAX = 0.01  # s, longest wait in a step
-TURN_TIME = 0.004  # s, time limit for reading requests in a step
-LINGER_TIME = 0.2  # s, time limit for sending queued messages after the loop has ended
+STEP_WAIT_MAX = 0.01  # longest wait in a step [s]
+TURN_TIME = 0.004  # time limit for reading requests in a step [s]
+LINGER_TIME = 0.2  # time limit for sending queued messages after the loop has ended [s]
 
 
 class Config(NamedTuple):
@@ -65,4 +65,4 @@ class Config(NamedTuple):
     ipc_mode: int = 0o600  # permissions of an ipc socket file
     keys: str = ""  # folder created by `softfinger keys`
     stream_key: str = "stream.address"  # setting named in error messages about the stream address
-    latest: str = ""  # address at which the first topic is published in single frames
+    latest: str = ""  # address that publishes the first topic in single frames

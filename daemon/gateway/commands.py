@@ -29,7 +29,8 @@ from softfinger.daemon.gateway.endpoints import NO_WAIT, Admission, Endpoint
 from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask
 
-_PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't be part of a string
+# This byte sequence cannot occur inside a string.
+_PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")
 _MALFORMED_REFUSAL = refusal(
     "envelope: expected one frame with the command, optionally after an envelope of at most "
     f"{bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes ending with an "
@@ -47,7 +48,7 @@ class Client:
     def __init__(self, per_second: float, now: float) -> None:
         self.waiting: deque[Ask] = deque()
         self.urgent = False  # True while an urgent request awaits its reply
-        self._behind = False  # True after exceeding the rate, until the client pauses
+        self._behind = False  # True from exceeding the rate until the client pauses
         self._left = per_second
         self._then = now
 
@@ -78,26 +79,26 @@ class CommandEndpoint(Endpoint):
         self._too_many = refusal(text, Reason.BUSY)
         self._send_to_loop = send_to_loop
         self._clock = clock
-        self.refused = 0  # requests refused by rate and queue limits
+        self.refused = 0  # number of requests refused by rate and queue limits
         self.stops = 0  # stop count stamped on new requests
         self._fence = 0  # current stop count
         self._last_poll = clock()
-        # Time of the last poll before a gap; None once all requests from the gap have been read.
+        # Time of the last poll before a gap, or None once all requests from the gap have been read.
         self._dated: float | None = None
-        self._left = 0  # maximum number of unread requests from the gap
+        self._left = 0  # maximum number of requests from the gap that are still unread
         self._since = 0.0  # time of the last stop, gap or `_arrived` check
-        self._arrived = 0  # requests since `_since`, except status
+        self._arrived = 0  # number of requests since `_since`, except status
         self._held: list[list[bytes]] = []  # replies held back
-        # s, time for which replies have been held back. A step adds at most REFUSAL_TIME, so that a
-        # stall of the process hardly counts.
+        # Time for which replies have been held back [s]. A step adds at most REFUSAL_TIME, so that
+        # a stall of the process has little effect.
         self._held_for = 0.0
         self._clients: OrderedDict[bytes, Client] = OrderedDict()
         self._active: set[bytes] = set()  # clients that sent a request in the current second
         self._active_until = 0.0
         self._turns: deque[Client] = deque()  # clients with queued requests
         self._urgent: deque[Ask] = deque()
-        self.count = 0  # queued requests, not counting urgent ones
-        self._under_way = [0, 0]  # requests that await the loop's reply: normal, urgent
+        self.count = 0  # number of queued requests, not counting urgent ones
+        self._under_way = [0, 0]  # number of requests that await the loop's reply: normal, urgent
         limit = bounds.PART_SIZE_RATIO * config.max_bytes
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
@@ -148,7 +149,7 @@ class CommandEndpoint(Endpoint):
 
     def _take(self, parts: list[bytes], name: str, now: float) -> None:
         """Queue or refuse one client message."""
-        # As with a REP socket, the frames up to the first empty frame are returned with the reply.
+        # Like a REP socket, return the frames up to the first empty frame with the reply.
         ends = parts.index(b"", 1) + 1 if b"" in parts[1:-1] else 1
         route, payload = parts[:ends], parts[-1]
         if sum(map(len, route)) > bounds.ENVELOPE_SIZE_MAX or len(parts) > bounds.PART_COUNT_MAX:
@@ -156,7 +157,7 @@ class CommandEndpoint(Endpoint):
         client = self._client(parts[0], now)
         self._arrived += b"status" not in payload
         self._left -= 1
-        if self._left < 0:  # More requests were read than the socket queues can hold.
+        if self._left < 0:  # The gateway has read more requests than the socket queues can hold.
             self._dated = None
         is_urgent = (
             _PACKED_STOP in payload and len(payload) <= bounds.URGENT_SIZE_MAX and not client.urgent

@@ -113,7 +113,7 @@ def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
     if path and (trouble := _taken(path)):
         raise AddressError(f"{address} {trouble}")
     bound.setsockopt(zmq.IPV6, int("[" in address))
-    before = os.umask(0o777 & ~ipc_mode)  # The file must never have wider permissions.
+    before = os.umask(0o777 & ~ipc_mode)  # The socket file must never have wider permissions.
     try:
         # libzmq binds only to numeric addresses.
         bound.bind(address.replace("tcp://localhost:", "tcp://127.0.0.1:"))
@@ -159,7 +159,7 @@ class Endpoint:
             If the address can't be bound.
         """
         self.socket: zmq.Socket[Any] = admission.context.socket(kind)
-        # Options apply only to later connections, so they must be set before bind.
+        # Socket options apply only to later connections, so they must be set before bind.
         self.socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LINGER_TIME))
         self.socket.setsockopt(zmq.MAXMSGSIZE, limit)
         self.socket.setsockopt(
@@ -199,7 +199,7 @@ class StreamEndpoint(Endpoint):
         self._topics = [name.encode() for name in config.topics]
         self._prefixes: set[bytes] = set()
         self._kept: dict[int, deque[bytes]] = {}  # each topic's last messages, for late subscribers
-        self._came_late = 0  # bit mask of topics to be repeated to late subscribers
+        self._came_late = 0  # bit mask of topics to repeat for late subscribers
         self._tell_at = 0.0  # earliest time of the next repetition
         self.wanted = 0  # bit mask of topics with subscribers
         super().__init__(

@@ -34,9 +34,9 @@ from softfinger.daemon.gateway.endpoints import (
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel
 
-_TIMER_INTERVAL = 0.5  # s, interval for resetting the timers that end a stalled process
+_TIMER_INTERVAL = 0.5  # interval between resets of the timers that end a stalled process [s]
 _LATEST_TOPIC = 0  # index of the topic that is also published in single frames
-# s, longest time that the authenticator thread waits for the interpreter lock during a flood.
+# Longest time for which the authenticator thread waits for the interpreter lock during a flood [s].
 _AUTHENTICATOR_WAIT = 5e-4
 
 
@@ -146,7 +146,7 @@ def main(words: list[str]) -> int:
             now = time.monotonic()
             if now - lived > _TIMER_INTERVAL:
                 lived = now
-                # SIGPROF and SIGALRM have no handlers, so they end the process.
+                # SIGPROF and SIGALRM have no handlers, so these signals end the process.
                 signal.setitimer(signal.ITIMER_PROF, bounds.STEP_CPU_TIME_MAX)
                 signal.setitimer(signal.ITIMER_REAL, bounds.STEP_TIME_MAX)
     except RestartNeeded as reason:
@@ -168,7 +168,7 @@ def _be_bounded() -> None:
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     except OSError:
-        pass  # Both measures are optional.
+        pass  # The daemon also works without these two measures.
 
 
 if __name__ == "__main__":

@@ -17,11 +17,12 @@ from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel, Link
 
 _ROOT = Path(__file__).parents[3]  # parent folder of the package
-_BIND_TIMEOUT = 60.0  # s, timeout for binding the sockets
-_STABLE_TIME = 10.0  # s, running time after which the restart delay is reset
-# s between checks, and the number of successive stopped states after which a process is killed.
+_BIND_TIMEOUT = 60.0  # timeout for binding the sockets [s]
+_STABLE_TIME = 10.0  # running time after which the restart delay is reset [s]
+# Interval between checks [s], and number of consecutive checks in the stopped state after which a
+# process is killed.
 _CHECK_INTERVAL, _STOPPED_COUNT_MAX = 1.0, 2
-_RESTART_DELAYS = 0.1, 2.0  # s, first and maximum delay between an exit and the next start
+_RESTART_DELAYS = 0.1, 2.0  # first and maximum delay between an exit and the next start [s]
 
 
 class Gateway:
@@ -53,15 +54,16 @@ class Gateway:
         ours, theirs = loop_link.pair()
         paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
-            # With -P, a folder named daemon in the working directory is not imported.
+            # The option -P keeps Python from importing a folder named daemon in the working
+            # directory.
             words = [sys.executable, "-P", "-m", f"{__package__}.server", str(theirs.fileno())]
             process = subprocess.Popen(
                 [*words, json.dumps(self._config)],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # The process runs in its own session, so Ctrl-C does not end it before it has sent
-                # the daemon's last messages.
+                # The process runs in its own session, so that Ctrl-C does not end it before it has
+                # sent the daemon's last messages.
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )

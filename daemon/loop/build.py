@@ -33,7 +33,7 @@ from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
-_RETRY_INTERVAL = 0.2  # s between connection attempts
+_RETRY_INTERVAL = 0.2  # time between connection attempts [s]
 
 if TYPE_CHECKING:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
@@ -188,7 +188,7 @@ class Daemon:
             closer = self._closers.pop()
             try:
                 closer()
-            except Exception as error:  # Torque off and the other functions must still run.
+            except Exception as error:  # Torque off and the other cleanup functions must still run.
                 logging.getLogger(__name__).error("closing: %s", error)
 
     def __enter__(self) -> Daemon:

@@ -31,7 +31,7 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-# s, maximum age of commands that stiffen or move the hand, except ``hold`` during a grip
+# Maximum age of commands that stiffen or move the hand, except ``hold`` during a grip [s].
 _START_AGE_MAX = 0.2
 
 
@@ -48,7 +48,7 @@ def command_age_max(settings: Settings, waits: bool) -> float:
 class Commands(Protocol):
     """Command source: `wire.command_server.CommandServer` or a recording."""
 
-    notices: deque[str]  # messages from the gateway process, emitted as events
+    notices: deque[str]  # messages from the gateway process, to be emitted as events
 
     @property
     def refused_by_pace(self) -> int:
@@ -100,7 +100,7 @@ class Loop:
             self.emit,
             command_age_max(settings, clock.pauses_when_late),
         )
-        self._after_opening: Breach | None = None  # fault to latch when the hand is open
+        self._after_opening: Breach | None = None  # fault to latch once the hand is open
         self.statistics = Statistics()
         self._lateness = Lateness(settings, self.state.timing, clock.pauses_when_late)
         self._publishing = None
@@ -111,7 +111,7 @@ class Loop:
         self._ending = False
         self._stopping = False
         self._began = -math.inf  # start of the current tick, machine time [s]
-        self._commanded = False  # a possibly slow command was executed on this tick
+        self._commanded = False  # True if a command that may be slow was executed on this tick
 
     # The following methods may be called from outside the tick, including from signal handlers.
 
@@ -157,7 +157,7 @@ class Loop:
         clock of a simulated hand has paused.
         """
         clock, timing = self._clock, self.state.timing
-        clock.sleep_until(clock.now())  # Time before the first tick does not count as a delay.
+        clock.sleep_until(clock.now())  # The time before the first tick does not count as a delay.
         before = clock.behind - timing.behind_s
         deadline = clock.now()
         last = clock.host() - self.period
@@ -359,7 +359,7 @@ class Loop:
             self._on_event(level, kind, text)
 
     def _with_cause(self, name: str, text: str) -> str:
-        # The command may have occupied the bus for a long time; the machine need not be busy.
+        # A command may have occupied the bus for a long time, even if the machine is not busy.
         at_work = 0.0 if self._commanded else self._clock.host() - self._began
         return self._lateness.with_cause(name, text, at_work)
 

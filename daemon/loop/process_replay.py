@@ -182,7 +182,7 @@ class _Commands:
             try:
                 handler(request, 0.0)
             except Refused:
-                pass  # The comparison of the states will show the difference.
+                pass  # The comparison of the states will reveal the difference.
         self.waiting = []
 
     def raise_fence(self) -> None:

@@ -27,7 +27,7 @@ _KEEP_ALIVE_FRACTION = 0.25  # keep-alive interval as a fraction of the watchdog
 _NEVER = float("inf")
 _LATENCY_DEVICE = "/dev/cpu_dma_latency"
 
-# Commands that grant the requested permissions to a user.
+# Shell commands that grant the requested permissions to a user.
 _LIMITS_FILE = "/etc/security/limits.d/softfinger.conf"
 _UDEV_RULE_FILE = "/etc/udev/rules.d/99-softfinger.rules"
 _LATENCY_UDEV_RULE = f'KERNEL=="cpu_dma_latency", GROUP="{serial_group()}", MODE="0660"'
@@ -45,12 +45,12 @@ GRANT_LATENCY = (
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
-# Numbers of the system calls sched_setattr and sched_getattr per machine type; the C library does
-# not wrap them. Their argument is struct sched_attr: size, policy, flags, nice, priority, runtime,
-# deadline, period.
+# System call numbers of sched_setattr and sched_getattr for each machine type. The C library does
+# not wrap these calls. Their argument is struct sched_attr: size, policy, flags, nice, priority,
+# runtime, deadline, period.
 _ATTRIBUTE_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 _ATTRIBUTES = struct.Struct("=IIQiIQQQ")
-_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # ns, range of time slices accepted by the kernel
+_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # range of time slices accepted by the kernel [ns]
 
 
 class RealTime:
@@ -63,7 +63,7 @@ class RealTime:
 
     def __init__(self, settings: Settings) -> None:
         self.granted: list[str] = []
-        self.refused: list[str] = []  # with consequence and remedy
+        self.refused: list[str] = []  # refused measures, each with its consequence and remedy
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
@@ -95,7 +95,7 @@ class RealTime:
             try:
                 self._undo.pop()()
             except OSError:
-                pass  # For example, the thread may have ended.
+                pass  # The thread may have ended.
 
     def __enter__(self) -> RealTime:
         return self

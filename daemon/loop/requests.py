@@ -28,7 +28,7 @@ from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, State
 
-AGE_MAX = 1.0  # s, maximum age of all commands except status and stop
+AGE_MAX = 1.0  # maximum age of all commands except status and stop [s]
 _COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE_KEYS = frozenset({"command", "client"})
 _MODE_REMEDIES = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
@@ -170,7 +170,7 @@ class Requests:
             "release": control.release,
             "set": control.set,
             "clear": control.disarm,
-            "demo": lambda: None,  # the loop starts the task
+            "demo": lambda: None,  # The loop itself starts the task.
             "status": lambda: None,
         }
         self._lease = Lease(settings.commands.lease)
@@ -190,7 +190,8 @@ class Requests:
             If the request is rejected. The message gives the reason.
         """
         state, control = self._state, self._control
-        if request["command"] == "stop":  # accepted in every mode, from any client, with any fields
+        # A stop is accepted in every mode, from any client, with any fields.
+        if request["command"] == "stop":
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}
         command = name, numbers, _ = parse(request, control.mode)
@@ -342,7 +343,8 @@ class Requests:
         if self._torque.servos is None or not silent:
             return
         if self._torque.pending and not state.read_error:
-            return  # The port works, and connecting would end the silence that stops the servos.
+            # The port works. Connecting now would end the bus silence that makes the servos stop.
+            return
         try:
             self._torque.reconnect()
         except ServoError as error:

@@ -23,24 +23,25 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 TIMES = ("wake", "compute", "bus", "publish")
 QUANTILES = (0.5, 0.99, 0.999)
 
-# Exponent of the first bin's lower edge, 2^-30 s = 0.93 ns. This bin also counts shorter times.
+# Exponent of the first bin's lower edge, which is 2^-30 s = 0.93 ns. The first bin also counts
+# shorter times.
 _LOWEST_EXPONENT = -29
-_OCTAVES = 36  # up to 64 s; the last bin also counts longer times
+_OCTAVES = 36  # number of octaves, up to 64 s; the last bin also counts longer times
 _BINS_PER_OCTAVE = 32
 _BIN_COUNT = _OCTAVES * _BINS_PER_OCTAVE
 _BIN_EDGES = np.ldexp(
     0.5 + 0.5 * np.arange(1, _BINS_PER_OCTAVE + 1) / _BINS_PER_OCTAVE,
     np.arange(_OCTAVES)[:, None] + _LOWEST_EXPONENT,
 )
-# Upper edges of the bins; the last bin is unbounded.
+# Upper edges of the bins. The last bin is unbounded.
 _UPPER_EDGES = np.append(_BIN_EDGES.ravel()[:-1], np.inf)
 
-LATENESS_MIN = 0.05  # s, minimum delay that is reported
-# s, minimum time between reports. In addition, each reported delay must be at least twice the
-# previous one.
+LATENESS_MIN = 0.05  # minimum delay that is reported [s]
+# Minimum time between reports [s]. In addition, the total delay must have doubled since the
+# previous report.
 REPORT_INTERVAL = 60.0
-ATTRIBUTION_TIME = 0.25  # s after a late tick during which faults may be attributed to it
-# Limits that a late tick alone can violate.
+ATTRIBUTION_TIME = 0.25  # time after a late tick during which faults may be attributed to it [s]
+# Limits that a single late tick can violate.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
 Event = tuple[str, str, str]
@@ -115,7 +116,7 @@ class Lateness:
         self._timing = timing
         self._period = 1.0 / settings.loop.rate
         self._waits = waits
-        self._sum = 0.0  # total tick delay, or total time the hand has waited [s]
+        self._sum = 0.0  # total tick delay, or total time for which the hand has waited [s]
         self._reported = (0.0, -math.inf)  # total delay and time of the last report [s]
         self._busy_until = -math.inf
 
@@ -131,7 +132,7 @@ class Lateness:
             timing.busy_s, self._busy_until = gap, t + ATTRIBUTION_TIME
         elif t > self._busy_until:
             timing.busy_s = 0.0
-        if self._waits:  # Before the next tick, the hand will also wait for this tick's delay.
+        if self._waits:  # The hand will also wait for this tick's delay before the next tick.
             self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
         elif gap > LATENESS_MIN:
             self._sum += gap

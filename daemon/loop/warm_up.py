@@ -198,7 +198,7 @@ def _joints(scene: WantedScene) -> None:
     winding_std(heat.array)
     time_to_limit(heat.array, 1.0, 70.0)
     sustained_square(heat.array, 70.0)
-    tip_position(0.0, 1.0, 0.0, 1.0, 0.0)  # used by the joint.opens limit
+    tip_position(0.0, 1.0, 0.0, 1.0, 0.0)  # for the joint.opens limit
     Setpoint(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time, SetpointState())
     Statistics()
 
@@ -216,6 +216,6 @@ _GRIP = Part("grip", 26, _grip)
 _JOINTS = Part("joints and timing", 13, _joints)
 _MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _JOINTS, _MANY)
-EMULATED = (_TABLE, _HAND, _SENSOR)  # for `softfinger emulate`
-LANDSCAPE = (_TABLE, _MANY)  # for the energy plot
-FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # for frame analysis
+EMULATED = (_TABLE, _HAND, _SENSOR)  # parts used by `softfinger emulate`
+LANDSCAPE = (_TABLE, _MANY)  # parts used by the energy plot
+FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # parts used by frame analysis

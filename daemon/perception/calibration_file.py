@@ -28,9 +28,9 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
-_PITCH = 1e-9  # m, tolerance for equal pitches
+_PITCH = 1e-9  # tolerance within which two pitches count as equal [m]
 _MONOTONE_POINTS = 257
-_FAULTY = 0.2  # fraction of the median range below which an unloaded cell is nearly saturated
+_FAULTY = 0.2  # minimum range of an unloaded cell, as a fraction of the median range
 
 
 class CalibrationFileError(TactileError):

@@ -71,7 +71,7 @@ def make_models(
             calibration = calibration_for(settings, finger)
         if measured:
             if name not in settings.scene.fingers:
-                continue  # It gets the other finger's model below.
+                continue  # This finger gets the other finger's model below.
             material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
             table = make_table(settings, material, tip)
         elif calibration is not None and calibration.modulus is not None:
@@ -180,7 +180,7 @@ def make_estimator(
         converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
         alive &= converter.live
         saturation, quantum = converter.saturation, converter.quantum
-        # The estimator subtracts 0.5 (in the unit of the frame) from a threshold.
+        # The estimator subtracts 0.5 frame units from a threshold.
         threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0
     if settings.tip.physics == "measured":
         return MeasuredEstimator(

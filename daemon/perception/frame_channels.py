@@ -57,18 +57,21 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
 
-D_MIN = 1e-5  # m, minimum displacement of a tip in contact
-# A frame is an outlier if it exceeds OUTLIER_GATE standard deviations and one of these limits.
-ANGLE_JUMP = 0.12  # rad; correct frames deviate from the prediction by at most 0.04
-D_JUMP = 1e-3  # m
-REJECTED_MAX = 2  # consecutive rejected frames that are tolerated before a sensor fault
-_JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must also show to confirm it
-_NORMAL_FORCE_MIN = 1.0  # N per tip; below this, an object may rock between the tips
-_RATE_INTERVAL_MIN = 0.005  # s, minimum interval for the rates of d and θ
-# A footprint that grows during the response time of the cells looks wider and flatter. These are
-# the relative changes per var(d)/d², from fitting a paraboloid to a mean of paraboloids.
+D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
+# A frame is an outlier if its deviation exceeds OUTLIER_GATE standard deviations and one of these
+# limits.
+ANGLE_JUMP = 0.12  # limit for the angle [rad]; correct frames deviate by at most 0.04 rad
+D_JUMP = 1e-3  # limit for the displacement [m]
+REJECTED_MAX = 2  # number of consecutive rejected frames that are tolerated before a sensor fault
+_JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
+# Minimum normal force per tip [N]; at a lower force, an object may rock between the tips.
+_NORMAL_FORCE_MIN = 1.0
+_RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
+# A footprint that grows during the response time of the cells looks wider and flatter. These
+# factors are the relative changes per var(d)/d². They come from fitting a paraboloid to a mean of
+# paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
-_SLOPE_SMOOTHING = 0.9  # low-pass coefficient per frame for ∂ ln F/∂d
+_SLOPE_SMOOTHING = 0.9  # low-pass coefficient of ∂ ln F/∂d, applied once per frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
 _FIRST_D_ERROR = 0.5  # relative standard deviation of d at first contact
 
@@ -193,7 +196,7 @@ def update(
     d_since = tip.travel[0] - at_scan.d
     q_since = tip.travel[1] - at_scan.q
     rotation_since = h.rotation - at_scan.angle
-    face = found.theta + sense * (tip.q - q_since)  # face angle at the scan [rad]
+    face = found.theta + sense * (tip.q - q_since)  # face angle at the scan time [rad]
     is_fitted = covariance[3, 3] > 0.0
     gain_is_fixed = not (is_fitted or h.gain_is_known)
     tilt = total_tilt(found.theta, found.tilt_y)
@@ -211,7 +214,7 @@ def update(
     if is_new_contact:
         tip.touch_time = h.t
         _begin_contact(h, finger, sense, face + rotation_since)
-    # While the cells still respond to the touch, they show motion that precedes the contact
+    # While the cells are still responding to the touch, they show motion from before the contact
     # history.
     cells_respond = h.t - tip.touch_time < h.response
     if is_new_contact or cells_respond:
@@ -231,7 +234,7 @@ def update(
         _set_d_slopes(h, finger, 1.0, 1.0, d_rate)
         d_std = math.sqrt(predicted_variance(h) + d_noise)
         h.slopes[:] = 0.0
-        # Two velocity units per joint
+        # Allow for two velocity counts per joint.
         joints_move = abs(tip.speed) + abs(other.speed) > 4.0 * h.velocity_unit
         jump = d_innovation if is_fitted else 0.0
         if _is_rejected(h.grasp, finger, angle_innovation, angle_std, jump, d_std, joints_move):
@@ -241,7 +244,7 @@ def update(
     tip.shear = found.shear
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
-    if gain_is_fixed:  # GAIN is a state, so its part of the error is not shared.
+    if gain_is_fixed:  # The gain is a state, so its error is not shared.
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = not cells_respond
@@ -260,8 +263,8 @@ def update(
         _set_d_slopes(h, finger, 1.0, 1.0, d_rate)
         _update_footprint(h, finger, d_innovation, d_noise)
     if is_fitted and not h.gain_is_known and gain > 0.0:
-        # The errors of d and gain are correlated, and the footprint has already used the common
-        # part.
+        # The errors of d and gain are correlated, and the footprint update has already used the
+        # common part.
         ratio = (covariance[0, 3] - systematic[0, 3]) / (d_noise * gain)
         gain_noise = (covariance[3, 3] - systematic[3, 3]) / (gain * gain)
         own_noise = max(gain_noise - ratio * ratio * d_noise, 0.0)

@@ -35,7 +35,7 @@ class GraspState(Record):
     force: Pair  # elastic tip forces [N]
     stiffness: Pair  # ∂F/∂d [N/m]
     normal: Pair  # normal forces [N]
-    shear: float  # ratio of shear to normal force at equilibrium without a load
+    shear: float  # ratio of shear force to normal force at equilibrium without a load
     angle_std: float  # standard deviation of the object angle [rad]
     taper: float  # angle α between the object faces [rad]
     tilt_moment_ratio: float  # (∂U/∂θ)/(F θ d) of an upright tip, a constant
@@ -44,16 +44,16 @@ class GraspState(Record):
     moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
     jacobian_rotation: Pair  # r1, r2 in φ̇ = r1 q̇1 − r2 q̇2
     jacobian_slide: float  # ∂(d1 + d2)/∂φ [m/rad]
-    energy_arm: Pair  # joint torque over force, from the energy gradient [m]
+    energy_arm: Pair  # joint torque divided by force, from the energy gradient [m]
 
     # A load L along the faces causes the mean residual load_arm L + load_curvature L².
     torque_residual: Pair  # joint torque attributed to a load along the faces [N·m]
-    load_arm: float  # [m], 0 if the torques show no load
+    load_arm: float  # moment arm of the load [m], or 0 if the torques show no load
     load_curvature: float  # [m/N]
-    pull_shear: float  # shear due to a pull, newest frames of solid tips [N]
-    twist_shear: float  # shear due to a twist, newest frames of solid tips [N]
+    pull_shear: float  # shear due to a pull, from the newest frames of solid tips [N]
+    twist_shear: float  # shear due to a twist, from the newest frames of solid tips [N]
     free_torque: Pair  # maximum torque of each joint during free approach [N·m]
-    unexplained_rotation: Pair  # accumulated object rotation not caused by the joints [rad]
+    unexplained_rotation: Pair  # accumulated object rotation that the joints do not explain [rad]
 
     # Consistency
     nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running average, expected value 1
@@ -65,8 +65,8 @@ class GraspState(Record):
     angle_bias: Pair  # [rad]
     angle_bias_std: Pair
     has_bias: Pair  # 1 if the sensor has a significant bias
-    gain_change: Pair  # log ratio of gain to its prior
+    gain_change: Pair  # logarithm of the ratio of the gain to its prior
     gain_std: Pair
     gain_prior_std: Pair
-    current_off_time: Pair  # duration of the deviation of a joint's current from its goal [s]
-    sensor_fault: bool  # a channel is faulty, so the grip force must not increase
+    current_off_time: Pair  # time for which a joint's current has deviated from its goal [s]
+    sensor_fault: bool  # True if a channel is faulty, so that the grip force must not increase

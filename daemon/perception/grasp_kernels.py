@@ -52,9 +52,9 @@ from softfinger.kinematics.hand.grasp_state import holding_moment_arms, load_tor
 
 FloatArray = NDArray[np.float64]
 
-_SUPPORT_FRICTION = 0.4  # N, friction between object and table
+_SUPPORT_FRICTION = 0.4  # friction between object and table [N]
 # A bias is significant if it exceeds all of these limits and OUTLIER_GATE standard deviations.
-_BIAS_RATIO_MIN = 0.8  # fraction of the other sensor's bias, because a bias partly appears in both
+_BIAS_RATIO_MIN = 0.8  # minimum ratio to the other sensor's bias; each bias partly appears in both
 _D_BIAS_MIN = 0.1  # fraction of d
 ANGLE_BIAS_MIN = 0.5 * ANGLE_JUMP  # rad
 
@@ -69,7 +69,7 @@ class TipResult(NamedTuple):
     d_std: float
     theta_std: float
     force_std: float
-    inside: bool  # within the contact table
+    inside: bool  # True if d and θ are within the contact table
 
 
 class GraspResult(NamedTuple):
@@ -118,7 +118,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
     if h.closing_speed > h.velocity_unit:  # Friction opposes the motion.
         innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
-        # After a decrease in torque, the gears may hold any part of the decrease.
+        # After a torque decrease, the gears may hold any part of the decrease.
         held_torque = min(h.torque_max - torque, h.load_held * torque)
         variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
         if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):

@@ -44,9 +44,9 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 FloatArray = NDArray[np.float64]
 
 # Standard deviations of the settings.
-_TAPER_ERROR = 0.1  # rad, `object.taper`
-_LATENCY_ERROR = 0.03  # s, `tactile.latency`
-_GOAL_DISTANCE = 0.25  # rad; a joint farther than this from its goal draws the full goal current
+_TAPER_ERROR = 0.1  # `object.taper` [rad]
+_LATENCY_ERROR = 0.03  # `tactile.latency` [s]
+_GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
 
 
 class HandEstimator:
@@ -104,9 +104,9 @@ class HandEstimator:
             _tilt_moment_ratio(table, state.radius) for table in tables
         )
         self._joints_read = False
-        self._factors_outdated = True  # a frame arrived after the factors were last written
+        self._factors_outdated = True  # True if a frame arrived after the last write
         self._in_contact = [False, False]
-        self._invalid = [Invalid.NO_FRAME] * 2  # why the newest estimate is not used
+        self._invalid = [Invalid.NO_FRAME] * 2  # reason why the newest estimate is not used
 
     def _set_prior(self, settings: Settings, priors: tuple[Prior, Prior]) -> None:
         """Set the priors and reset the state to them."""
@@ -172,7 +172,7 @@ class HandEstimator:
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
             return  # The contact is still predicted from joint motion, but its age increases.
-        # Without a joint reading, only the frame is used.
+        # Without a joint reading, the estimate is based on the frame alone.
         in_contact = estimate.contact and self._joints_read
         if in_contact and self._in_contact[finger] and not has_changed:
             contact.t_valid = frame.t_arrival
@@ -200,7 +200,7 @@ class HandEstimator:
         if not in_contact:
             tip = self._state.tip[finger]
             if tip.in_contact:
-                self.grasp.free_torque[finger] = 0.0  # measured again during the next approach
+                self.grasp.free_torque[finger] = 0.0  # measured again on the next approach
                 tip.free_torque_max[:] = 0.0
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0
@@ -296,7 +296,7 @@ def _fill_from_frame(
     contact.force = contact.energy = contact.force_std = 0.0
     contact.inside = True
     if not estimate.contact:
-        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # a contact hidden by noise
+        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # Noise may hide a contact.
         return
     tilt = total_tilt(contact.theta, contact.tilt_y)
     force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)

@@ -38,38 +38,39 @@ FloatArray = NDArray[np.float64]
 D, ENCODER, D_BIAS, ANGLE_BIAS, MODULUS, GAIN, TORQUE = range(0, 14, 2)
 ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 
-# Measurement channels, in the order of `grasp.CHANNELS`; the first four are pairs.
+# Measurement channels, in the order of `grasp.CHANNELS`. The first four are pairs.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-HISTORY_TIME = 0.5  # s of stored joint motion; older frames are treated as this old
-CURRENT_OFF_TIME_MAX = 0.1  # s, maximum time for which a current may differ from its goal
+HISTORY_TIME = 0.5  # duration of stored joint motion [s]; older frames are treated as this old
+CURRENT_OFF_TIME_MAX = 0.1  # maximum time for which a current may differ from its goal [s]
 LAW_POINTS = 17  # nodes in d from 0 to the radius
 
-GATE = 3.0  # standard deviations beyond which the effect of an innovation is reduced
-OUTLIER_GATE = 5.0  # standard deviations beyond which a deviation is a fault
+GATE = 3.0  # number of standard deviations above which an innovation has a reduced effect
+OUTLIER_GATE = 5.0  # number of standard deviations above which a deviation is a fault
 MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
-MODEL_ERROR_TIME = 0.1  # s, correlation time of these errors
-TORQUE_NOISE = 0.05  # N·m, of a moving joint: its friction changes with place and time
+MODEL_ERROR_TIME = 0.1  # correlation time of these errors [s]
+TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with place and time
 
 # Random walks during a grip, per √s
-_WALK_CLOSING = 2e-5  # m, for d1 + d2; small because the object width is constant
-_WALK_SIDEWAYS = 3e-4  # m, for d1 − d2; the object can move between the tips
-_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # m, for d1 − d2 if frames do not measure d independently
-_WALK_LOOSE_D = 5e-3  # m, contact without a grip
-_WALK_LOOSE_ANGLE = 2e-2  # rad, same case
-_WALK_ANGLE = 2e-4  # rad, tip creep
-_WALK_D_BIAS = 1e-4  # m, zero drift during sensor warm-up
+_WALK_CLOSING = 2e-5  # walk of d1 + d2 [m]; small because the object width is constant
+_WALK_SIDEWAYS = 3e-4  # walk of d1 − d2 [m]; the object can move between the tips
+_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # walk of d1 − d2 if frames do not measure d independently [m]
+_WALK_LOOSE_D = 5e-3  # walk of d in a contact without a grip [m]
+_WALK_LOOSE_ANGLE = 2e-2  # walk of the angle in a contact without a grip [rad]
+_WALK_ANGLE = 2e-4  # walk of the angle due to tip creep [rad]
+_WALK_D_BIAS = 1e-4  # zero drift during sensor warm-up [m]
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
-_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times gain
-_SIDEWAYS_ERROR = 0.1  # fraction of sideways finger motion that shifts the object in the grip
-_VELOCITY_TIME = 0.02  # s, correlation time of velocity rounding
-_VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to that before it
-_TOUCH_DELAY = 0.1  # s, delay from a touch until a frame shows it
+_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only the product of force and gain
+# Fraction of the sideways finger motion by which the object may shift in the grip.
+_SIDEWAYS_ERROR = 0.1
+_VELOCITY_TIME = 0.02  # correlation time of velocity rounding [s]
+_VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to the variance before it
+_TOUCH_DELAY = 0.1  # delay from a touch until a frame shows the contact [s]
 _CURRENT_ERROR = 0.25  # allowed relative deviation of a current from its goal
-_CURRENT_NOISE = 0.02  # A, additional allowed deviation
+_CURRENT_NOISE = 0.02  # additional allowed deviation of a current [A]
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
-_NIS_SAMPLES = 100.0  # number of measurements averaged for squared innovations
+_NIS_SAMPLES = 100.0  # number of measurements over which squared innovations are averaged
 
 
 class TrackedTip(Record):
@@ -77,24 +78,24 @@ class TrackedTip(Record):
 
     in_contact: bool
     touch_time: float  # start of the contact [s]
-    has_new_frame: bool  # a frame arrived after the last torque update
-    gain_is_fixed: bool  # its frames measure force times gain but not displacement
+    has_new_frame: bool  # True if a frame has arrived since the last torque update
+    gain_is_fixed: bool  # True if the frames measure force times gain but not displacement
     tilt_y: float  # [rad]
-    shear: float  # shear along the face in the hand plane, newest frame of a solid tip [N]
+    shear: float  # shear along the face in the hand plane, from the newest frame of a solid tip [N]
     log_slope: float  # ∂ ln F/∂d, low-pass filtered [1/m]
     d_innovation: float  # innovation of the newest frame [m]
-    shared_variance: Pair  # variance of d and θ common to all frames
+    shared_variance: Pair  # variance of d and θ that is common to all frames
     q: float  # tracked joint angle [rad]
     encoder: float  # last encoder reading [rad]
     speed: float  # joint speed [rad/s]
     torque: float  # joint torque [N·m]
     free_torque: float  # average torque without contact [N·m]
-    free_torque_max: Pair  # maxima in the current and the previous _TOUCH_DELAY window
+    free_torque_max: Pair  # maxima in the current and in the previous _TOUCH_DELAY window
     window_start: float  # [s]
-    travel: Pair  # integrated predicted motion of d [m] and the joint [rad]
+    travel: Pair  # integrated predicted motion of d [m] and of the joint [rad]
     law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F due to table and law
     relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered long-term forces [N]
-    relaxation: float  # relaxation factor ρ: tip force over long-term force
+    relaxation: float  # relaxation factor ρ, the ratio of tip force to long-term force
 
 
 class HistoryRow(Record):
@@ -102,7 +103,7 @@ class HistoryRow(Record):
 
     t: float
     d: Pair
-    spread: Pair  # variance of d within the cell response time [m²]
+    spread: Pair  # variance of d during the cell response time [m²]
     angle: float
     q: Pair
     relaxation: Pair
@@ -113,9 +114,9 @@ class HandFilter(Record):
 
     mean: Annotated[FloatArray, STATES]
     covariance: Annotated[FloatArray, STATES, STATES]
-    prior_mean: Annotated[FloatArray, STATES]  # means before a contact
-    prior_variance: Annotated[FloatArray, STATES]  # variances before a contact
-    slopes: Annotated[FloatArray, STATES]  # measurement row H, 0 between updates
+    prior_mean: Annotated[FloatArray, STATES]  # state means before a contact
+    prior_variance: Annotated[FloatArray, STATES]  # state variances before a contact
+    slopes: Annotated[FloatArray, STATES]  # measurement row H, which is 0 between updates
     scratch: Annotated[FloatArray, STATES]
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
@@ -127,17 +128,17 @@ class HandFilter(Record):
     response: float  # `tactile.response` [s]
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
     relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
-    torque_constant: float  # output torque of a closing joint per current [N·m/A]
+    torque_constant: float  # output torque per current of a closing joint [N·m/A]
     inertia: float  # joint inertia [kg·m²]
-    load_held: float  # fraction of the tip moment held by the gears when torque decreases
-    is_single: bool  # one-finger hand
-    is_gripping: bool  # a grip sets the joint torques
-    gain_is_known: bool  # `estimator.free_gain` is false
+    load_held: float  # fraction of the tip moment that the gears hold when torque decreases
+    is_single: bool  # True for a one-finger hand
+    is_gripping: bool  # True if a grip sets the joint torques
+    gain_is_known: bool  # True if `estimator.free_gain` is false
     t: float  # time of the last reading [s]
-    newest_row: int  # index in the history
+    newest_row: int  # index of the newest row in the history
     rotation: float  # integrated predicted rotation [rad]
     closing_speed: float  # mean speed of both joints, low-pass filtered [rad/s]
-    last_closing_speed: float  # on the previous tick [rad/s]
+    last_closing_speed: float  # mean closing speed on the previous tick [rad/s]
     torque_max: float  # maximum mean torque during this grip [N·m]
     balance_time: float  # time of the last torque and balance update [s]
     tip: Annotated[Records[TrackedTip], 2]
@@ -183,7 +184,7 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
             h.mean[i] += gain * innovation
             for j in range(STATES):
                 h.covariance[i, j] -= gain * h.scratch[j]
-        for k in (TORQUE, TORQUE + 1, LATENCY):  # These are hardly observable.
+        for k in (TORQUE, TORQUE + 1, LATENCY):  # These states are hardly observable.
             bound = OUTLIER_GATE * math.sqrt(h.prior_variance[k])
             error = h.mean[k] - h.prior_mean[k]
             h.mean[k] = h.prior_mean[k] + min(max(error, -bound), bound)
@@ -266,7 +267,7 @@ def predict(
         if not tip.in_contact:
             _measure_free_torque(h, k, t, dt, dq[k] - last_speed[k])
     h.t = t
-    if dt > HISTORY_TIME:  # After a pause, the encoders are the only source.
+    if dt > HISTORY_TIME:  # After a pause, the joint angles come from the encoders alone.
         dt = 0.0
         for k in range(2):
             h.tip[k].q = h.tip[k].encoder = q[k]
@@ -311,7 +312,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
-    # Before contact, a tip approaches at the rate at which it would later be compressed.
+    # Before contact, the gap closes at the rate at which d would increase in contact.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:
@@ -330,7 +331,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     right.q += step2
     left.travel[1] += step1
     right.travel[1] += step2
-    # An impossible step, for example due to a taper of 180°, would stay in the state forever.
+    # An impossible step, for example at a taper of 180°, would stay in the state forever.
     if not abs(d_step1) + abs(d_step2) + abs(rotation) * h.radius < h.radius:
         return
     left.travel[0] += d_step1
@@ -467,7 +468,7 @@ def _relax(h: HandFilter, finger: int, dt: float) -> None:
     """Advance a tip's relaxation (Prony series) by ``dt`` seconds and set its relaxation factor."""
     tip = h.tip[finger]
     lasting = h.grasp.force[finger] / tip.relaxation if tip.in_contact else 0.0
-    if not lasting < math.inf:  # beyond the range of the tip's law
+    if not lasting < math.inf:  # The step is beyond the range of the tip's material law.
         lasting = 0.0
     factor = 1.0
     for k in range(3):

@@ -24,12 +24,12 @@ from softfinger.daemon.types import FINGERS, Event, Frame, SensorInfo, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAME_COUNT = 16
-_ZERO_INTERVAL = 8  # frames between zero updates; thermal drift takes seconds
-_PRESSURE_STEPS = 65535  # quantisation steps of a published pressure
-_STORED_TIME = 2.0  # s of stored frames
-_REPEATED_TIME = 0.1  # s of repeated frames that indicate a fault
+_ZERO_INTERVAL = 8  # number of frames between zero updates; thermal drift takes seconds
+_PRESSURE_STEPS = 65535  # number of quantisation steps of a published pressure
+_STORED_TIME = 2.0  # time for which frames are stored [s]
+_REPEATED_TIME = 0.1  # duration of repetition that indicates a fault [s]
 _REPEATED_COUNT_MIN = 5  # minimum number of repeated frames for a fault
-_CHANGED_CELLS_MIN = 4  # minimum per frame; one or two noisy cells may repeat by chance
+_CHANGED_CELLS_MIN = 4  # minimum number of changed cells; noisy cells may repeat by chance
 
 
 class Perception:
@@ -42,7 +42,7 @@ class Perception:
         models: tuple[FingerModel, FingerModel],
     ) -> None:
         """Create the perception; ``sensors`` maps finger indices to sensors and may be empty."""
-        self.events: list[Event] = []  # published and removed by the loop
+        self.events: list[Event] = []  # events that the loop publishes and removes
         self.fingers = [
             FingerPerception(sensor, models[finger], settings, self.events)
             for finger, sensor in sorted(sensors.items())
@@ -84,8 +84,8 @@ class RepeatDetector:
     def __init__(self, rate: float, enabled: bool = True) -> None:
         """Create a detector for a frame ``rate`` [Hz]; ``enabled`` makes repetitions a fault."""
         self._enabled = enabled
-        self.period = 0  # repetition period in frames, 0 without repetition
-        self._repeated_count = 0  # consecutive frames with this period
+        self.period = 0  # repetition period in frames, or 0 without repetition
+        self._repeated_count = 0  # number of consecutive frames with this period
         self._fault_count = max(round(_REPEATED_TIME * rate), _REPEATED_COUNT_MIN)
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
         self._last: NDArray[np.uint16] | None = None  # frame
@@ -123,7 +123,7 @@ class FingerPerception:
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
         """Create the perception for one finger; each tare appends an event to ``events``."""
-        full = getattr(sensor, "full_count", None)  # Some recordings have their own value.
+        full = getattr(sensor, "full_count", None)  # Some recordings specify their own full count.
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
             settings = settings.model_copy(update={"tactile": own})
@@ -134,9 +134,9 @@ class FingerPerception:
         self.sensor = sensor
         self.frame: Frame | None = None
         self.frame_count = 0  # number of received frames
-        self.has_changed = True  # the newest frame is not a repetition
+        self.has_changed = True  # True if the newest frame is not a repetition
         self.changed_time = 0.0  # arrival time of the last frame that changed [s]
-        # A recording played in a loop repeats its frames.
+        # A recording that is played in a loop repeats its frames.
         self.repeats = RepeatDetector(settings.tactile.rate, tactile.backend != "replay")
         self.estimate = ContactEstimate()  # from the last valid frame
         active = getattr(sensor, "live", None)  # Some recordings lack cells.
@@ -151,11 +151,11 @@ class FingerPerception:
             self._converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
             self._scale = 1.0
             self._quantum = self._converter.quantum
-        self._readings: NDArray[Any] | None = None  # newest frame: counts above zero, or Pa
+        self._readings: NDArray[Any] | None = None  # newest frame in counts above zero or in Pa
         self._publishes_pressure = settings.stream.tactile_unit == "Pa"
         self.info = self._info(settings, model)
         self._events = events
-        self._zero: NDArray[np.uint16] | None = None  # used without a converter
+        self._zero: NDArray[np.uint16] | None = None  # zero offset, used without a converter
         self._live = np.ones(model.grid.shape, np.bool_) if active is None else active
         self._unloaded = UnloadedCells(model.grid, settings.tip.radius, self._live)
         self._noise = tactile.noise  # cell noise from the settings [Pa]
@@ -221,8 +221,7 @@ class FingerPerception:
             return self.frame.data
         if self._converter is None:
             return self._readings
-        # If the zero offset is below its calibrated value, a cell may exceed the range of the
-        # scale.
+        # If the zero offset is below its calibrated value, a cell reading may exceed the scale.
         steps = np.minimum(self._readings * (1.0 / self.info.scale), _PRESSURE_STEPS)
         return np.rint(steps).astype(np.uint16)
 
@@ -252,7 +251,7 @@ class FingerPerception:
             return
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
-        if not np.median(ends) > 0.0:  # Above such a zero offset, no contact could be measured.
+        if not np.median(ends) > 0.0:  # With such a zero offset, no contact could be measured.
             text = f"{side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))
             return

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-MODULUS_ERROR = 0.2  # relative, uncalibrated tip
-CALIBRATED_ERROR = 0.05  # relative, after `softfinger calibrate modulus`
+MODULUS_ERROR = 0.2  # relative modulus error of an uncalibrated tip
+CALIBRATED_ERROR = 0.05  # relative modulus error after `softfinger calibrate modulus`
 
 
 class Prior(NamedTuple):

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_RIM_DISTANCE = 2.0  # pitches from the tip rim beyond which a cell is unloaded
+_RIM_DISTANCE = 2.0  # distance from the tip rim above which a cell is unloaded, in pitches
 _CELL_COUNT_MIN = 50  # minimum number of cells for estimating zero shift and noise
-_AVERAGED_FRAME_COUNT = 8  # calls of `update`, time constant of the noise average
-_CLIPPED_FRACTION = 0.25  # fraction of cells at 0 above which noise is treated as clipped
+_AVERAGED_FRAME_COUNT = 8  # time constant of the noise average, in calls of `update`
+_CLIPPED_FRACTION = 0.25  # fraction of cells at 0 above which the noise counts as clipped
 _CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping
 
 
@@ -77,8 +77,8 @@ class UnloadedCells:
         if self._reference is None:
             self._reference = level
         self.zero_shift = round(level - self._reference)
-        # Use only readings above the median, since readings below it may be clipped. Limit the
-        # deviation to three standard deviations, since some cells may be loaded. Subtract the
+        # Use only readings above the median, since readings below the median may be clipped. Limit
+        # the deviation to three standard deviations, since some cells may be loaded. Subtract the
         # quantisation error (1/12), which the error budget adds separately.
         above = np.maximum(read - level, 0.0)
         deviation_max = 3.0 * max(self.noise, 1.0) if self._variance is not None else math.inf

@@ -55,7 +55,7 @@ def make_table(
     """
     tip = tip or make_tip(settings)
     try:
-        if tip.physics != "springs":  # Building such a table is fast, so it is not cached.
+        if tip.physics != "springs":  # This table is fast to build, so it is not cached.
             return ContactTable.build(tip, material)
         return _built(tip, material, settings.table.tolerance)
     except TableError as error:

@@ -25,10 +25,12 @@ from softfinger.daemon.profile.validation import plausibility_warnings, problems
 __all__ = ["load"]
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-_FILE_SIZE_MAX = 256 << 10  # bytes; the reference profile, which has every key, takes 21 kB
-_DEPTH_MAX = 8  # nesting depth of tables and arrays
+# Maximum file size [bytes]; the reference profile with all keys takes 21 kB.
+_FILE_SIZE_MAX = 256 << 10
+_DEPTH_MAX = 8  # maximum nesting depth of tables and arrays
 _ERROR_COUNT_MAX = 20  # maximum number of errors reported per load
-# Matches dotted keys with 16 or more parts, because tomllib needs minutes for thousands of parts.
+# Pattern for dotted keys with 16 or more parts. tomllib needs minutes for keys with thousands of
+# parts.
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
 _WORD = re.compile(r"\w+")
 _MESSAGE_START = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
@@ -209,7 +211,7 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
     except RecursionError:
         raise SettingsError(f"{name}: tables or arrays are nested too deeply") from None
-    except ValueError as error:  # TOMLDecodeError, or ValueError for a number with 5000 digits
+    except ValueError as error:  # TOMLDecodeError, or ValueError for an integer with 5000 digits
         raise SettingsError(f"{name}: not TOML: {error}") from None
 
 
@@ -222,7 +224,7 @@ def _change(data: dict[str, Any], change: str) -> str:
     try:
         value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
-        value = text.strip()  # a string whose quotes were removed by the shell
+        value = text.strip()  # The shell has removed the quotes of this string.
     held = data
     for section in sections:
         held = held.setdefault(section, {})
@@ -245,8 +247,7 @@ def _tuples(value: Any, depth: int = 0) -> Any:
         return {key: _tuples(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list):
         return tuple(_tuples(item, depth + 1) for item in value)
-    # Large integers are rejected here, because an integer with 5000 digits could not be printed
-    # later.
+    # Reject large integers here, because Python refuses to print an integer with 5000 digits.
     if isinstance(value, int) and value.bit_length() > 63:
         raise ValueError("an integer of more than 64 bits")
     return value

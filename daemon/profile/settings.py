@@ -242,8 +242,8 @@ class TactileSettings(Section):
     )
     pitch_error: float = setting(0.0, "", "Relative standard deviation of the pitch.", ge=0, le=0.1)
     rotation_error: float = setting(0.0, "rad", "Standard deviation of `rotation`.", ge=0, le=0.5)
-    # Crosstalk is below 3.3 % with a good read-out (arXiv 2508.20959), linearity ± 3 %
-    # (FlexiForce's manual).
+    # Crosstalk is below 3.3 % with a good read-out circuit (arXiv 2508.20959). Linearity is ± 3 %
+    # (FlexiForce manual).
     smooth_error: float = setting(
         0.035, "", "Relative standard deviation of pressure errors that neighbouring cells share, "
         "for example crosstalk and hysteresis.", ge=0, le=1

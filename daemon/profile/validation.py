@@ -16,9 +16,9 @@ from softfinger.daemon.backends import backend, servo_model
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
-_VALUE_LENGTH_MAX = 60  # characters, maximum length of a value in a message
+_VALUE_LENGTH_MAX = 60  # maximum length of a value in a message [characters]
 _DITHER_TICKS_MIN = 8  # minimum number of ticks per dither period
-_SENSOR_WIDTH_MAX = 2.0  # tip diameters; a larger sensor probably belongs to another tip
+_SENSOR_WIDTH_MAX = 2.0  # limit in tip diameters; a larger sensor probably belongs to another tip
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 

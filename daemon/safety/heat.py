@@ -29,14 +29,14 @@ from softfinger.kinematics.hand.servo_heat import (
     winding_std,
 )
 
-_UPDATE_INTERVAL = 0.5  # s between thermal model updates
-_AVERAGING_TIME = 5.0  # s, averaging time for the squared current
-# °C, half the thermometer's resolution, because the rounded reading reaches the limit early.
+_UPDATE_INTERVAL = 0.5  # time between thermal model updates [s]
+_AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
+# Half the thermometer's resolution [°C]. A rounded reading may reach the limit this much too early.
 _HALF_STEP = 0.5
-_TARGET_MARGIN = 3.0  # °C below the limit, target temperature after a reduction
+_TARGET_MARGIN = 3.0  # margin below the limit for the target temperature after a reduction [°C]
 _FRACTION_MAX = 0.97  # maximum ratio of new to old force for which a reduction is worthwhile
-_FRACTION_MIN = 0.6  # minimum ratio of new to old force; the first estimate is uncertain
-_SETTLING_TIME = 10.0  # s from a reduction to the next evaluation
+_FRACTION_MIN = 0.6  # minimum ratio of new to old force, because the first estimate is uncertain
+_SETTLING_TIME = 10.0  # time from a reduction to the next evaluation [s]
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
 # Winding fractions of the total heat capacity and thermal resistance.
 _WINDING_SHARE, _COUPLING_SHARE = 0.04, 0.4
@@ -73,7 +73,7 @@ class HeatWatch:
             for each in self._states:
                 set_law(each.law, settings)
         self._heat = [0.0, 0.0]  # ∫ I² dt since the last update [A² s]
-        self._square = [0.0, 0.0]  # smoothed squared current [A²]
+        self._square = [0.0, 0.0]  # low-pass filtered squared current [A²]
         self._t = math.nan  # time of the last reading [s]
         self._elapsed = 0.0  # time since the last update [s]
         self._reduction_time = -math.inf  # time of the last force reduction [s]
@@ -102,7 +102,7 @@ class HeatWatch:
             self._square[i] += (square - self._square[i]) * min(passed / _AVERAGING_TIME, 1.0)
             if not self._state.reading.temperature[i]:
                 continue  # No temperature has been read yet.
-            # Limit the step to suit the winding's time constant, even after a long gap in the
+            # Limit the step to suit the winding's time constant, even after a long gap between
             # readings.
             for _ in range(max(round(passed / _UPDATE_INTERVAL), 1)):
                 step = min(passed, _UPDATE_INTERVAL)

@@ -32,21 +32,23 @@ from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardwa
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 from softfinger.kinematics.hand.geometry import tip_position
 
-_NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention noise
-_WARNING_FRACTION = 0.9  # fraction of a fault limit at which a warning starts
-# A/rad, expected current per position error. The position loop of every servo model is stiffer.
+_NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention the noise
+_WARNING_FRACTION = 0.9  # fraction of a fault limit above which a warning is issued
+# Expected current per position error [A/rad]. Every servo model has a stiffer position loop.
 _CURRENT_PER_ERROR = 2.0
-_STANDSTILL_SPEED = 0.05  # rad/s, maximum speed of a joint at standstill
-# Minimum relative increase in commanded force, and fraction of it that must be measured.
+_STANDSTILL_SPEED = 0.05  # maximum speed of a joint at standstill [rad/s]
+# Minimum relative increase in commanded force, and minimum fraction of this increase that the tips
+# must measure.
 _FORCE_RISE_MIN = 0.2
-_RESPONSE_TIME = 0.3  # s, time allowed for the measured force to follow
-_STEP_TOLERANCE = 0.02  # rad, step tolerance beyond the distance at maximum velocity
-_DRIFT_MAX = 0.1  # rad, allowed difference between angle and integrated velocity
-_DRIFT_TIME = 0.1  # s, time window for this difference, which allows for velocity lag
-_LATE_TIME = 0.02  # s; if readings are farther apart than this and 3 ticks, the window restarts
-_FAILURE_TIME = 0.72  # s, time constant for the fraction of failed readings
-_FAILED_FRACTION_MAX = 0.75  # warning threshold, reached after 1 s without a valid reading
-_GAP_TIME = 0.1  # s, interval between readings above which steps are not checked
+_RESPONSE_TIME = 0.3  # time within which the measured force must follow [s]
+_STEP_TOLERANCE = 0.02  # step tolerance beyond the distance travelled at maximum velocity [rad]
+_DRIFT_MAX = 0.1  # allowed difference between the angle and the integrated velocity [rad]
+_DRIFT_TIME = 0.1  # time window of the drift check [s], which allows for velocity lag
+# Interval between readings above which the drift window restarts [s]. It must also exceed 3 ticks.
+_LATE_TIME = 0.02
+_FAILURE_TIME = 0.72  # time constant of the fraction of failed readings [s]
+_FAILED_FRACTION_MAX = 0.75  # fraction that is reached after 1 s without a valid reading
+_GAP_TIME = 0.1  # interval between readings above which position steps are not checked [s]
 
 
 class JointMotion:
@@ -75,7 +77,7 @@ class JointMotion:
         t = reading.t
         if not reading.valid or t == self._t:
             return
-        # Each reading is measured at an unknown time between request and reply.
+        # Each reading is measured at an unknown time between the request and the reply.
         longest, dt = t - self._request_time, t - self._t
         q, before, apart = reading.q, self._q, self._drift
         if longest < self._gap_time:
@@ -109,10 +111,10 @@ class View:
         self.grasp = GraspState() if grasp is None else grasp
         self.sensors = sensors
         self.wiring = WiringWatch(self.fingers)
-        self.failed = 0.0  # fraction of failed readings during about the last second
+        self.failed = 0.0  # fraction of failed readings in about the last second
         self._t = math.nan  # time of the previous state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
-        servos = settings.servos  # in current mode, the stiffness limits `pull`
+        servos = settings.servos  # In current mode, the stiffness limits `pull`.
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
             self.pull = min(self.pull, 0.5 * servos.stiffness)
@@ -120,7 +122,7 @@ class View:
         self.grip_width = math.nan  # object width at the start of the grip [m]
         self._target = math.nan  # commanded grip force on the previous tick [N]
         self.rise_t = math.inf  # time of a commanded increase without a measured response [s]
-        self.rise_felt = 0.0  # measured force at that time [N]
+        self.rise_felt = 0.0  # measured force at `rise_t` [N]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":
             model = by_name(settings.servos.model)
@@ -187,10 +189,10 @@ class Limit:
     keys: tuple[str, ...] = ()  # settings that define the limit
     needs: Literal["", "servos", "sensors"] = ""
     check: Check | None = None
-    lasts: float | str = 0.0  # required duration of a violation [s], or a setting name
+    lasts: float | str = 0.0  # time for which a violation must last [s], or the name of a setting
     fraction: float = 1.0  # applied fraction of the bound
-    in_turn: bool = False  # only one of these rows is checked per tick
-    gripping: bool = False  # applies only while gripping
+    in_turn: bool = False  # True if only one of these rows is checked per tick
+    gripping: bool = False  # True if the limit applies only while gripping
 
     def __call__(self, check: Check) -> Check:
         """Add the row with its check.
@@ -310,7 +312,7 @@ def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
 
 # --- joints ---------------------------------------------------------------------------------------
 
-_STOP_TOLERANCE = 0.1  # rad, tolerance for joints pushed beyond their limits
+_STOP_TOLERANCE = 0.1  # tolerance for joints pushed beyond their limits [rad]
 
 
 @Limit("joint.angle", "joint angle more than 0.1 rad beyond its limits", "fault",
@@ -343,8 +345,8 @@ def _joint_jump(view: View, _: State, __: float) -> str:
     )
 
 
-_POSITION_ERROR_MIN = 0.05  # rad, position error above which current is expected
-_EXPECTED_CURRENT_MIN = 0.04  # A, minimum expected current for the check
+_POSITION_ERROR_MIN = 0.05  # position error above which a current is expected [rad]
+_EXPECTED_CURRENT_MIN = 0.04  # minimum expected current for the check [A]
 _CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 
 
@@ -381,7 +383,7 @@ def _joint_current(view: View, state: State, _: float, i: int) -> str:
     return "" if well else f"{FINGERS[i]} joint draws {current:.2f} A, more than {bound:g} A"
 
 
-_FULL_CURRENT = 0.9  # fraction of the goal's current limit that counts as saturated
+_FULL_CURRENT = 0.9  # minimum fraction of the goal's current limit that counts as saturated
 
 
 @Limit("joint.stall", "joint that does not move although it is away from its goal and at "
@@ -428,7 +430,7 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     )
 
 
-_OVERLAP_RATIO = 0.5  # fraction of the tip radius; offset errors and frame latency cause less
+_OVERLAP_RATIO = 0.5  # minimum overlap in tip radii; offset errors and frame latency cause less
 
 
 @Limit("joint.opens",
@@ -458,7 +460,7 @@ def _joint_opens(view: View, state: State, _: float) -> str:
     )
 
 
-_CURRENT_FRACTION_MAX = 0.95  # fraction of the maximum current that counts as saturated
+_CURRENT_FRACTION_MAX = 0.95  # minimum fraction of the maximum current that counts as saturated
 
 
 @Limit("joint.strained", "joint that requires the maximum current in a grip", "warn",
@@ -625,7 +627,7 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
     return ""
 
 
-_GAIN_SIGMA = 1.5  # prior standard deviations; a larger gain error is reported
+_GAIN_SIGMA = 1.5  # number of prior standard deviations above which a gain error is reported
 
 
 def _gain_fault(view: View, finger: int) -> str:
@@ -647,8 +649,8 @@ def _add_consistency_checks(finger: int, side: str) -> None:
     def _sensor(view: View, state: State, _: float) -> str:
         if finger not in view.fingers:
             return ""
-        # Check the gain only during a grip. After release, the sensor cells may relax more slowly
-        # than the shape of the tip.
+        # Check the gain only during a grip. After a release, the sensor cells may relax more slowly
+        # than the tip's shape.
         return _sensor_fault(view, state, finger) or (
             _gain_fault(view, finger) if view.holds(state) else ""
         )
@@ -720,7 +722,7 @@ def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
 
 # --- the hand and its grip ------------------------------------------------------------------------
 
-_ANGLE_SIGMA = 4.0  # summed tilt standard deviations, minimum significant difference
+_ANGLE_SIGMA = 4.0  # minimum significant difference, in standard deviations of the summed tilt
 _ANGLE_TEXT = "difference between the two fingers' estimates of the object's angle"
 _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
@@ -732,7 +734,8 @@ _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
-    left, right = (sensor.estimate for sensor in view.sensors)  # newest frames only
+    # Estimates from the newest frames only.
+    left, right = (sensor.estimate for sensor in view.sensors)
     if not (left.contact and right.contact):
         return ""
     unsure = _ANGLE_SIGMA * (left.tilt_x_std + right.tilt_x_std)

@@ -20,11 +20,11 @@ from softfinger.daemon.safety.limits import LIMITS, Check, Limit, View
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Goal, State
 
-_REPEAT_TIME = 1.0  # s, time without a violation after which a warning may be repeated
+_REPEAT_TIME = 1.0  # time without a violation after which a warning may be repeated [s]
 _HYSTERESIS = 0.95  # fraction of the bound below which a reported warning clears
 
-BUS = "servos.bus"  # limit name for servo backend errors
-TORQUE_OFF = "torque.off"  # limit name for unconfirmed torque off, see `safety.torque_state`
+BUS = "servos.bus"  # limit name for errors of the servo backend
+TORQUE_OFF = "torque.off"  # limit name for an unconfirmed torque off, see `safety.torque_state`
 
 
 class Breach(NamedTuple):
@@ -42,7 +42,7 @@ class _Watch:
         self.check = check
         lasts = limit.lasts
         self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
-        self.since = math.inf  # start of the violation [s], inf if there is none
+        self.since = math.inf  # start of the violation [s], or inf if there is none
         self.reported = False
         self._ended = -math.inf
 
@@ -94,13 +94,13 @@ class Safety:
         ]
         self._each_tick = [watch for watch in watches if not watch.limit.in_turn]
         self._in_turn = [watch for watch in watches if watch.limit.in_turn]
-        # Keep the table order, because the first violation determines the fault name.
+        # Keep the table order, because the first violation determines the name of the fault.
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
         self._found: dict[_Watch, str] = {}  # current violations of fault limits
-        self.must_hold = False  # True if frames are late during a grip, so the goal is held
-        self.warnings: list[Breach] = []  # new warnings, reported and removed by the loop
-        self.limited: Counter[str] = Counter()  # number of ticks with a modified goal, by limit
+        self.must_hold = False  # True if late frames require holding the goal during a grip
+        self.warnings: list[Breach] = []  # new warnings, which the loop reports and removes
+        self.limited: Counter[str] = Counter()  # number of ticks with a modified goal, per limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
         dt = 1.0 / settings.loop.rate
         self._step = limits.goal_speed * dt
@@ -170,7 +170,7 @@ class Safety:
         goal = state.goal
         q, current = goal.q, goal.current
         present = state.reading.q
-        if state.seq - self._sent_seq != 1:  # torque was off: start here with zero current
+        if state.seq - self._sent_seq != 1:  # Torque was off, so start here with zero current.
             self._sent_q[:] = present
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq

@@ -18,9 +18,9 @@ from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 
-_TRY_FRACTION = 0.5  # fraction of the watchdog time for attempts before bus silence
-_TRY_TIME_UNGUARDED = 0.05  # s, duration of attempts before a report if servos.watchdog = 0
-_CLOSING_TRY_COUNT = 15  # attempts at shutdown
+_TRY_FRACTION = 0.5  # fraction of the watchdog time spent on attempts before the bus is kept silent
+_TRY_TIME_UNGUARDED = 0.05  # time spent on attempts before a report if servos.watchdog is 0 [s]
+_CLOSING_TRY_COUNT = 15  # number of torque-off attempts at shutdown
 
 
 class TorqueState:
@@ -53,7 +53,7 @@ class TorqueState:
         self._silent_until = -math.inf
         self._first = math.inf  # time of the first torque-off request [s]
         self._reported = False
-        self._port_gone = False  # True if the port is lost, so that sending is impossible
+        self._port_gone = False  # True if the port is lost and nothing can be sent
         self._last_try = -1  # seq of the tick with the last attempt
         self._unused = Reading()  # buffer for readings that are discarded
 
@@ -107,7 +107,7 @@ class TorqueState:
             return "confirmed"
         first = not self.pending
         if first:
-            state.torque = True  # another program may have switched torque on
+            state.torque = True  # Another program may have switched torque on.
             self._first = self._tried_since = state.t
             self._silent_until = -math.inf
         if self._last_try != state.seq and (first or not self._is_silent()):
@@ -138,12 +138,12 @@ class TorqueState:
         self.servos.connect()
         self.servos.read(self._state.reading)
         if self._state.torque:
-            # Torque may still be on if the port was lost before it could be turned off.
+            # Torque may still be on if the port was lost before torque could be turned off.
             self._last_try = -1
             self.off()
 
     def _on(self, servos: Servos) -> None:
-        self._state.torque = True  # From this point on, torque may be on, regardless of the reply.
+        self._state.torque = True  # From here on, torque may be on, regardless of the reply.
         try:
             servos.torque_on()
         except ServoError as error:

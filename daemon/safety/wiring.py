@@ -13,27 +13,27 @@ from collections.abc import Sequence
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.types import FINGERS, State
 
-_STANDING_MAX = 0.02  # rad, maximum motion of the stationary joint
-_CLOSING_MIN = 0.05  # rad, minimum closing motion of the other joint
+_STANDING_MAX = 0.02  # maximum motion of the stationary joint [rad]
+_CLOSING_MIN = 0.05  # minimum closing motion of the other joint [rad]
 # Minimum tip tilt as a fraction of the closing motion. With swapped IDs, a tip tilts by about the
-# rotation angle of its finger: by 0.9 of that angle in the simulated hand, on a sliding object.
+# rotation angle of its finger: in the simulated hand with a sliding object, by 0.9 of that angle.
 # With correct wiring, the fraction is 0.25.
 _TILT_RATIO = 0.5
-_TILT_SIGMA = 2.0  # number of tilt standard deviations that are added to the threshold
-_FORCE_RISE_MIN = 1.0  # N, minimum tip force increase
-_SETTLING_TIME = 0.07  # s after a touch, covers the frame latency and the joint's stopping time
-_WRONG_ROTATION = math.radians(4.0)  # rad, minimum rotation opposite to the command
-_TILT_SIGNS = (1.0, -1.0)  # sign of tip tilt when the finger closes
+_TILT_SIGMA = 2.0  # number of tilt standard deviations added to the threshold
+_FORCE_RISE_MIN = 1.0  # minimum tip force increase [N]
+_SETTLING_TIME = 0.07  # settling time after a touch [s]; covers frame latency and stopping time
+_WRONG_ROTATION = math.radians(4.0)  # minimum rotation opposite to the command [rad]
+_TILT_SIGNS = (1.0, -1.0)  # sign of the tip tilt while the finger closes
 
 
 class WiringWatch:
     """Check, during approach and rotation, that the moving joint and the responding tip match."""
 
     def __init__(self, fingers: Sequence[int]) -> None:
-        self.swapped = ""  # description of a detected swap, otherwise empty
+        self.swapped = ""  # description of a detected swap, or an empty string
         self._has_two_fingers = len(fingers) == len(FINGERS)
-        self._touching = -1  # finger in contact, -1 if none or both
-        self._since = 0.0  # start of that contact [s]
+        self._touching = -1  # finger in contact, or -1 for none or both
+        self._since = 0.0  # start of the single-finger contact [s]
         self._q = [0.0, 0.0]  # joint angles after the touch [rad]
         self._tilt = math.nan  # tilt after the touch [rad]
         self._force = 0.0  # force after the touch [N]
@@ -81,7 +81,8 @@ class WiringWatch:
 
     def _check_turn(self, state: State) -> None:
         angle, goal = state.object.angle, state.goal.angle
-        if goal != self._goal:  # Also true for NaN. A streamed goal changes on every tick.
+        # This condition is also true for NaN. A streamed goal changes on every tick.
+        if goal != self._goal:
             self._goal, self._turn = goal, math.nan
         if math.isnan(self._turn):
             if state.object.valid and abs(goal - angle) > 0.5 * _WRONG_ROTATION:

@@ -20,7 +20,7 @@ from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-CHECKED = reg.BACKUP_READY  # number of registers to read: addresses 0 to 146
+CHECKED = reg.BACKUP_READY  # number of registers to read, at addresses 0 to 146
 DRIVE_REVERSE = 0b0001
 FIX = "`softfinger doctor --fix`"
 REBOOT_FIX = "remove the cause, then reboot the servo with `softfinger doctor --fix`"
@@ -31,11 +31,11 @@ OLD_PROTOCOL = (
     "require firmware for Protocol 2.0), or use another servo",
 )
 _WATCHDOG_FIRMWARE = 38
-_FAULT_AFTER_LONG = 0.5  # s, values of servos.fault_after above this limit cause a notice
-_CONSTANT_RATIO_MAX = 1.3  # maximum ratio of a torque constant to the data sheet value
-_TEMPERATURE_MARGIN = 10  # °C below the temperature limit
-# rad beyond the hand's limits. A larger angle is implausible. Possible causes are a wrong zero
-# offset, or a servo that lost its turn count when it was switched off.
+_FAULT_AFTER_LONG = 0.5  # value of servos.fault_after above which a notice is issued [s]
+_CONSTANT_RATIO_MAX = 1.3  # maximum ratio of a torque constant to its data sheet value
+_TEMPERATURE_MARGIN = 10  # margin below the temperature limit [°C]
+# Tolerance beyond the hand's limits [rad]. A larger angle is implausible. Possible causes are a
+# wrong zero offset, or a servo that lost its turn count when it was switched off.
 ANGLE_MARGIN = 0.25
 
 
@@ -57,11 +57,11 @@ class Examined:
 
     finger: int
     id: int
-    replies: bool  # responds to a ping
+    replies: bool  # True if the servo responds to a ping
     table: Registers = field(default_factory=Registers)
     errors: tuple[Finding, ...] = ()
     notices: tuple[Finding, ...] = ()
-    misplaced: Finding | None = None  # None, or the finding that the joint angle is implausible
+    misplaced: Finding | None = None  # finding that the joint angle is implausible, or None
 
     @property
     def name(self) -> str:
@@ -145,7 +145,8 @@ def check_servo(
     )
     if not low <= volts <= high:
         fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
-        fix = FIX if fits else "check the power supply"  # the servo's own limits are too narrow
+        # If the voltage suits the model, the servo's own limits are too narrow.
+        fix = FIX if fits else "check the power supply"
         wrong(f"supply voltage is {volts:.1f} V, expected {low:.1f} to {high:.1f} V", fix)
     firmware = table[reg.FIRMWARE_VERSION]
     if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 # --- addresses -----------------------------------------------------------------------------------
 
-# EEPROM: retained over a reboot, writable only while torque is off.
+# The EEPROM registers are retained over a reboot and are writable only while torque is off.
 MODEL_NUMBER: Final = 0
 MODEL_INFORMATION: Final = 2
 FIRMWARE_VERSION: Final = 6
@@ -38,7 +38,7 @@ STARTUP_CONFIGURATION: Final = 60
 PWM_SLOPE: Final = 62
 SHUTDOWN: Final = 63
 
-# RAM: reset on every reboot.
+# The RAM registers are reset on every reboot.
 RAM: Final = 64
 TORQUE_ENABLE: Final = 64
 LED: Final = 65
@@ -80,10 +80,10 @@ COUNTS_PER_TURN: Final = 4096
 VELOCITY_UNIT: Final = 0.229 * 2.0 * math.pi / 60.0  # rad/s per count
 ACCELERATION_UNIT: Final = 214.577 * 2.0 * math.pi / 3600.0  # rad/s² per count
 VOLTAGE_UNIT: Final = 0.1  # V per count
-RETURN_DELAY_UNIT: Final = 2e-6  # s a count
-WATCHDOG_UNIT: Final = 0.020  # s a count
+RETURN_DELAY_UNIT: Final = 2e-6  # s per count
+WATCHDOG_UNIT: Final = 0.020  # s per count
 WATCHDOG_MAX: Final = 127
-WATCHDOG_ERROR: Final = 0xFF  # register 98 reads -1: goals are rejected until 0 is written
+WATCHDOG_ERROR: Final = 0xFF  # register 98 reads -1 and goals are rejected until 0 is written
 
 # --- operating modes, register 11 ----------------------------------------------------------------
 
@@ -124,9 +124,9 @@ def hardware_error_names(status: int) -> str:
 
 # --- models --------------------------------------------------------------------------------------
 
-_SPECIFIC_HEAT = 0.9  # J/(g K), approximation for plastic, aluminium and steel
-_CONVECTION = 10.0  # W/(m² K), small body in still air
-SAG: Final = 0.35  # Ω, simulated supply including cable
+_SPECIFIC_HEAT = 0.9  # approximate specific heat of plastic, aluminium and steel [J/(g K)]
+_CONVECTION = 10.0  # convection coefficient of a small body in still air [W/(m² K)]
+SAG: Final = 0.35  # resistance of the simulated supply, including cable [Ω]
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,14 +135,14 @@ class ServoModel:
 
     name: str
     number: int
-    firmware: int  # version reported by the emulated servo
+    firmware: int  # firmware version that the emulated servo reports
     highest_baud: int  # index into BAUD_RATES
-    current_unit: float  # A per count, 0 without a current sensor
+    current_unit: float  # A per count, or 0 without a current sensor
     current_limit: int  # default and upper bound
     velocity_limit: int  # default
     velocity_max: int  # upper bound of the velocity limit
-    temperature_limit: int  # °C, default
-    voltage_min: int  # 0.1 V, default and lower bound of the voltage limits
+    temperature_limit: int  # default [°C]
+    voltage_min: int  # default and lower bound of the voltage limits [0.1 V]
     voltage_max: int  # 0.1 V, default and upper bound
     velocity_gains: tuple[int, int]  # I, P
     position_gains: tuple[int, int, int]  # D, I, P
@@ -153,9 +153,9 @@ class ServoModel:
     mass: float  # g
     size: tuple[float, float, float]  # mm
     modes: tuple[int, ...] = tuple(MODE_NAMES)
-    pwm_slope: int | None = None  # default of register 62, None if the model lacks it
+    pwm_slope: int | None = None  # default of register 62, or None if the model lacks this register
     is_x330: bool = False  # True for the X330 series, whose indirect addresses moved in firmware 53
-    gear_loss: float = 0.0  # fraction of the gear torque lost to friction, if published
+    gear_loss: float = 0.0  # published fraction of the gear torque lost to friction, or 0
 
     @property
     def senses_current(self) -> bool:
@@ -224,14 +224,14 @@ class ServoModel:
 _ALL = tuple(MODE_NAMES)
 _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MODE)
 # One row per model, in the order of the ServoModel fields: name, number, firmware, highest baud, A
-# per count, current limit, velocity limit and its bound, °C, 0.1 V, gains, shutdown, etc. Sources:
-# the model's page in the ROBOTIS e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or …/mx/NAME-2/
-# (specifications and both areas of the control table). Where model numbers differ (XD430), the
-# source is control_table/dynamixel.model in dynamixel-sdk. The velocity limits for XH430-V,
-# XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's values are
-# for firmware before version 42. The page of the XW430-T200 lists the stall torque of the
-# XW540-T140, 6.9 N·m at 4.9 A. The values used are scaled by the gear ratio, 200 : 213, from those
-# of the XH430-W210. The same rule gives 3.2 N·m for the XW430-T333, whose page lists 3.1 N·m at
+# per count, current limit, velocity limit and its bound, °C, 0.1 V, gains, shutdown, etc. The
+# sources are the model's page in the ROBOTIS e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or
+# …/mx/NAME-2/ (specifications and both areas of the control table). Where model numbers differ
+# (XD430), the source is control_table/dynamixel.model in dynamixel-sdk. The velocity limits of
+# XH430-V, XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's
+# values are for firmware before version 42. The page of the XW430-T200 lists the stall torque of
+# the XW540-T140, 6.9 N·m at 4.9 A. The values used here are those of the XH430-W210, scaled by the
+# gear ratio, 200 : 213. The same rule gives 3.2 N·m for the XW430-T333, whose page lists 3.1 N·m at
 # 1.3 A.
 _430 = 82, (28.5, 46.5, 34.0)  # g, mm
 _540 = 165, (33.5, 58.5, 44.0)

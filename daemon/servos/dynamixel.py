@@ -54,14 +54,14 @@ _unpack_supply = struct.Struct("<HB").unpack_from  # voltage, temperature
 _unpack_clock = struct.Struct("<H").unpack_from
 _HEALTH_INTERVAL = 0.25  # s
 _CHECK_INTERVAL = 0.01  # s
-_CHECK_FRACTION = 0.05  # maximum fraction of the line capacity used for checks
-_RECENT_TIME = 0.035  # s, maximum age of a recent goal
-_FROZEN_TIME = 0.1  # s, maximum time for which a servo's 1 ms clock may stand still
-_VARIED_READ_COUNT = 32  # requests with varying span lengths after a missing reply
-_CHECK_TIMEOUT = 0.2  # s, reply timeout during the checks; `clear` blocks the loop for this time
-# s, reply timeout for an emulated hand, whose clock pauses while the machine is late.
+_CHECK_FRACTION = 0.05  # maximum fraction of the line capacity that checks may use
+_RECENT_TIME = 0.035  # maximum age of a recent goal [s]
+_FROZEN_TIME = 0.1  # maximum time for which a servo's 1 ms clock may stand still [s]
+_VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a missing reply
+_CHECK_TIMEOUT = 0.2  # reply timeout during the checks [s]; `clear` blocks the loop for this time
+# Reply timeout for an emulated hand, whose clock pauses while the machine is late [s].
 _BUSY_TIME = 0.04
-_CLOSING_TRY_COUNT = 10  # torque-off attempts when closing
+_CLOSING_TRY_COUNT = 10  # number of torque-off attempts when closing
 
 
 class DynamixelServos:
@@ -224,7 +224,7 @@ class DynamixelServos:
         group = self._reads.spans[span][turn]
         result = group.exchange()
         if result == COMM_RX_CORRUPT:
-            # Repeat the read within the first exchange's deadline.
+            # Repeat the read before the first exchange's deadline.
             deadline = group.port.deadline
             if time.monotonic() < deadline:
                 self._retries += 1

@@ -20,21 +20,22 @@ from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.servos.protocol import TRY_COUNT, FastGroupRead, GroupRead, PacketHandler
 
 Span = tuple[int, int]  # first and last address
-# Register spans read in one exchange: the one for most ticks; with goals and bus watchdog; with
-# supply voltage and temperature; from torque enable on.
+# Register spans that are read in one exchange. PRESENT is read on most ticks, CHECK adds goals and
+# bus watchdog, HEALTH adds supply voltage and temperature, and ENABLED begins at torque enable.
 PRESENT: Span = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
 CHECK: Span = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
 HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 # A late reply could be mistaken for the reply to the next request. After a missing reply, the next
-# requests therefore use spans of different lengths, so that the replies can be distinguished.
-LENGTH_COUNT = 11  # versions of each span: without and with up to ten preceding registers
+# requests therefore use spans of different lengths, so that their replies can be distinguished.
+LENGTH_COUNT = 11  # number of versions of each span, with zero to ten preceding registers
 
-EXCHANGE_COUNT = 50  # number of exchanges timed by `doctor`
-_TIMED_REPLY_TIMEOUT = 0.1  # s, minimum reply timeout for timed exchanges
-_CONNECT_READ_COUNT = 9  # reads in `connect`; the fastest one gives the minimum reply time
+EXCHANGE_COUNT = 50  # number of exchanges that `doctor` times
+_TIMED_REPLY_TIMEOUT = 0.1  # minimum reply timeout for timed exchanges [s]
+_CONNECT_READ_COUNT = 9  # number of reads in `connect`; the fastest gives the minimum reply time
 _REPLY_FRACTION_MAX = 0.8  # maximum duration of a reply as a fraction of a tick
-_FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2  # fraction of failed exchanges
+# Fractions of failed exchanges that cause a warning and a failure.
+_FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2
 
 
 class TickReads:

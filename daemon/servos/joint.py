@@ -13,7 +13,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.types import FINGERS
 
-_GOAL_LIMIT = 1_048_575  # counts, maximum goal in multi-turn modes
+_GOAL_LIMIT = 1_048_575  # maximum goal in multi-turn modes [counts]
 _CURRENT_AND_POSITION = struct.Struct("<hi")
 _CURRENT = struct.Struct("<h")
 _POSITION = struct.Struct("<i")
@@ -49,10 +49,10 @@ class JointScale:
     are motor currents; only their sign is converted, so that positive currents close the joint.
     """
 
-    direction: int  # +1 or -1, sign of the counts when closing
-    zero: int  # counts at q = 0
-    radian: float  # rad of the joint per position count, always > 0
-    velocity: float  # rad/s of the joint per velocity count, always > 0
+    direction: int  # +1 or -1, the sign of the counts when closing
+    zero: int  # position counts at q = 0
+    radian: float  # joint rotation per position count [rad], always > 0
+    velocity: float  # joint velocity per velocity count [rad/s], always > 0
     current_unit: float  # A per current count
 
     @classmethod
@@ -116,7 +116,7 @@ class Joint:
     dq: float = 0.0  # [rad/s]
     sent: deque[bytes] = field(default_factory=deque)  # recently sent goals as register bytes
     ticks: int = -1  # reading of the servo clock at the last check
-    ticked: float = math.inf  # time when that clock last advanced [s]
+    ticked: float = math.inf  # time when the servo clock last advanced [s]
 
     @property
     def name(self) -> str:

@@ -19,12 +19,12 @@ from dynamixel_sdk.port_handler import PortHandler
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.port_access import grant, port_group_remedy
 
-with contextlib.suppress(ModuleNotFoundError):  # on Windows, only simulated servos are supported
+with contextlib.suppress(ModuleNotFoundError):  # On Windows, only simulated servos are supported.
     import termios
 
 BITS_PER_BYTE = 10
-# s, reply timeout outside the loop (setup, calibration). It allows for a new servo with its factory
-# return delay, on a slow adapter and a busy machine.
+# Reply timeout outside the loop, for setup and calibration [s]. It allows for a new servo with its
+# factory return delay, on a slow adapter and a busy machine.
 UNPACED_TIMEOUT = 0.5
 _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")

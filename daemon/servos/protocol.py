@@ -46,17 +46,17 @@ from dynamixel_sdk.robotis_def import (
 from softfinger.daemon.servos.control_table import crc16
 from softfinger.daemon.servos.port import UNPACED_TIMEOUT, SerialPort
 
-TRY_COUNT = 3  # attempts per exchange outside the tick
+TRY_COUNT = 3  # number of attempts per exchange outside the tick
 _HEADER = b"\xff\xff\xfd"
 _PREFIX = _HEADER + b"\x00"
 _STUFFED = _HEADER + b"\xfd"
 _MAX_PACKET = 1024
-_STATUS_SIZE = 11  # bytes of a status packet without data
-_FAST_SYNC_READ = 0x8A  # not defined by dynamixel-sdk 3
+_STATUS_SIZE = 11  # length of a status packet without data [bytes]
+_FAST_SYNC_READ = 0x8A  # dynamixel-sdk 3 does not define this instruction
 _OLD_HEADER = b"\xff\xff"  # Protocol 1.0: header, ID, length, instruction or error, checksum
-_OLD_STATUS = 6  # bytes, length of a ping reply in Protocol 1.0
-_OLD_TIMEOUT = 0.5  # s; on a busy machine, an emulated servo may take longer than 0.1 s
-_ERROR_MASK = 0x7F  # mask for the error code in the error byte; the highest bit is the alert
+_OLD_STATUS = 6  # length of a ping reply in Protocol 1.0 [bytes]
+_OLD_TIMEOUT = 0.5  # timeout [s]; on a busy machine, an emulated servo may take longer than 0.1 s
+_ERROR_MASK = 0x7F  # mask for the error code in the error byte, whose highest bit is the alert
 
 
 def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -75,9 +75,9 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         self.timeouts = 0  # missing replies
         self.crc_errors = 0  # replies with an invalid CRC
         self.torn = 0  # incomplete replies
-        self.late = 0  # replies to an earlier request
-        self.refused = 0  # reads answered with an error
-        self.skipped_bytes = 0  # bytes outside any reply
+        self.late = 0  # number of replies to an earlier request
+        self.refused = 0  # number of reads that were answered with an error
+        self.skipped_bytes = 0  # number of bytes outside any reply
 
     @property
     def damaged(self) -> int:
@@ -133,7 +133,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 known = sender == BROADCAST_ID if fast_option else sender <= MAX_ID
                 if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != INST_STATUS:
                     self.skipped_bytes += 1
-                    del buffer[0]  # echo of the request, or noise
+                    del buffer[0]  # This byte is an echo of the request, or noise.
                     continue
                 end = 7 + length
                 if len(buffer) >= end:
@@ -190,12 +190,12 @@ class GroupRead:
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler = self._handler
-        for servo_id in self.data:  # Each servo sends its own reply in this order.
+        for servo_id in self.data:  # Each servo sends its own reply, in this order.
             while True:
                 packet, result = handler.rxPacket(self.port, False)
                 if result != COMM_SUCCESS:
                     return result
-                if packet[8] & _ERROR_MASK:  # data of an error reply are invalid
+                if packet[8] & _ERROR_MASK:  # The data of an error reply are invalid.
                     handler.refused += 1
                     return int(COMM_RX_CORRUPT)
                 if len(packet) != _STATUS_SIZE + self._length:
@@ -228,7 +228,7 @@ class FastGroupRead(GroupRead):
         for servo_id in self.data:
             if packet[at + 1] != servo_id:
                 return int(COMM_RX_CORRUPT)
-            if packet[at] & _ERROR_MASK:  # data of an error reply are invalid
+            if packet[at] & _ERROR_MASK:  # The data of an error reply are invalid.
                 handler.refused += 1
                 return int(COMM_RX_CORRUPT)
             self.errors[servo_id] = packet[at]
@@ -276,7 +276,7 @@ class ServoLine:
         request = _OLD_HEADER + body + bytes((~sum(body) & 0xFF,))
         port.send(request, _OLD_STATUS, time.monotonic() + _OLD_TIMEOUT)
         while True:
-            came = bytes(port.received).replace(request, b"")  # some adapters echo it
+            came = bytes(port.received).replace(request, b"")  # Some adapters echo the request.
             reply = came[max(came.find(_OLD_HEADER), 0) :][:_OLD_STATUS]
             if len(reply) == _OLD_STATUS:
                 sound = ~sum(reply[2:-1]) & 0xFF == reply[-1]

@@ -33,15 +33,15 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-SEARCH_TIME = 0.8  # s, listening time per baud rate, enough for 253 servos at 1 Mbaud
+SEARCH_TIME = 0.8  # listening time per baud rate [s], enough for 253 servos at 1 Mbaud
 FACTORY_ID = 1
 ONE_SERVO_ONLY = (
     "connect only one servo and run `softfinger doctor --fix`; then connect the next servo as "
     "well, and run the command again"
 )
 _READ_COUNT = 8  # number of full-table reads
-_REBOOT_TIMEOUT = 2.0  # s, maximum time from a reboot until the servo responds
-_WRITE_TIME = 0.05  # s, time for sending a packet and storing its data in the EEPROM
+_REBOOT_TIMEOUT = 2.0  # maximum time from a reboot until the servo responds [s]
+_WRITE_TIME = 0.05  # time for sending a packet and storing its data in the EEPROM [s]
 
 
 # --- finding servos ------------------------------------------------------------------------------
@@ -146,8 +146,8 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
         damaged += handler.damaged > before
         silent += result == COMM_RX_TIMEOUT
         if silent > 1 and not damaged:
-            break  # no servo uses this ID
-    return damaged > 1  # a single corrupted reply may be interference
+            break  # No servo uses this ID.
+    return damaged > 1  # A single corrupted reply may be interference.
 
 
 # --- identifying servos --------------------------------------------------------------------------
@@ -207,8 +207,8 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
         and not (each.id in anywhere and each.baud != servos.baud)
         and (each.id, each.baud) not in bad
     ]
-    # A servo with a finger's configured ID and baud rate belongs to that finger, even if the finger
-    # is not in the scene.
+    # A servo with a finger's configured ID and baud rate belongs to that finger, even if the scene
+    # does not contain the finger.
     others = {each for each in strangers if each.baud == servos.baud and each.id in servos.ids}
     fit = [each for each in strangers if each.number == model.number and each not in others]
     missing = [servo_id for servo_id in ids if servo_id not in home]
@@ -335,7 +335,7 @@ def _set_up(
     def failed(problem: str) -> None:
         result.append(Finding("warn", name, problem))
 
-    # At status return level 0, servos do not reply to reads, so set the level before the first
+    # At status return level 0, servos do not reply to reads, so set this level before the first
     # read.
     if line.read(servo_id, reg.STATUS_RETURN_LEVEL, 1) is None:
         if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
@@ -347,7 +347,7 @@ def _set_up(
     if table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
         return None
     rows = required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION])
-    # Write the operating mode first, because this resets gains, profiles and goals.
+    # Write the operating mode first, because this write resets gains, profiles and goals.
     for row in sorted(rows, key=lambda row: row.register.address != reg.OPERATING_MODE):
         raw = line.read(servo_id, row.register.address, row.register.size) or b""
         wrong = row.wrong_in(raw, row.register.address) if raw else None
@@ -418,7 +418,7 @@ def _reboot(line: ServoLine, servo_id: int) -> int | None:
     line.handler.reboot(line.port, servo_id)
     end = time.monotonic() + _REBOOT_TIMEOUT
     while time.monotonic() < end:
-        # A ping without a reply waits for its deadline, which paces this loop.
+        # A ping without a reply waits for its deadline, so this loop does not need its own pause.
         if line.ping(servo_id, tries=1) is not None:
             status = line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
             return status[0] if status else None

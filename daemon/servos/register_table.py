@@ -24,10 +24,11 @@ from softfinger.daemon.servos.base import Status
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 
-# In one read, the return delays of both servos add up. If each delay were longer than 50 µs, a read
-# would exceed a tick at 500 Hz.
+# A read takes the sum of both servos' return delays. With delays longer than 50 µs, a read would
+# exceed a tick at 500 Hz.
 RETURN_DELAY_MAX: Final = 25
-# Drive mode bits: follow another servo, and switch torque on when a goal is written.
+# Drive mode bits that must be clear. They make a servo follow another servo, or switch torque on
+# when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
 _STARTUP_FIRMWARE = 45
@@ -52,8 +53,8 @@ class Register(NamedTuple):
         return value.to_bytes(self.size, "little", signed=value < 0)
 
 
-# Registers stored by `doctor --save` for a later restore. ID, baud rate and protocol are excluded,
-# because a servo no longer replies at its address after they change.
+# Registers that `doctor --save` stores for a later restore. ID, baud rate and protocol are
+# excluded, because a servo no longer replies at its old address once they have changed.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),
@@ -93,10 +94,10 @@ class Requirement(NamedTuple):
 
     register: Register
     holds: Callable[[int], bool]
-    mended: Callable[[int], int]  # replacement for a wrong value
-    told: Callable[[int], str]  # description of a wrong value and the expected value
+    mended: Callable[[int], int]  # function that returns the replacement for a wrong value
+    told: Callable[[int], str]  # function that describes a wrong value and the expected value
     status: Status
-    armed: bool = False  # RAM written by `arm`
+    armed: bool = False  # True for RAM that `arm` writes
     then: str = ""  # action required after the value is corrected
 
     def wrong_in(self, table: bytes, start: int = 0) -> int | None:
@@ -238,7 +239,8 @@ def required_registers(
     if model.pwm_slope is not None:
         why = "the motor voltage ramps at a different rate"
         row = _exactly(reg.PWM_SLOPE, slope := model.pwm_slope, why, "warn")
-        rows.append(row._replace(holds=lambda found: found in (0, slope)))  # 0: not implemented
+        # The register reads 0 if the firmware does not implement it.
+        rows.append(row._replace(holds=lambda found: found in (0, slope)))
     rows += armed_registers(model)
     return sorted(rows, key=lambda row: row.register.address)
 

@@ -16,8 +16,8 @@ from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.joint import JointScale, current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
-_HEALTH_INTERVAL = 0.25  # s between temperature and supply voltage readings
-_OVERLOAD_TIME = 2.0  # s at the current limit until an overload error occurs
+_HEALTH_INTERVAL = 0.25  # time between temperature and supply voltage readings [s]
+_OVERLOAD_TIME = 2.0  # time at the current limit until an overload error occurs [s]
 
 
 class MotorHeat(Protocol):
@@ -64,7 +64,7 @@ class SimulatedServos:
         self._last = -math.inf  # time of the last exchange
         self._goal_q = [0.0, 0.0]
         self._goal_current = [0.0, 0.0]
-        self._q = [0.0, 0.0]  # last angle and velocity readings [rad, rad/s]
+        self._q = [0.0, 0.0]  # last readings of angle [rad] and velocity [rad/s]
         self._dq = [0.0, 0.0]
         self._seq = 0
         self._errors = [0, 0]  # hardware error bits
@@ -86,7 +86,7 @@ class SimulatedServos:
             reading.valid = False
             return
         reading.t = self._exchange()
-        # Python floats are faster to access one at a time.
+        # Reading single elements is faster from Python floats than from an array.
         q, dq = self._hand.q.tolist(), self._hand.dq.tolist()
         for joint in self._joints:
             scale = self._scales[joint]
@@ -161,7 +161,7 @@ class SimulatedServos:
             limit = self._settings.current_limit[joint]
             bound = scale.bound_counts(min(abs(goal.current[joint]), limit))
             current = bound * scale.current_unit
-            if self._mode == reg.CURRENT_MODE:  # the daemon's position loop
+            if self._mode == reg.CURRENT_MODE:  # This is the daemon's position loop.
                 q, dq = self._q[joint], self._dq[joint]
                 current = current_toward(self._settings, goal.q[joint], current, q, dq)
                 counts = min(max(scale.current_counts(current), -bound), bound)

@@ -26,9 +26,9 @@ _GOAL_BYTES = (
     *range(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 2),
     *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
-_PACKET_COUNT = 2  # copies of each torque-off packet, which has no reply
-_ON_TIMEOUTS = 50  # time limit for switching on, in reply timeouts; it blocks the loop
-_MOTION_MAX = 8  # counts (0.7°), allowed motion of a limp joint before torque is on
+_PACKET_COUNT = 2  # number of copies of each torque-off packet, which has no reply
+_ON_TIMEOUTS = 50  # time limit for switching on, in reply timeouts; switching on blocks the loop
+_MOTION_MAX = 8  # allowed motion of a limp joint before torque is on, in counts (0.7°)
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
@@ -64,7 +64,7 @@ class Torque:
         self._mode = reg.MODE_NUMBERS[servos.mode]
         ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
         self._ticks = min(ticks, reg.WATCHDOG_MAX)
-        self._not_after = math.inf  # deadline for switching on [s, time.monotonic()]
+        self._not_after = math.inf  # deadline for switching on, in time.monotonic() [s]
         ids = list(self._joints)
         self._offs = [
             GroupWrite(line.port, reg.TORQUE_ENABLE, 1, each) for each in (ids, *([i] for i in ids))
@@ -83,7 +83,7 @@ class Torque:
         """
         self._not_after = time.monotonic() + _ON_TIMEOUTS * self._line.port.reply_timeout
         self._refuse_hardware_errors()
-        # Writing 0 clears a watchdog stop, during which goals are read-only.
+        # Writing 0 clears a watchdog stop; until then, goals are read-only.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
         self._write_registers()
         goals = self._choose_goals()

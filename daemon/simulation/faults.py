@@ -31,20 +31,20 @@ LATE_REPLY_DELAY = 0.010  # s
 class LineFaults:
     """Fault probabilities (0 to 1) per instruction or reply, and the delay of all replies."""
 
-    lose: float = 0.0  # an instruction is lost
+    lose: float = 0.0  # probability that an instruction is lost
     lose_writes: float = 0.0  # additional probability that an instruction other than a read is lost
-    drop: float = 0.0  # a reply is lost
-    late: float = 0.0  # a reply is late by LATE_REPLY_DELAY
-    truncate: float = 0.0  # the end of a reply is missing
-    corrupt: float = 0.0  # one bit of a reply is flipped
-    duplicate: float = 0.0  # a reply is sent twice
-    delay: float = 0.0  # s, delay of all replies, as with a slow adapter
+    drop: float = 0.0  # probability that a reply is lost
+    late: float = 0.0  # probability that a reply is late by LATE_REPLY_DELAY
+    truncate: float = 0.0  # probability that the end of a reply is missing
+    corrupt: float = 0.0  # probability that one bit of a reply is flipped
+    duplicate: float = 0.0  # probability that a reply is sent twice
+    delay: float = 0.0  # delay of all replies, as with a slow adapter [s]
 
 
 LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
 _SERVO_FAILURES = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
 SERVO_FAULTS = ("silent", "answer", "reboot", *_SERVO_FAILURES, "recover")
-BOARD_FAULTS = {  # kind → default probability
+BOARD_FAULTS = {  # default probability of each kind
     "torn": 0.1,
     "noisy": 0.1,
     "silent": 1.0,
@@ -108,16 +108,16 @@ class MeasurementFault(NamedTuple):
 
 MEASUREMENT_FAULTS = {
     "gain": MeasurementFault(1.0, 0.0, 100.0),  # factor for the pressure of all cells
-    # cells, shift towards higher columns, filled with zeros
+    # Shift of the image towards higher columns, in cells. The gap is filled with zeros.
     "shift-x": MeasurementFault(0.0, -255.0, 255.0),
-    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # cells towards higher rows
-    "mirror": MeasurementFault(0.0, 0.0, 1.0),  # 1 reverses the column order
-    # offset of all cells as a fraction of the maximum count
+    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # shift towards higher rows, in cells
+    "mirror": MeasurementFault(0.0, 0.0, 1.0),  # A value of 1 reverses the column order.
+    # Offset of all cells, as a fraction of the maximum count.
     "drift": MeasurementFault(0.0, -1.0, 1.0),
-    "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # s of repeated frames
+    "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # duration of the repeated frames [s]
     "current": MeasurementFault(1.0, -100.0, 100.0),  # factor for the measured current
 }
-SWITCHED_FAULTS = ("mirror", "replay")  # either on or off
+SWITCHED_FAULTS = ("mirror", "replay")  # faults that are either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
@@ -130,8 +130,8 @@ class FaultEvent(NamedTuple):
     after: float  # s
     part: str  # ``servos``, ``object``, ``all``, or a finger (board or measurements)
     kind: str
-    value: float = 1.0  # probability, servo ID, load, or measurement fault value
-    over: float = 0.0  # s, duration of the fault's increase
+    value: float = 1.0  # probability, servo ID, load, or value of a measurement fault
+    over: float = 0.0  # time over which the fault grows to its full value [s]
 
     def __str__(self) -> str:
         if self.kind == WELL:
@@ -149,9 +149,9 @@ class _Form(NamedTuple):
     """Fault types with the same syntax."""
 
     kinds: Collection[str]
-    value: str  # syntax of the value: in brackets if optional, empty if none
-    parts: tuple[str, ...]  # affected parts if the word does not name a finger
-    sided: bool = False  # the word may name a finger
+    value: str  # syntax of the value, in brackets if optional, empty if there is no value
+    parts: tuple[str, ...]  # parts that are affected if the word does not name a finger
+    sided: bool = False  # True if the word may name a finger
 
     def fits(self, side: str | None, kind: str, valued: bool) -> bool:
         """Return True if a word may have this syntax."""
@@ -169,7 +169,7 @@ class _Form(NamedTuple):
         return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
 
 
-# The first type that matches is used: `silent=2` and `frozen=2` are servo faults, whereas
+# The first matching type is used, so `silent=2` and `frozen=2` are servo faults, whereas
 # `left:silent` and `silent` are board faults.
 _ID = "=ID"
 _FORMS = (
@@ -177,7 +177,7 @@ _FORMS = (
     _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True),
     _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
-    # N, along the faces and away from the palm; N·m
+    # Forces along the faces and away from the palm [N], and torque [N·m].
     _Form(("push", "twist"), "=NUMBER", (OBJECT,)),
     _Form(_PORT_FAULTS, "", (SERVOS,), sided=True),
     _Form((WELL,), "", (ALL,), sided=True),

@@ -54,7 +54,7 @@ _HEADER = struct.Struct("<BBHIHH")
 _CRC = struct.Struct("<H")
 _CRC_START = 0xFFFF
 _TICK = 1e-6  # s per tick of the board clock
-_BLOCK = 254  # bytes, maximum block of a COBS code
+_BLOCK = 254  # maximum length of a COBS block [bytes]
 
 
 def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
@@ -91,7 +91,7 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
     within a block. The code has no data-dependent branches, because these would be unpredictable.
     """
     code = np.int64(_BLOCK + 1)  # code of the current block
-    left = np.int64(0)  # number of remaining bytes of the block
+    left = np.int64(0)  # number of bytes that remain in the block
     size = 0
     for byte in packet:
         value = np.int64(byte)
@@ -108,7 +108,7 @@ class CobsDecoder(DelimitedDecoder):
 
     def __init__(self, rows: int, cols: int) -> None:
         super().__init__(rows, cols, b"\0", longest_frame(rows, cols))
-        # Compile the kernel now rather than at the first frame.
+        # Compile the kernel now instead of at the first frame.
         unstuff(np.frombuffer(bytearray(b"\1"), np.uint8), np.zeros(1, np.uint8))
         self._bad_crc = 0
         self._missed = 0

@@ -104,9 +104,9 @@ class DelimitedDecoder(Decoder):
         super().__init__(rows, cols, longest)
         self.longest = longest
         self._delimiter = delimiter
-        # number of bytes in the buffer that were already searched for a delimiter
+        # Number of bytes in the buffer that were already searched for a delimiter.
         self._scanned = 0
-        self._reason = ""  # short reason for rejecting the last rejected packet
+        self._reason = ""  # short reason why the last packet was rejected
 
     @abstractmethod
     def parse(self, packet: bytearray, t: float) -> Decoded | None:

@@ -18,10 +18,10 @@ from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
-_SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest
+_SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest one
 _MARKER_COUNT_MAX = 96  # number of markers stored to recognise another grid size
-_GAP_TIME = 1e-3  # s, minimum gap between frames
-_CELL_COUNT_MIN = 16  # cells; ``AA 55`` pairs that are closer than this are image content
+_GAP_TIME = 1e-3  # minimum gap between frames [s]
+_CELL_COUNT_MIN = 16  # minimum number of cells; ``AA 55`` pairs closer together are image content
 
 
 class FlexiTacDecoder(Decoder):
@@ -47,15 +47,15 @@ class FlexiTacDecoder(Decoder):
     def __init__(self, rows: int, cols: int, byte_time: float = 5e-6) -> None:
         """Create a decoder; ``byte_time`` is the transmission time of one byte [s]."""
         super().__init__(rows, cols, len(MARKER) + rows * cols)
-        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # s, maximum per frame
+        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # [s]
         self._t_whole = -math.inf  # time at which the last returned frame was complete
         self._start = 0  # stream position of the buffer's first byte
-        # Stream position of the end, and read time, of each piece in the buffer.
+        # Stream position of the end of each piece in the buffer, and its read time.
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
         self._markers: deque[int] = deque(
             maxlen=_MARKER_COUNT_MAX
-        )  # stream positions of markers while not locked
+        )  # stream positions of the markers found while not locked
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
         self._buffer += data

@@ -124,7 +124,7 @@ class ReplayTactile:
 
     def latest(self) -> Frame | None:
         """Return the newest frame that is due, or None if the sensor is not open."""
-        now = self._clock.now() + 1e-9  # includes a frame that is due now
+        now = self._clock.now() + 1e-9  # The margin includes a frame that is due now.
         if now < self._due:
             return self._frame
         turn = math.floor((now - self._start) / self._period)

@@ -24,12 +24,13 @@ from softfinger.daemon.types import Frame
 
 __all__ = ["SerialReader"]
 
-_READ_SIZE = 65536  # bytes per read, equal to the capacity of a Linux tty
+_READ_SIZE = 65536  # number of bytes per read, which equals the capacity of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-_GAP_TIME = 5e-4  # s, time without a byte that counts as a gap between frames
-_REQUEST_TIMEOUT = 0.1  # s, time after a frame's transmission time at which the request is repeated
-_WAIT_MIN = 3e-4  # s; shorter waits cost more than the wake-ups they avoid
-_WAIT_MAX = 2e-3  # s, maximum delay if the number of missing bytes is wrong
+_GAP_TIME = 5e-4  # time without a byte that counts as a gap between frames [s]
+# Waiting time beyond a frame's transmission time before the request is repeated [s].
+_REQUEST_TIMEOUT = 0.1
+_WAIT_MIN = 3e-4  # minimum wait [s]; shorter waits cost more than the wake-ups they avoid
+_WAIT_MAX = 2e-3  # maximum delay if the number of missing bytes is wrong [s]
 
 
 class SensorClock:
@@ -92,7 +93,7 @@ class SerialReader:
         self._bytes = 0
         self._error = ""
         self._port_lost = False
-        self._event = threading.Event()  # set on the first frame, or when the port is lost
+        self._event = threading.Event()  # set at the first frame, or when the port is lost
         self._thread: threading.Thread | None = None
         self._port: serial.Serial | None = None
         self._stop: tuple[int, int] | None = None
@@ -211,8 +212,8 @@ class SerialReader:
             else:
                 timeout = self._request_timeout if decoded is None else self._ask(port)
             wait = decoder.missing * self._byte_time
-            # The board is sending the remaining bytes, so wait for the end of the frame instead of
-            # its next byte.
+            # The board is sending the remaining bytes, so wait for the end of the frame rather than
+            # for the next byte.
             if wait > _WAIT_MIN and select.select((stop,), (), (), min(wait, _WAIT_MAX))[0]:
                 return None
 

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SoftfingerError
 
-_SIZE_MAX = 1024  # maximum number of rows or cols
+_SIZE_MAX = 1024  # maximum number of rows or columns
 _HEADER_LINES_MAX = 1000
 _READING_MAX = 1e12  # maximum reading in the unit of the readings
-_RAW_SATURATION = 255  # the manufacturer's electronics have 8 bits
-_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, to allow for rounding
+_RAW_SATURATION = 255  # maximum reading of the manufacturer's 8-bit electronics
+_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, which allows for rounding
 _EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
@@ -187,7 +187,7 @@ def _frames(
             continue
         if line.lstrip(_EDGE_CHARACTERS).startswith("@@"):
             break
-        if re.match(r'"?[^\W\d]{2}', line):  # A row starts with a number or a single letter B.
+        if re.match(r'"?[^\W\d]{2}', line):  # A row starts with a number or with a single letter B.
             match = re.match(r'"?[^\W\d]+[\s:#,;]*(\d{1,9})\b', line)
             if match is None:
                 if re.match(r'"?(nan|inf)', line, re.IGNORECASE) is None:
@@ -325,7 +325,7 @@ def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
         return 0.0
     if unit in _PRESSURES or unit in _per_area():
         return (_PRESSURES | _per_area())[unit]
-    if unit in _FORCES:  # force per cell
+    if unit in _FORCES:  # The unit is a force per cell.
         area = _quantity(header, "SENSEL_AREA", _AREAS) if "SENSEL_AREA" in header else math.nan
         area = pitch[0] * pitch[1] if math.isnan(area) else area
         if area > 0.0:

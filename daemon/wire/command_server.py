@@ -24,14 +24,14 @@ from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.types import NO_LEASE_COMMANDS
 from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
 
-if TYPE_CHECKING:  # the gateway process does not need this module
+if TYPE_CHECKING:  # The gateway process does not need this module.
     from softfinger.daemon.wire.local_stop import LocalStop
 
 Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: request and its age [s]
 
-_ANSWER_TIMEOUT = 0.4  # s, maximum wait for the gateway before a local stop is confirmed
-_COMMANDS_PER_TICK = 2  # maximum, not counting stops
-_UNPACKED_SIZE_MAX = 4096  # bytes; when this size is reached, unpacking continues on the next tick
+_ANSWER_TIMEOUT = 0.4  # maximum wait for the gateway before a local stop is confirmed [s]
+_COMMANDS_PER_TICK = 2  # maximum number of commands per tick, not counting stops
+_UNPACKED_SIZE_MAX = 4096  # number of bytes after which unpacking continues on the next tick
 _OUTCOME_COUNT_MAX = 256  # number of stored outcomes of requests with a key
 _KEY_LENGTH_MAX = 64
 _VALUE_TYPES = (str, int, float)  # bool is a subclass of int
@@ -40,9 +40,9 @@ _VALUE_TYPES = (str, int, float)  # bool is a subclass of int
 class _Outcome(NamedTuple):
     """Reply to a request that has a key."""
 
-    stops: int  # stop count when the request was first refused or carried out
-    changes: int  # number of other commands carried out by that time
-    reply: bytes  # empty if the request was late and may be repeated
+    stops: int  # stop count when the request was first refused or executed
+    changes: int  # number of other commands executed until then
+    reply: bytes  # reply, empty if the request was late and may be repeated
 
 
 class CommandServer:
@@ -61,9 +61,10 @@ class CommandServer:
         self._clock = clock
         self._stops = 0
         self._changes = 0  # number of executed commands other than status and stop
-        # Outcomes by (client name from its access key, request), oldest first.
+        # Outcomes by client name (from its access key) and request, oldest first.
         self._outcomes: OrderedDict[tuple[str, bytes], _Outcome] = OrderedDict()
-        self._stopped: bytes | None = None  # reply to a local stop, pending gateway confirmation
+        # Reply to a local stop that awaits the gateway's confirmation.
+        self._stopped: bytes | None = None
         self._answer_by = 0.0
         if local is not None:
             link.watch(local.fileno())
@@ -102,7 +103,7 @@ class CommandServer:
             size += len(ask.payload)
             try:
                 request = decode(ask.payload)
-                if ask.urgent and request["command"] != "stop":  # two keys are named "command"
+                if ask.urgent and request["command"] != "stop":  # Two keys are named "command".
                     raise _malformed('expected exactly one string under the key "command"')
             except Refused as refused:
                 self._link.reply(ask, refusal(str(refused), refused.reason))
@@ -112,7 +113,8 @@ class CommandServer:
             if request["command"] == "stop":
                 if not stopped:
                     stopped = accepted(handler({"command": "stop", "client": ask.name}, 0.0))
-                    self.raise_fence()  # done before the reply, after which the client may continue
+                    # The client may continue after the reply, so raise the fence first.
+                    self.raise_fence()
                 self._link.reply(ask, stopped)
                 continue
             mine = [other for other in waiting if other[0].route[0] == ask.route[0]]
@@ -187,7 +189,7 @@ def decode(payload: bytes) -> dict[str, Any]:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
     except msgpack.StackError:
         raise _malformed("not valid msgpack: nested too deeply") from None
-    except Exception as error:  # msgpack's exceptions have no common base class
+    except Exception as error:  # The exceptions of msgpack have no common base class.
         raise _malformed(f"not valid msgpack: {str(error) or 'invalid format'}") from None
     if not isinstance(request, dict):
         raise _malformed(f"expected a map, found {type(request).__name__}")

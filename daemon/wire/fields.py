@@ -77,7 +77,7 @@ class Member(NamedTuple):
     name: str
     type: Any
     unit: str
-    meaning: str  # for a nested map: prefix of its field descriptions
+    meaning: str  # prefix of the field descriptions, for a nested map
     source: FieldSource[Any]
     get: Getter
 

@@ -38,7 +38,7 @@ from softfinger.kinematics.compiled.own_folder import check_above, fault
 LOCAL = "local"  # client that every key folder contains
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_LENGTH = 32  # bytes of a key
+_LENGTH = 32  # length of a key [bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class ServerKeys:
 
     public: bytes
     secret: bytes
-    clients: dict[bytes, str]  # public key → name
+    clients: dict[bytes, str]  # maps each public key to a client name
 
     def left(self, folder: Path) -> ServerKeys:
         """Return the keys, except the keys of clients whose files were removed.

@@ -22,9 +22,9 @@ from softfinger.daemon.errors import AddressError
 from softfinger.daemon.own_files import home_folder, shared_folder
 from softfinger.kinematics.compiled.own_folder import require_own
 
-_LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # equivalent to 127.0.0.1 on this machine
+_LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # names for 127.0.0.1 on this machine
 _DATAGRAM_SIZE_MAX = 4096  # bytes
-_SENDER_COUNT_MAX = 16  # senders awaiting a reply
+_SENDER_COUNT_MAX = 16  # maximum number of senders that await a reply
 _DATAGRAMS_PER_TICK = 4  # reads per tick; the system's queue holds only a few more datagrams
 
 
@@ -61,7 +61,7 @@ class LocalStop:
         for _ in range(_DATAGRAMS_PER_TICK):
             try:
                 _, asker = self._socket.recvfrom(_DATAGRAM_SIZE_MAX)
-            except OSError:  # the queue is empty
+            except OSError:  # The queue is empty.
                 break
             came = True
             if asker:
@@ -75,7 +75,7 @@ class LocalStop:
     def answer(self, reply: bytes) -> None:
         """Send the reply to all clients that sent a stop."""
         while self._senders:
-            with contextlib.suppress(OSError):  # the sender has ended
+            with contextlib.suppress(OSError):  # The sender has ended.
                 self._socket.sendto(reply, self._senders.popleft())
 
     def close(self) -> None:
@@ -134,7 +134,7 @@ def _folders() -> Iterator[Path]:
     yield Path("/run/softfinger/softfinger")
     yield Path(f"/run/user/{os.geteuid()}/softfinger")
     yield shared_folder()
-    with contextlib.suppress(RuntimeError):  # no home folder
+    with contextlib.suppress(RuntimeError):  # The user has no home folder.
         folder = home_folder()
         with contextlib.suppress(OSError):
             folder.parent.mkdir(parents=True, exist_ok=True)

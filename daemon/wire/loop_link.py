@@ -32,9 +32,9 @@ NOTICE = "notice"  # warning text
 
 RESTART_STATUS = 3  # exit status of a gateway that must be restarted and has reported the reason
 
-_BUFFER_SIZE = 1 << 20  # bytes, requested socket buffer size; the kernel may allow less
-_CHUNK = 1 << 16  # bytes per receive call
-_MESSAGE_SIZE_MAX = 64 << 20  # bytes per message
+_BUFFER_SIZE = 1 << 20  # requested socket buffer size [bytes]; the kernel may allow less
+_CHUNK = 1 << 16  # maximum number of bytes per receive call
+_MESSAGE_SIZE_MAX = 64 << 20  # maximum message size [bytes]
 _NOTICE_COUNT_MAX = 20
 _FIRST, _AGAIN = (msgpack.packb("again") + msgpack.packb(again) for again in (False, True))
 
@@ -127,15 +127,15 @@ class Link:
 
     def __init__(self) -> None:
         self.wanted = 0  # bit mask of topics with subscribers
-        self.refused = 0  # number of requests refused by the gateway's rate and queue limits
+        self.refused = 0  # number of requests that the gateway's rate and queue limits refused
         self.stops = 0  # stop count with which the gateway stamps new requests
-        self.asked: deque[Ask] = deque()  # received requests, urgent ones first
+        self.asked: deque[Ask] = deque()  # received requests, with urgent requests first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # queued for a later tick
         self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # gateway warnings
         self.called = False  # True if the descriptor passed to `watch` is readable
         self._other = -1  # the descriptor passed to `watch`
         self._fence = 0
-        # each topic's last messages, for a restarted gateway
+        # Last messages of each topic, for a restarted gateway.
         self._kept: dict[int, deque[bytes]] = {}
         self._channel: Channel | None = None
         self._offered: Channel | None = None

@@ -16,11 +16,11 @@ from softfinger.kinematics.estimation.invalid import Invalid
 if TYPE_CHECKING:
     from softfinger.daemon.wire.schema import FingerState, HandState, ObjectState, TactileFrame
 
-_COLOUR = "#0a8078"  # readable on light and on dark pages
-# number of shades in a picture; more shades lengthen the SVG without a visible difference
+_COLOUR = "#0a8078"  # colour that is readable on light and on dark pages
+# Number of shades in a picture. More shades make the SVG longer without a visible difference.
 _SHADES = 12
 _SIDE = 176  # longer side of a picture [px]
-# Pa, minimum full scale of a picture, so that the noise of an unloaded tip stays faint
+# Minimum full scale of a picture [Pa], which keeps the noise of an unloaded tip faint.
 _FULL = 10e3
 
 
@@ -110,7 +110,7 @@ def state_html(state: HandState) -> str:
 def frame_html(frame: TactileFrame) -> str:
     """Return an SVG picture of the pressures, with row 0 at the bottom, above the frame's text."""
     aspect = frame.rows * frame.pitch_y / (frame.cols * frame.pitch or math.nan)
-    if not 0.01 < aspect < 100.0:  # the values may be invalid, because the stream is not trusted
+    if not 0.01 < aspect < 100.0:  # The values may be invalid, because the stream is not trusted.
         aspect = frame.rows / frame.cols
     width, height = min(1.0, 1.0 / aspect) * _SIDE, min(1.0, aspect) * _SIDE
     paths = "".join(

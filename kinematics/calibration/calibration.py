@@ -40,20 +40,21 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD_RESPONSE = 0.2  # fraction of the median response below which a cell is considered dead
+DEAD_RESPONSE = 0.2  # fraction of the median response below which a cell counts as dead
 _EXPONENTS = (0.3, 3.0)
 _UNREST_SIGMA = 8.0  # multiple of the median noise above which a cell is unsteady
-# Minimum number of unsteady cells for a failed tare; fewer cells may be faulty.
+# Minimum number of unsteady cells that makes a tare fail. If fewer cells are unsteady, they may be
+# faulty.
 _UNREST_CELL_COUNT = 4
 _TILT_MIN = math.radians(3.0)  # minimum tilt range from which the rotation can be determined
 _UPRIGHT_ERROR = math.radians(0.5)
-_PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, relative to the noise
-_LAG_MAX = 8  # cells, maximum lag of the noise correlation
-_SIGNIFICANT_SIGMA = 4.0  # standard errors above which a result is significant
+_PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, as a multiple of the noise
+_LAG_MAX = 8  # maximum lag of the noise correlation, in cells
+_SIGNIFICANT_SIGMA = 4.0  # number of standard errors above which a result is significant
 # Clipping at 0 affects zero offsets below this number of noise standard deviations.
 _CLIPPED_SIGMA = 4.0
-_HOLD_RATIO_MIN = 2.0  # minimum hold time, relative to the longest time constant
-_ITERATIONS = 25  # number of iterations that alternate between the strengths and the press
+_HOLD_RATIO_MIN = 2.0  # minimum hold time, as a multiple of the longest time constant
+_ITERATIONS = 25  # number of iterations that alternate between the term strengths and the press
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -107,7 +108,7 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     n, rows, cols = stack.shape
     noise = stack - stack.mean(axis=0)
     std = noise.std(axis=0)
-    rests = (std > 0.0) & (std <= _UNREST_SIGMA * np.median(std))  # excludes dead and faulty cells
+    rests = (std > 0.0) & (std <= _UNREST_SIGMA * np.median(std))  # True for usable cells
     noise *= rests
     common = noise.sum(axis=(1, 2)) / max(np.count_nonzero(rests), 1)
     noise -= common[:, None, None] * rests
@@ -116,7 +117,7 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     shape = rows + _LAG_MAX, cols + _LAG_MAX
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
-    # Average the correlation over both signs of one lag, i.e. over both diagonal directions.
+    # Average the correlation over both signs of one lag, that is, over both diagonal directions.
     both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAG_MAX, :_LAG_MAX]
     pairs = (n - 1.0) * np.outer(rows - np.arange(_LAG_MAX), cols - np.arange(_LAG_MAX))
     if rows < _LAG_MAX or cols < _LAG_MAX or not both[0, 0] > 0.0:
@@ -361,8 +362,8 @@ def fit_centre(
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
-    # Add the uncertainty of the upright orientation, which shifts the centroid by moment arm ×
-    # angle.
+    # Add the uncertainty of the upright orientation. It shifts the centroid by the product of
+    # moment arm and angle.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
     std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
     return Centre(found.centre, found.rotation if tilted else None, residual, std)
@@ -427,7 +428,7 @@ class Relaxation:
     strengths: tuple[float, ...]
     residual: float
     elastic: float
-    model: FloatArray  # fitted F [N] during the hold, measured F during the press
+    model: FloatArray  # fitted F during the hold, measured F during the press [N]
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:

@@ -25,26 +25,26 @@ from softfinger.kinematics.contact.table import ContactTable
 FloatArray = NDArray[np.float64]
 
 _UNIT = Material.constant(1.0)
-_SLACK = 0.02  # fraction of the range of d; smaller reversals are encoder noise
+_SLACK = 0.02  # fraction of the range of d below which a reversal is encoder noise
 _TURNS = 5  # minimum number of rows per reversal of d; with fewer, the rows are not in test order
-_DEEP = 0.9  # fraction of the maximum d; shallower cycles are preconditioning
+_DEEP = 0.9  # fraction of the maximum d below which a cycle is preconditioning
 TOE = 0.1  # half width of the toe around the first contact, as a fraction of the depth
-# Fraction of the maximum force; only points above it are used to extrapolate to zero force.
+# Fraction of the maximum force above which points are used for extrapolating to zero force.
 _STEEP = 0.2
 _POWER = 0.55  # exponent that makes F(d) of springs and solid rubber nearly linear
 _FEWEST = 6  # minimum number of fitted rows per run
-_LOADED = 20.0  # minimum force range of a run, relative to the noise
+_LOADED = 20.0  # minimum force range of a run, as a multiple of the noise
 # Minimum noise due to rounding and interpolation, as a fraction of the maximum force.
 _SMOOTHEST = 1e-4
 _ROUNDS = 60
 _CLIP = 0.02  # maximum step of the zero of d, as a fraction of the depth
-_STEP = 1e-8  # m, step for numerical derivatives
+_STEP = 1e-8  # step for numerical derivatives [m]
 _TOLERANCE = 1e-7  # relative tolerance of the tables
-_EDGE = 1.0 - 1e-4  # usable fraction of a table's range; leaves room for the step
+_EDGE = 1.0 - 1e-4  # usable fraction of a table's range, which leaves room for the derivative step
 _TOO_DEEP = "the run exceeds the depth or tilt range of the model's data"
 _NO_BEGINNING = "no zero offset of d fits the run: the run must include the onset of contact"
-# Higher-order coefficients of three laws. The forces for σ = c_1 ε + c_2 ε² + c_3 ε³ are linear
-# combinations of the forces for these laws.
+# Higher-order coefficients of three material laws. The forces for σ = c_1 ε + c_2 ε² + c_3 ε³ are
+# linear combinations of the forces for these laws.
 _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
 
 
@@ -175,7 +175,7 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
             "found no force that increases with d, expected positive d and F in compression"
         )
     begin = float(d[0])
-    for _ in range(4):  # improve the zero of F using the rows before contact, if any
+    for _ in range(4):  # Each pass improves the zero of F from the rows before contact, if any.
         steep = rise > _STEEP * most
         if (count := np.count_nonzero(steep)) < 3:
             raise CalibrationError(

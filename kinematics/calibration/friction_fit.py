@@ -12,22 +12,26 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 
 FloatArray = NDArray[np.float64]
 
-DURATION_MAX = 3600.0  # s, maximum recording time; limits memory
-_STEP = 0.01  # s, step of the time grid for motion and torque
-_WINDOW = 6  # steps on either side of an instant, for fitting velocity and acceleration
-_GAP_MAX = 0.035  # s, maximum gap in the data to interpolate across
-# rad/s, speed above which static friction has mostly vanished (XL330: 0.12 rad/s).
+DURATION_MAX = 3600.0  # maximum recording time [s], which limits the memory use
+_STEP = 0.01  # step of the time grid for motion and torque [s]
+_WINDOW = 6  # number of steps on either side of an instant for fitting velocity and acceleration
+_GAP_MAX = 0.035  # maximum gap in the data across which values are interpolated [s]
+# Speed above which static friction has mostly vanished [rad/s]. For the XL330, this speed is 0.12
+# rad/s.
 _SLIDING_SPEED = 0.2
-# rad/s, speed below which a joint is at standstill; one count of 1.5 mrad in 0.08 s.
+# Speed below which a joint is at standstill [rad/s]. It corresponds to one count of 1.5 mrad in
+# 0.08 s.
 _REST_SPEED = 0.02
-# rad, travel from standstill at break-away: three counts, ten times the gear compliance.
+# Travel from standstill at which a joint breaks away [rad]. It is three counts, or ten times the
+# gear compliance.
 _BREAK_AWAY_DISTANCE = 5e-3
-# Maximum goal velocity at break-away [rad/s], over a number of steps; limits the inertial torque.
+# Maximum goal velocity at break-away [rad/s], and number of steps over which it applies. The limit
+# keeps the inertial torque small.
 _BREAK_AWAY_RATE = 0.1, 20
-_MOTION_TIME_MIN = 0.5  # s, minimum motion time in each direction
-_CORRELATION_TIME = 0.2  # s, correlation time of the residuals
+_MOTION_TIME_MIN = 0.5  # minimum motion time in each direction [s]
+_CORRELATION_TIME = 0.2  # correlation time of the residuals [s]
 _BREAK_AWAY_COUNT_MIN = 3  # minimum number of break-aways for a mean
-# N·m·s/rad, mean and standard deviation of the prior. Values identified for similar servos range
+# Mean and standard deviation of the prior [N·m·s/rad]. Values identified for similar servos range
 # from 0.015 to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
 _VISCOUS_PRIOR = 0.02, 0.02
 _INERTIA_ERROR = 0.5  # relative standard deviation of the configured inertia
@@ -40,7 +44,7 @@ class FrictionFit(NamedTuple):
     coulomb_std: float
     viscous: float  # [N·m·s/rad]
     viscous_std: float
-    stiction: float  # friction at break-away; NaN for fewer than three slow starts from standstill
+    stiction: float  # friction at break-away; NaN after fewer than three slow starts
     stiction_std: float
 
 
@@ -149,7 +153,7 @@ def _least_squares(
     )
     rounding = step * step / 12.0
     variance = rounding
-    for _ in range(2):  # the second pass uses the noise estimate from the first pass
+    for _ in range(2):  # The second pass uses the noise estimate from the first pass.
         per_sample = _STEP / _CORRELATION_TIME / variance
         covariance = np.linalg.inv(per_sample * columns.T @ columns + weight)
         found = covariance @ (per_sample * columns.T @ values + weight @ prior)
@@ -157,7 +161,8 @@ def _least_squares(
     std = np.sqrt(np.diag(covariance))
     if found[1] < 0.0:  # b cannot be negative, so use the solution for b = 0
         found = found - covariance[:, 1] * (found[1] / covariance[1, 1])
-    # A constant current always has the same quantisation error, so averaging does not reduce it.
+    # A constant current always has the same quantisation error, so averaging does not reduce this
+    # error.
     std[0] = math.hypot(float(std[0]), math.sqrt(rounding))
     return found, std
 

@@ -13,15 +13,15 @@ from softfinger.kinematics.calibration.friction_fit import DURATION_MAX, duratio
 
 FloatArray = NDArray[np.float64]
 
-_STEP = 1e-3  # s, step of the time grid and of the initial delays
-_DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # s, range of latencies to search
-# Minimum closing speed in a ramp [m/s], and the time over which the speed is averaged [s].
+_STEP = 1e-3  # step of the time grid and of the initial delays [s]
+_DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # range of latencies to search [s]
+# Minimum closing speed in a ramp [m/s], and averaging time of the speed [s].
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
-_RAMP_MARGIN = 0.2  # s, time before and after a ramp that still counts as part of the ramp
-_CLOSING_MIN = 8e-4  # m, minimum closing distance in a ramp, seven encoder counts
+_RAMP_MARGIN = 0.2  # time before and after a ramp that still counts as part of the ramp [s]
+_CLOSING_MIN = 8e-4  # minimum closing distance in a ramp [m], seven encoder counts
 _FRAME_COUNT_MIN = 8  # minimum number of frames
-_TIME_ERROR = 1e-3  # s, standard deviation of the times of ticks, readings and frames
-# Widening of a growing footprint, see `perception.frame_channels`.
+_TIME_ERROR = 1e-3  # standard deviation of the times of ticks, readings and frames [s]
+# Widening of a growing footprint; see `perception.frame_channels`.
 _WIDENING, _SPREAD_MAX = 1.4, 0.1
 _ITERATIONS = 3  # number of iterations that alternate between the first touch and the fit
 
@@ -31,7 +31,7 @@ class LatencyFit(NamedTuple):
 
     delay: float
     std: float
-    scale: float  # ratio of the d estimated from frames to the d computed from joint angles
+    scale: float  # ratio of the d from frames to the d from joint angles
     residual: float  # rms residual of d [m]
     ramps: int
 
@@ -90,7 +90,7 @@ def fit_latency(
         shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # The encoder error at standstill is constant, and half of it shifts the ramp.
+    # The encoder error at standstill is constant, and half of this error shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))
@@ -179,7 +179,8 @@ def _ramps(
     """Return a mask of the frames in each ramp, [n, ramps], and the maximum closing [m]."""
     window = np.ones(2 * round(_RAMP_MARGIN / _STEP) + 1)
     near = np.convolve(np.abs(rate) > _CLOSING_SPEED_MIN, window, "same") > 0.5
-    number = np.cumsum(near & ~np.append(False, near[:-1])) * near  # ramp number; 0 outside ramps
+    # Ramp number, or 0 outside ramps.
+    number = np.cumsum(near & ~np.append(False, near[:-1])) * near
     index = np.clip(np.searchsorted(grid, t), 0, grid.size - 1)
     widths = {
         k: float(np.ptp(closing[index[number[index] == k]]))

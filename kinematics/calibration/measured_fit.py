@@ -25,8 +25,8 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 _PRESS_COUNT_MIN = 6  # minimum number of presses
 _UPRIGHT_TILT = math.radians(1.0)
 _TILTED_MIN = math.radians(5.0)
-_CURVE_ERROR_MAX = 0.05  # maximum errors of the curves, relative to the force and to the radius
-_STAGE_ERROR = 2e-3  # minimum assumed relative error of a stage and a sensor
+_CURVE_ERROR_MAX = 0.05  # maximum curve error, relative to the force and to the radius
+_STAGE_ERROR = 2e-3  # minimum relative error that is assumed for a stage and a sensor
 
 
 class CurvesError(SoftfingerError, ValueError):

@@ -21,15 +21,15 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _UNIT_MATERIAL = Material.constant(1.0)
-_STEP = 1e-5  # m, step for numerical derivatives
-_PLACE_STEP = 2e-4  # m, position step; larger because rim cells change by whole sample points
+_STEP = 1e-5  # step for numerical derivatives [m]
+_PLACE_STEP = 2e-4  # position step [m]; larger because rim cells change by whole sample points
 _ROTATION_STEP = 1e-4  # rad
 _ROTATION_STARTS = 8  # number of initial rotations to try
 _GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
 _POISSON_TOLERANCE = 4e-3  # tolerance of ν
-# m, rad; presses whose d and θ differ by less are repetitions.
+# Presses whose d [m] and θ [rad] differ by less are repetitions.
 _REPEATED_D, _REPEATED_THETA = 5e-5, 0.009
-_DRIFT_MIN = 0.02  # minimum significant relative drift of E; accuracy of presses and tables
+_DRIFT_MIN = 0.02  # minimum significant drift of E, given the accuracy of presses and tables
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder
 
 _operation: Any = types.Function
 _resolve = _operation.get_call_type
-# Signatures of operations; the keys contain the argument types and arithmetic flags.
+# Signatures of operations. The keys contain the argument types and arithmetic flags.
 _SIGNATURES: dict[Any, Any] = {}
 _context: Any = BaseContext
 _size = _context.get_abi_sizeof
@@ -89,7 +89,8 @@ class KernelCompiler(CompilerBase):
 
     def define_pipelines(self) -> list[Any]:
         """Return the compiler passes in the order of execution."""
-        # Branches such as `if blur is None` cannot be typed for some arguments, so prune them.
+        # Branches such as `if blur is None` cannot be typed for some arguments, so prune these
+        # branches.
         nones = types.none in self.state.args
         passes: list[Any] = [TranslateByteCode, FixupArgs, IRProcessing]
         passes += [RewriteSemanticConstants, DeadBranchPrune] if nones else []
@@ -128,7 +129,7 @@ def _with_cached_lookups(flags: Any) -> Iterator[None]:
                 return None
             _SIGNATURES[key] = found, function._impl_keys[found.args]
         found, body = _SIGNATURES[key]
-        function._impl_keys[found.args] = body  # Numba looks up the implementation in this map
+        function._impl_keys[found.args] = body  # Numba looks up the body in this map.
         return found
 
     def size(context: Any, kind: Any) -> int:
@@ -160,7 +161,8 @@ class BitcodeKernel(plain.InnerKernel):
             no_cfunc_wrapper=True,
             **options,
         )(self.py_func)
-        # Without this, Numba recompiles for each literal argument; LLVM folds the constants anyway.
+        # Otherwise, Numba would recompile for each literal argument. LLVM folds the constants
+        # anyway.
         resolve = self.dispatcher.get_call_template
         self.dispatcher.get_call_template = lambda args, kws: resolve(
             tuple(types.unliteral(each) for each in args), kws
@@ -176,7 +178,8 @@ class _Bitcode(JITCodeLibrary):
     """Code library that is linked into its callers and never compiled to machine code."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        # Repeat Numba's finalisation of its own libraries, also for functions only declared here.
+        # Repeat Numba's finalisation of its own libraries, including functions that are only
+        # declared here.
         ll_module.data_layout = self._codegen._data_layout
         for function in ll_module.functions:
             if not function.is_declaration:
@@ -322,8 +325,8 @@ def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     try:
         dispatcher._cache = KernelCache(function)
     except RuntimeError:
-        pass  # no folder; `kernel_folder` has already issued a warning
-    called = inner(function, options).dispatcher  # the cache does not store bitcode
+        pass  # There is no folder; `kernel_folder` has already issued a warning.
+    called = inner(function, options).dispatcher  # The cache does not store bitcode.
     dispatcher.get_call_template = called.get_call_template
     dispatcher.get_overload = called.get_overload
     return dispatcher

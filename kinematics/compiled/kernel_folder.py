@@ -31,9 +31,10 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 ROOT = Path(__file__).resolve().parents[2]  # directory of the package `softfinger`
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-# Number of other cache folders to keep, e.g. from other checkouts or the previous release.
+# Number of other cache folders to keep, for example those of other checkouts or of the previous
+# release.
 _FOLDERS_MAX = 4
-_RECENT = 600.0  # s; folders used this recently are kept, because they may still be in use
+_RECENT = 600.0  # age below which a folder is kept [s], because it may still be in use
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",
@@ -72,7 +73,7 @@ def find_kernel_folder() -> OwnFolder:
     path = base / f"kernels-{digest()}"
     fresh = not path.exists()
     folder = OwnFolder(path)
-    os.utime(folder.path)  # marks the folder as used, so that it is not pruned
+    os.utime(folder.path)  # The new time marks the folder as used, so that it is not pruned.
     if fresh:
         _prune(base, path)
     return folder
@@ -134,7 +135,7 @@ def is_marked(folder: OwnFolder, part: str) -> bool:
 
 def mark(folder: OwnFolder, part: str) -> None:
     """Mark the kernels of ``part`` as compiled; on failure, the next start checks all of them."""
-    with contextlib.suppress(OSError):  # another process may have pruned the folder
+    with contextlib.suppress(OSError):  # Another process may have pruned the folder.
         folder.write(part + _MARK, b"")
 
 

@@ -39,7 +39,7 @@ class Records(Protocol, Generic[Each]):
     """Structured array of one record class, as indexed in kernels."""
 
     def __getitem__(self, index: int, /) -> Each: ...
-    def __setitem__(self, index: int, record: Any, /) -> None: ...  # copies
+    def __setitem__(self, index: int, record: Any, /) -> None: ...  # copies the record
     def __len__(self) -> int: ...
 
 
@@ -59,12 +59,12 @@ class Record(metaclass=_Slotted):
     __slots__ = ("_fields", "array")
 
     dtype: np.dtype[np.void]
-    array: Records[Self]  # array of one record, passed to kernels
+    array: Records[Self]  # array of one record, which is passed to kernels
 
     def __init_subclass__(cls) -> None:
         hints = get_type_hints(cls, include_extras=True)
         kinds = {name: _kind(hints[name]) for name in cls.__annotations__}
-        # Align fields as in C; otherwise Numba uses slow unaligned access for each field.
+        # Align fields as in C. Otherwise, Numba uses slow unaligned access for each field.
         cls.dtype = np.dtype([(name, *kind) for name, (_, *kind) in kinds.items()], align=True)
         for name, (inner, _, shape) in kinds.items():
             setattr(cls, name, _field(name, inner, shape))
@@ -150,5 +150,5 @@ def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
     inner = base.__args__[-1]
     if isinstance(inner, type) and issubclass(inner, Record):
         return inner, inner.dtype, shape
-    # The type argument of NDArray[np.float64] is dtype[float64]; since NumPy 2.5 it is float64.
+    # The type argument of NDArray[np.float64] is dtype[float64], or float64 since NumPy 2.5.
     return None, getattr(inner, "__args__", (inner,))[0], shape

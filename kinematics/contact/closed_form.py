@@ -29,7 +29,7 @@ __all__ = ["ClosedForms", "Fingertip", "closed_forms"]
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
-RADIUS_MAX = 1.0  # m; larger values were probably given in millimetres
+RADIUS_MAX = 1.0  # maximum radius [m]; a larger value was probably given in millimetres
 POISSON = (0.45, 0.4995)  # range of Poisson's ratio covered by the solid tip data
 
 
@@ -101,7 +101,8 @@ class Fingertip:
         The result is a number or an array, like ``d``.
         """
         h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
-        # cos θ is the footprint radius divided by a. Unlike asin(h/a), this is accurate as d → 0.
+        # cos θ is the footprint radius divided by a. Unlike asin(h/a), this form is accurate for
+        # small d.
         depth = np.clip(d, 0.0, self.radius)
         limit: FloatArray = np.arctan2(h, np.sqrt(depth * (self.radius + h)))
         return limit
@@ -114,7 +115,7 @@ class ClosedForms(NamedTuple):
     energy: FloatArray  # U [J]
     force_d: FloatArray  # ∂F/∂d [N/m]
     force_theta: FloatArray  # ∂F/∂θ [N/rad]
-    energy_d: FloatArray  # ∂U/∂d [N], force along the face's normal
+    energy_d: FloatArray  # ∂U/∂d, the force along the face's normal [N]
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
 
 
@@ -126,7 +127,7 @@ def theta_limit(radius: float, d: float) -> float:
     if d >= radius:
         return 0.0
     h = radius - d
-    # cos θ is the footprint radius divided by a. Unlike asin(h/a), this is accurate as d → 0.
+    # cos θ is the footprint radius divided by a. Unlike asin(h/a), it is accurate for small d.
     return math.atan2(h, math.sqrt(d * (radius + h)))
 
 

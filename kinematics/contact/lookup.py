@@ -43,7 +43,7 @@ FloatArray = NDArray[np.float64]
 HALF_PI = math.pi / 2
 H_END = 0.5**OCTAVES  # h at the end of the domain
 _H_MIN = H_END * (1.0 + 2.0**-52)  # smallest number above H_END
-_END = H_END * (1.0 - 1e-12)  # limit of h at the end of the domain, with a rounding margin
+_END = H_END * (1.0 - 1e-12)  # limit of h at the end of the domain, with a margin for rounding
 
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1

@@ -55,8 +55,8 @@ class SolidData:
     edges: FloatArray  # ring edges, r/a [rings + 1]
     modes: FloatArray  # B averaged over each ring [k, rings]
     shear: FloatArray  # B_T [rings]
-    error: float  # relative error of N compared with other meshes
-    pressure_error: float  # relative rms error of the base pressure compared with other meshes
+    error: float  # error of N relative to other meshes
+    pressure_error: float  # rms error of the base pressure relative to other meshes
 
 
 @lru_cache(maxsize=8)
@@ -76,7 +76,7 @@ def solid_data(tip: Fingertip) -> SolidData:
         return np.asarray(chebyshev.chebval(at, np.moveaxis(coefficients, -1, 0)))
 
     root = float(stored["s_max"])
-    # 1 + t P with t = root/2 (1 + x); 2 x T_i = T_(i−1) + T_(i+1).
+    # This is 1 + t P with t = root/2 (1 + x), using 2 x T_i = T_(i−1) + T_(i+1).
     more = 0.5 * root * np.pad(by_poisson(stored["energy"]), ((0, 1), (0, 0)))
     ratio = more.copy()
     ratio[:-1] += 0.5 * more[1:]

@@ -24,7 +24,7 @@ from softfinger.kinematics.contact.table_record import (
 )
 from softfinger.kinematics.contact.tip_curves import TipCurves
 
-ENERGY, STICK = range(2)  # pieces of the table: g with its partials, q_0 with its partials
+ENERGY, STICK = range(2)  # pieces of the table: g with its partials, and q_0 with its partials
 
 
 def solid_table(tip: Fingertip, material: Material) -> Table:

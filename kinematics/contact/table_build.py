@@ -45,9 +45,9 @@ from softfinger.kinematics.contact.table_record import (
 
 FloatArray = NDArray[np.float64]
 
-# Rounding error of the closed forms and of the kernel's last products.
+# Rounding error of the closed forms and of the last products in the kernel.
 ROUNDING = 16.0 * np.finfo(float).eps
-# Number of Chebyshev coefficients in h and y computed beyond the stored ones.
+# Number of additional Chebyshev coefficients in h and y that are computed but not stored.
 _EXTRA_V, _EXTRA_U = 4, 6
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
 # Slab edges in h, from H_END to 1.
@@ -174,7 +174,8 @@ def _bound(
     k = int(np.argmax(bounds))
     here = np.abs(_dense_nodes(len(h)) @ lost[k] @ _dense_nodes(len(y)).T)
     i, j = np.unravel_index(int(np.argmax(here)), here.shape)
-    # Dense points are in ascending order, four per node; the nodes are in descending order.
+    # The dense points are in ascending order, four per node, whereas the nodes are in descending
+    # order.
     return _WorstError(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
 
 
@@ -228,7 +229,7 @@ def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
     """Return the ratios [5, …] at broadcast coordinates h in (0, 1) and y in [0, 1]."""
     h, y = np.broadcast_arrays(h, y)
     delta = 1.0 - h
-    # 1 − u² with u = h y, in a form without cancellation for h and y near 1.
+    # Compute 1 − u² for u = h y in a form without cancellation for h and y near 1.
     complement = (1.0 - y + delta * y) * (1.0 + h * y)
     c = np.sqrt(delta * (1.0 + h) / complement)
     s = h * np.sqrt((1.0 - y) * (1.0 + y) / complement)

@@ -26,8 +26,8 @@ ThreeFloats: TypeAlias = tuple[float, float, float]
 LANES = 5
 POWERS_U, POWERS_V = 12, 6  # terms in each variable
 PIECE = POWERS_V * POWERS_U * LANES  # coefficients per piece
-OCTAVES = 3  # octaves of the height h that the pieces of a spring tip cover
-SLAB_BITS = 4  # 2^4 slabs per octave
+OCTAVES = 3  # number of octaves of the height h that the pieces of a spring tip cover
+SLAB_BITS = 4  # Each octave has 2^4 slabs.
 SPLITS_MAX = 4  # maximum number of pieces per slab
 PIECES = OCTAVES * 2**SLAB_BITS * SPLITS_MAX
 
@@ -39,8 +39,8 @@ class TableError(SoftfingerError):
 class Table(Record):
     """Contact table of one tip and material."""
 
-    is_solid: bool  # solid or measured tip, evaluated by `solid_lookup`; otherwise springs
-    is_closed: bool  # springs with a constant modulus; the table has no pieces
+    is_solid: bool  # True for a solid or measured tip, which `solid_lookup` evaluates
+    is_closed: bool  # True for springs with a constant modulus, whose table has no pieces
     sticks: bool
     splits: int  # pieces per slab
     radius: float  # [m]
@@ -52,7 +52,7 @@ class Table(Record):
     by_square: float  # 2/(maximum sin² θ)
     at_first: float  # g at t = 0, from Hertz theory
     tolerance: float
-    max_error: float  # bound on the relative error; data error for a solid tip
+    max_error: float  # bound on the relative error; for a solid tip, the data error
     worst_d: float  # d at which the error is largest [m]
     worst_theta: float  # θ at which the error is largest [rad]
     coefficients: Annotated[FloatArray, PIECES * PIECE]

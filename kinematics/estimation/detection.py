@@ -20,11 +20,12 @@ from softfinger.kinematics.sensing.footprint import (
     steps,
 )
 
-# Ratio of the detection level during a contact to the level before; avoids flicker.
+# Ratio of the detection level during a contact to the level before it. The ratio avoids flicker.
 _HYSTERESIS = 0.5
-STRONG_PEAK = 6.0  # noise standard deviations; if the largest cell reads more, it is tested first
-_NOISE_RATIO = 1.75  # ratio of measured and set noise above which a frame is noisy
-_SUSPECT_PEAK = 4.0  # noise standard deviations that the largest cell of a noisy frame exceeds
+# Peak reading above which the largest cell is tested first, in noise standard deviations.
+STRONG_PEAK = 6.0
+_NOISE_RATIO = 1.75  # ratio of measured noise to noise setting above which a frame is noisy
+_SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviations
 
 
 @inner_kernel
@@ -164,7 +165,7 @@ def presses_outside(
     return False
 
 
-_MASK_DEPTH = 1e3  # m, lowers the height of masked cells beyond the reach of any face
+_MASK_DEPTH = 1e3  # depth that lowers masked cells beyond the reach of any face [m]
 
 
 @inner_kernel

@@ -60,16 +60,16 @@ __all__ = ["Uncertainty"]
 
 NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 NEIGHBOURS[2, 2] = 0.0
-_NOISE_PEAK = 4.5  # maximum reading due to noise alone, in standard deviations
-_CELL_COUNT_MIN = 48.0  # minimum number of cells for distinguishing smooth and rough misfits
-# Fractions of a smooth error's energy that appear in d (and the gain), in each tilt, and in the
+_NOISE_PEAK = 4.5  # maximum reading that noise alone causes, in standard deviations
+_CELL_COUNT_MIN = 48.0  # minimum number of cells for separating smooth and rough misfits
+# Fractions of a smooth error's energy that appear in d (and in the gain), in each tilt, and in the
 # residuals. Curve errors, hysteresis and crosstalk are nearly as symmetric as the pressure.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_IN_RESIDUALS = 0.15, 0.06, 0.2
-# Relative tilt error of the solid model per d/a, compared with frames from independent finite
-# elements up to 20° and 7 mm. In this range, the error is 4 % for a bonded tip and negligible for a
-# lying tip.
+# Relative tilt error of the solid model per d/a. It was found by comparison with frames from
+# independent finite elements up to 20° and 7 mm. In this range, the error is 4 % for a bonded tip
+# and negligible for a lying tip.
 _SOLID_TILT_ERROR = 0.1
-# Noise standard deviations, threshold for the products of neighbouring residuals.
+# Threshold for products of neighbouring residuals, in noise standard deviations.
 _PRODUCT_SIGMA = 6.0
 
 
@@ -278,7 +278,7 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
     fit = state.fit
     variance = state.signal.variance
     cols = state.grid.cols
-    # Near the floor, clipping increases the mean reading above the pressure.
+    # Near the floor, clipping raises the mean reading above the pressure.
     lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip_noise
     total, number = _neighbours_products(
         cells, lowest, index(fit.first_row * cols), index(fit.last_row * cols)
@@ -376,8 +376,8 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
         size = budget.sizes[source]
         if size == 0.0:
             continue
-        # Patterns that shift or scale the pressure image are proportional to the gain; offsets are
-        # not.
+        # Patterns that shift or scale the pressure image are proportional to the gain, but offsets
+        # are not.
         size *= gain if source >= PLACE_X else 1.0
         remaining += size * size * budget.squares[source]
         for i in range(PARAMETERS):
@@ -391,7 +391,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     along = budget.tilt_error * fit.d / state.grid.radius
     for i in range(2):
         for j in range(2):
-            # Split into components along and across the tilt direction.
+            # Split the pattern into components along and across the tilt direction.
             n_i = fit.n_y if i else fit.n_x
             n_j = fit.n_y if j else fit.n_x
             m_i = fit.n_x if i else -fit.n_y

@@ -143,7 +143,7 @@ class ContactEstimate:
         return math.sqrt(self.covariance.item(10))
 
 
-# Accepted frame types and the readings at which they saturate.
+# Frame types that are accepted, and the readings at which they saturate.
 _SATURATION_COUNTS = {
     np.dtype(np.uint8): 255.0,
     np.dtype(np.uint16): 65535.0,
@@ -188,19 +188,19 @@ _RESULTS = (
     "rejected_count", "contact", "has_second_contact", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
-# Default parameters of the fit and the activity test; `ContactEstimator.state` contains the values
-# in use.
+# Default parameters of the fit and of the activity test. `ContactEstimator.state` contains the
+# values in use.
 _TOLERANCE = 16.0  # squared ratio of step to noise floor below which the iteration ends
 _ITERATIONS = 20
-PEAK_LEVEL = 3.0  # noise standard deviations, see `detection.activity`
+PEAK_LEVEL = 3.0  # detection level in noise standard deviations, see `detection.activity`
 PATCH_LEVEL = 4.9
 _R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
-# Minimum number of model points per tip radius, for linear and for nonlinear material laws. With
+# Minimum number of model points per tip radius, for linear and for nonlinear material laws. With a
 # noise of 0.2 % of the modulus and tilts of up to 25°, the bias is at most a quarter of the noise
 # floor. Within 4° of the domain limit, the bias is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum d/a and sin θ in a spring fit
-_STEP_MARGIN = 1.01  # factor by which the fit of a solid tip may exceed the data range
+_STEP_MARGIN = 1.01  # factor by which the fit of a solid tip may exceed the range of the data
 _SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear force, relative to its normal force
 # Width of the excluded rim of a solid tip, relative to the radius.
 _RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
@@ -298,7 +298,8 @@ class ContactEstimator:
         options = self._options = state.options
         self.noise = noise
         options.saturation = math.inf
-        # Counts are rounded, so the smallest count covers readings down to half a count below it.
+        # Counts are rounded, so the smallest count covers readings down to half a count below
+        # itself.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.iterations = _TOLERANCE, _ITERATIONS
@@ -317,7 +318,7 @@ class ContactEstimator:
         tabulate_moments(state.moments, grid, tip, material, options.deepest)
         records: Any = state.estimate.array
         self._estimate = records
-        self._results = self._estimate[list(_RESULTS)]  # a view
+        self._results = self._estimate[list(_RESULTS)]  # This result is a view.
         self._seq: int | None = None
         self._last = ContactEstimate(
             cells_per_sample=state.budget.cells_per_sample,
@@ -366,7 +367,7 @@ class ContactEstimator:
 
         fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
         points = points_of(model_cells, material, grid.blur, count_for(cells, fineness))
-        # All arguments of the kernel except the state and the frame.
+        # These are all arguments of the kernel except the state and the frame.
         self._arrays = self._rows, pixels, weights.array, *points
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:
@@ -488,7 +489,8 @@ class ContactEstimator:
         if full != self._full:
             self._full = full
             self._options.saturation = full if self._saturation is None else self._saturation
-        # Copy the frame, so that the compiled code can handle any type, layout and writability.
+        # Copy the frame, so that the compiled code accepts any type, memory layout and write
+        # protection.
         self._frame[...] = frame[self._window]
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(
@@ -499,7 +501,7 @@ class ContactEstimator:
         for name, value in zip(_RESULTS, self._results.item(), strict=True):
             setattr(result, name, value)
         result.invalid = REASONS[result.invalid]
-        # Threshold of χ² at 5 σ, from the Wilson-Hilferty approximation.
+        # The threshold of χ² at 5 σ follows from the Wilson-Hilferty approximation.
         variance = 2.0 / (9.0 * max(result.cells / result.cells_per_sample - 4, 1))
         result.misfit = result.chi2 > (1.0 - variance + 5.0 * math.sqrt(variance)) ** 3
         self._seq = seq

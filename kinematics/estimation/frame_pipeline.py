@@ -34,24 +34,24 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import points_in
 
-# Clipping the noise at 0 increases the sums over neighbourhoods. Increasing the detection level by
-# this amount restores the false alarm rate.
+# Clipping the noise at 0 raises the sums over neighbourhoods. Raising the detection level by this
+# amount restores the false alarm rate.
 CLIPPED_LEVEL_INCREASE = 0.5
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # range of the gain for a contact of this tip on this sensor
 D_MAX = 0.75  # maximum valid d, relative to the radius
 # Maximum relative error of d that a smooth misfit may cause. The curved face of a disc causes an
-# error of this size, which is included in the covariance. If the gain is far from 1, a smaller
-# limit applies: such a gain together with a smooth misfit indicates a different tip, which the
-# covariance does not cover.
+# error of this size, which the covariance includes. A smaller limit applies if the gain is far from
+# 1. Such a gain together with a smooth misfit indicates a different tip, which the covariance does
+# not cover.
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
-# If at least ABOVE_FRACTION of the cells under the tip exceed both levels (relative to the noise
-# and to the peak), the sensor needs a tare. A solid tip loads all cells, but 5 % of them read less
-# than 0.32 of the peak.
+# The sensor needs a tare if at least ABOVE_FRACTION of the cells under the tip exceed both levels,
+# one relative to the noise and one relative to the peak. A solid tip loads all cells, but 5 % of
+# them read less than 0.32 of the peak.
 ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among the cells above half the peak
-ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for a valid linear error propagation
+ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for linear error propagation
 SHARED_MAX = 0.5  # maximum standard deviation of d due to known uncertainties, relative to d
 
 
@@ -136,7 +136,7 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
     n_y = s * estimate.n_x + c * estimate.n_y
     estimate.tilt_x = math.asin(n_x)
     estimate.tilt_y = math.asin(n_y)
-    # ∂tilt/∂n = 1/cos tilt. Only the two middle rows and columns must be rotated.
+    # Because ∂tilt/∂n = 1/cos tilt, only the two middle rows and columns must be scaled.
     per_x = 1.0 / math.sqrt(1.0 - n_x * n_x)
     per_y = 1.0 / math.sqrt(1.0 - n_y * n_y)
     for j in range(4):
@@ -211,7 +211,7 @@ def _reset_results(state: EstimatorState, scale: float, step: float) -> None:
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
     # A contact that is no wider than a cell causes a strain of at most about pitch²/2a². Allow for
-    # gains up to 3.
+    # gains of up to 3.
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate
@@ -264,8 +264,8 @@ def estimate_frame(
     rejected = without_outliers(state, frame, cells.height)
     strong = False
     if state.options.is_solid and signal.is_finite:
-        # Every contact of a solid tip matches the pattern. A strong signal without the pattern is
-        # not a contact of this tip. A small common zero offset does not count as a signal.
+        # Every contact of a solid tip matches the pattern, so a strong signal without the pattern
+        # is not a contact of this tip. A small common zero offset does not count as a signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > STRONG_PEAK * signal.noise
         signal.contact = shows_pattern(state, frame, cells)

@@ -35,21 +35,21 @@ from softfinger.kinematics.sensing.footprint import FloatArray, set_face
 from softfinger.kinematics.sensing.solid_pressure import own_shear, press_solid
 from softfinger.kinematics.sensing.springs_pressure import press_springs
 
-# With a free gain, the covariance is multiplied by 1 + _GAIN_CURVATURE (σ_d/d)². The factor was
-# determined by comparing squared errors with the linear prediction, in simulated frames over the
+# If the gain is free, the covariance is multiplied by 1 + _GAIN_CURVATURE (σ_d/d)². The factor was
+# determined by comparing squared errors with the linear prediction, using simulated frames over the
 # operating range.
 _GAIN_CURVATURE = 6.0
 _HALVINGS_MAX = 5
-_LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of the model
+_LIMITED_MAX = 4  # maximum number of consecutive steps that are clamped to the limits of the model
 # Minimum pivot of a scaled normal matrix. For a 2 × 2 matrix, the pivot is the determinant divided
-# by the product of the diagonal, with a rounding error of 1e-12.
+# by the product of the diagonal elements, with a rounding error of 1e-12.
 _PIVOT_MIN = 1e-11
 
 # A cell that cannot read below its floor (0, or the smallest count sent) has a mean reading above
-# the true pressure. At a pressure z standard deviations above the floor, this excess, in standard
-# deviations, is E[max(z + e, 0)] − z = E[max(e − z, 0)] with e ~ N(0, 1). The excess is
-# approximated by (1 − z/CLIP_END)² times this polynomial, to within 3e-4. Cells more than
-# CLIP_BELOW below the floor carry almost no information.
+# the true pressure. At a pressure z standard deviations above the floor, this excess is E[max(z +
+# e, 0)] − z = E[max(e − z, 0)] with e ~ N(0, 1), in standard deviations. The excess is approximated
+# to within 3e-4 by (1 − z/CLIP_END)² times this polynomial. Cells more than CLIP_BELOW below the
+# floor carry almost no information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
@@ -310,7 +310,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
         if not normal[i, i] > 0.0:
             return False
         scale[i] = 1.0 / math.sqrt(normal[i, i])
-    # Cholesky factorisation; the inverse of the factor is stored in place.
+    # Compute the Cholesky factor, and store its inverse in place.
     for j in range(first, last):
         pivot = 1.0
         for k in range(first, j):
@@ -438,7 +438,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
     variance = _check_fit(state, model, cells)
     wider = 1.0
     if options.free_gain:
-        # The relation between d and the gain is less linear for a larger uncertainty of d.
+        # The larger the uncertainty of d, the less linear is the relation between d and the gain.
         uncertain = variance * fit.inverse[DEPTH, DEPTH] + state.budget.shared[DEPTH, DEPTH]
         wider += _GAIN_CURVATURE * min(uncertain / (fit.d * fit.d), 1.0)
     set_covariance(fit.inverse, wider * variance, fit.covariance)
@@ -466,7 +466,7 @@ def fit(
     fit.n_y = estimate.n_y
     fit.gain = estimate.gain
     fit.shear[:] = estimate.shear
-    d = n_x = n_y = gain = shear_x = shear_y = 0.0  # values before the last step
+    d = n_x = n_y = gain = shear_x = shear_y = 0.0  # parameter values before the last step
     before = math.inf
     halvings = 0
     limited = 0
@@ -474,7 +474,7 @@ def fit(
     for iteration in range(state.options.iterations):
         cost = linearise(state, model, frame, cells)
         if solved and not cost <= before + variance and halvings < _HALVINGS_MAX:
-            # The cost increased, so halve the step.
+            # The cost has increased, so halve the step.
             fit.d = 0.5 * (fit.d + d)
             fit.n_x = 0.5 * (fit.n_x + n_x)
             fit.n_y = 0.5 * (fit.n_y + n_y)

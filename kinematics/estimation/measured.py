@@ -21,10 +21,10 @@ from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_CONTACT_SIGMA = 5.0  # contact threshold of the sum, in standard deviations
+_CONTACT_SIGMA = 5.0  # contact threshold of the sum of readings, in standard deviations
 _EXTRAPOLATION_MAX = 1.02  # extrapolation limit, relative to the measured depth and tilt
 _EXTENT_ERROR_MAX = 0.08  # maximum relative difference between measured and expected extent
-_ITERATIONS_MAX = 20  # maximum number of alternating iterations for d and θ
+_ITERATIONS_MAX = 20  # maximum number of iterations that alternate between d and θ
 _TOLERANCE = 1e-7  # convergence tolerance, relative to the range
 
 
@@ -84,9 +84,9 @@ class MeasuredEstimator:
     extent is within 8 % of the value expected for the force.
     """
 
-    saturation: float | None = None  # saturated cells are treated like all other cells
+    saturation: float | None = None  # Saturated cells are treated like all other cells.
 
-    noise = 0.0  # not used: the curves include the measured noise
+    noise = 0.0  # This noise is not used, because the curves include the measured noise.
 
     def __init__(
         self,
@@ -106,12 +106,13 @@ class MeasuredEstimator:
         self._weights = sum_weights(grid, tip.radius, alive)
         self._used = self._weights[0] > 0.0
         self._zero_sums, self._noise = np.array(law.rest), np.array(law.noise)
-        # Sums due to a common shift of all cells; moment due to a slope of the zero offset [N·m].
+        # Sums due to a common shift of all cells, and moment due to a slope of the zero offset
+        # [N·m].
         self._shift = known.baseline * self._weights.sum(axis=1)
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
         sum_std = math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
         self._contact_threshold = _CONTACT_SIGMA * sum_std
-        # Maximum undetected d; its force equals the contact threshold.
+        # Maximum d that is not detected. Its force equals the contact threshold.
         root = self._root_of(self._contact_threshold, 0.0, self._root_max)
         self._undetected_d = tip.radius * root**2
         self._seq: int | None = None
@@ -222,8 +223,8 @@ class MeasuredEstimator:
         shown, shown_t, shown_q = _curve(law.shown, t, q)
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        # Partials of (sum, moment along the tilt) with respect to (d, s), and the partial of the
-        # moment across the tilt with respect to the tilt in that direction.
+        # Partials of the sum and of the moment along the tilt with respect to d and s. The last
+        # partial is that of the moment across the tilt with respect to the tilt in that direction.
         by_d = shown_t * per_d, s * (shown_t * per_d * lever + shown * lever_t * per_d)
         b = 2.0 * s * shown_q
         by_s = b, shown * lever + s * (b * lever + shown * 2.0 * s * lever_q)

@@ -19,15 +19,15 @@ from softfinger.kinematics.estimation.state import START_POINTS, Cells, Estimato
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, set_around, set_face
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-# Margin around the footprint, in cell diagonals. Cells whose centres are within this margin include
-# all cells that touch the footprint, even after a small motion of the contact.
+# Margin around the footprint, in cell diagonals. All cells that touch the footprint have their
+# centres within this margin, even after a small motion of the contact.
 _MARGIN = 0.75
 _BLUR_MARGIN = 2.0  # additional margin around the footprint, in standard deviations of the blur
-# rad, tilt at which the centroid's moment arm is computed; the arm hardly depends on the tilt.
+# Tilt at which the centroid's moment arm is computed [rad]. The arm hardly depends on the tilt.
 _TILT = 0.2
-_WEAK_PEAK = 15.0  # noise standard deviations; below this peak, neighbourhoods are used
+_WEAK_PEAK = 15.0  # peak below which neighbourhoods are used, in noise standard deviations
 _SINE_MAX = 0.95
-_NO_LEVEL = -1e300  # threshold below every reading
+_NO_LEVEL = -1e300  # threshold that is below every reading
 
 
 def tabulate_moments(
@@ -75,7 +75,7 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
     signal = state.signal
     estimate = state.estimate
     if state.options.is_solid:
-        # A solid tip loads its whole base, and its extent hardly depends on d.
+        # A solid tip loads its whole base, and the extent of the pressure hardly depends on d.
         sums_above(m, frame, cells, _NO_LEVEL)
         m.gain = 1.0
         if m.total > 0.0:

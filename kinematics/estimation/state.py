@@ -10,12 +10,12 @@ from softfinger.kinematics.sensing.footprint import Face, FloatArray, Grid, IntA
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-OUTLIERS_MAX = 6  # maximum number of outliers excluded from a frame
-# Fit parameters; the last two apply only to solid tips.
+OUTLIERS_MAX = 6  # maximum number of outliers that are excluded from a frame
+# Fit parameters. The last two apply only to solid tips.
 GAIN, DEPTH, TILT_X, TILT_Y, SHEAR_X, SHEAR_Y = range(6)
 PARAMETERS = 6
 START_POINTS = 17  # number of depths in the table for the initial estimate
-DEPTHS = 12  # number of depths in the table of correlated-noise effects
+DEPTHS = 12  # number of depths in the table for the effects of correlated noise
 # Patterns of common errors: a shift of all cells, its slopes in x and y, the tip position in x and
 # y, the pitch, and the pressure itself.
 SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING, PRESSURE = range(7)
@@ -45,8 +45,8 @@ class Options(Record):
     free_gain: bool
     is_solid: bool
     deepest: float  # maximum d of the model [m]
-    sine_max: float  # sin of the model's maximum tilt
-    step_deepest: float  # limits on d [m] and the sin of the tilt during the iteration
+    sine_max: float  # sine of the model's maximum tilt
+    step_deepest: float  # limits during the iteration: d [m] and the sine of the tilt
     step_sine: float
     shear_prior: float  # standard deviation of the shear, relative to the normal force
 
@@ -67,7 +67,7 @@ class Signal(Record):
     col: int
     mean: float  # [counts]
     energy: float  # Σ p² [counts²]
-    is_clipped: bool  # readings are clipped at the floor
+    is_clipped: bool  # True if readings are clipped at the floor
     contact: bool
     is_finite: bool
 
@@ -89,12 +89,12 @@ class Estimate(Record):
     invalid: int  # an `Invalid`
     has_second_contact: bool
     has_last_contact: bool
-    shear_x: float  # force on the face [N], for solid tips
+    shear_x: float  # force on the face of a solid tip [N]
     shear_y: float
     n_x: float
     n_y: float
-    shear: Pair  # model shear force divided by the squared radius [Pa]
-    residual: float  # Σ of (reading − model)² − reading² over the footprint [Pa²]
+    shear: Pair  # shear force of the model divided by the squared radius [Pa]
+    residual: float  # sum of (reading − model)² − reading² over the footprint [Pa²]
     undetected: float  # relative error of d that a smooth misfit may cause
     shared: float  # relative standard deviation of d due to known uncertainties
     covariance: Matrix  # of (d, tilt_x, tilt_y, gain)
@@ -113,10 +113,10 @@ class Moments(Record):
     n_x: float
     n_y: float
     gain: float
-    # Moments of the model at the depths deepest · (k/(START_POINTS − 1))²:
+    # Moments of the model at the depths deepest · (k/(START_POINTS − 1))².
     force: Depths  # Σ p for an upright tip [Pa]
     extent: Depths  # trace of the pressure's covariance for an upright tip [m²]
-    centroid_arm: Depths  # centroid divided by the sin of the tilt [m]
+    centroid_arm: Depths  # centroid divided by the sine of the tilt [m]
 
 
 class Fit(Record):
@@ -128,9 +128,9 @@ class Fit(Record):
     n_x: float
     n_y: float
     shear: Pair
-    first_row: int  # range of cells under pressure in the model
+    first_row: int  # range of cells that are under pressure in the model
     last_row: int
-    clip_noise: float  # noise of cells clipped at the floor [Pa]; 0 without clipping
+    clip_noise: float  # noise of cells that are clipped at the floor, or 0 without clipping [Pa]
     decrement: float  # predicted decrease of the sum of squares
     misfit: float  # Σ (reading − model)²
     readings: float  # Σ reading²
@@ -150,15 +150,16 @@ class Budget(Record):
 
     sizes: Annotated[FloatArray, SOURCES]  # standard deviations of the pattern factors
     baseline: float  # standard deviation of a shift of all cells [Pa]
-    slope: float  # standard deviation of the zero-offset slope, at the rim [Pa]
+    slope: float  # standard deviation of the zero-offset slope, measured at the rim [Pa]
     smooth: float  # relative pressure error
     rotation: float  # rotation of the sensor [rad]
     tilt_error: float  # relative tilt error of a solid tip per d/a
     row_correlation: float  # correlation of neighbouring cells in a row
-    cells_per_sample: float  # Σρ², cells per independent noise sample
+    cells_per_sample: float  # Σρ², the number of cells per independent noise sample
     has_common_errors: bool  # True for any error other than correlated noise
     is_correlated: bool
-    widening: Annotated[FloatArray, DEPTHS, 5]  # factors on standard deviations, DOF used
+    # Factors on the four standard deviations, and degrees of freedom used.
+    widening: Annotated[FloatArray, DEPTHS, 5]
     responses: Annotated[FloatArray, PARAMETERS, SOURCES]  # Jᵀq
     squares: Annotated[FloatArray, SOURCES]  # qᵀq
     displacement: Column
@@ -192,13 +193,13 @@ class Cells(NamedTuple):
     by_d: FloatArray
     by_x: FloatArray
     by_y: FloatArray
-    height: FloatArray  # √(a² − x² − y²) [m], see `cell_centres`; negative for unused cells
+    height: FloatArray  # √(a² − x² − y²), see `cell_centres`; negative for unused cells [m]
     x: FloatArray  # cell centre [m]
     y: FloatArray
-    pattern: FloatArray  # pattern that detects the contact of a solid tip
-    model: FloatArray  # modelled pressure [Pa] including gain and shear
-    residual: FloatArray  # reading − model [Pa], 0 for cells excluded from the fit
-    factor: FloatArray  # sensitivity of the reading to pressure, 0 for excluded cells
+    pattern: FloatArray  # pattern for detecting the contact of a solid tip
+    model: FloatArray  # modelled pressure including gain and shear [Pa]
+    residual: FloatArray  # reading − model, or 0 for cells excluded from the fit [Pa]
+    factor: FloatArray  # sensitivity of the reading to pressure, or 0 for excluded cells
 
 
 STRESS, BY_D, BY_X, BY_Y, HEIGHT, X, Y, PATTERN, MODEL, RESIDUAL, FACTOR = range(11)  # row indices
@@ -218,7 +219,7 @@ def cells_in(rows: FloatArray, grid: Grid) -> Cells:
 class Images(NamedTuple):
     """Images of a solid tip on `EstimatorState.grid`, with their weights."""
 
-    pixels: FloatArray  # [images · cells]; the last two are the shear images
+    pixels: FloatArray  # pixels [images · cells]; the last two images are for shear
     weights: Weights
 
 

@@ -25,7 +25,7 @@ from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 FloatPair = tuple[float, float]  # (left, right)
 Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
 
-_SHEAR_STEPS = 3  # fixed-point iterations for the shear forces; each adds two digits
+_SHEAR_STEPS = 3  # number of fixed-point iterations for the shear forces; each adds two digits
 
 
 @kernel
@@ -244,7 +244,8 @@ def load_torques(
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, _, _, across = motion
-    # Remove the motion along the bisector, because it does not contribute to the moment arms.
+    # Remove the motion along the bisector, because this motion does not contribute to the moment
+    # arms.
     face_slope = math.tan(0.5 * taper)
     scale = 1.0 / (1.0 + face_slope * face_slope)
     moment_arm1 = scale * (across * turn1 - face_slope * arm1)

@@ -26,15 +26,15 @@ from softfinger.kinematics.compiled.layout import Record, Records
 FloatArray = NDArray[np.float64]
 
 WINDING, CASE, AMBIENT, HEATING = range(4)
-COPPER = 0.0039  # 1/K, temperature coefficient of the winding's resistance
-TIME_MAX = 3600.0  # s, upper limit of the reported time to a limit
+COPPER = 0.0039  # temperature coefficient of the winding's resistance [1/K]
+TIME_MAX = 3600.0  # maximum time to a limit that is reported [s]
 _ROOM_TEMPERATURE = 25.0  # °C
-_CONVECTION_DIFFERENCE = 30.0  # K above ambient at which τ_c is defined
+_CONVECTION_DIFFERENCE = 30.0  # temperature above ambient at which τ_c is defined [K]
 _INITIAL_STD = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
 _RANDOM_WALK = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
-_STEP_STD = 0.12  # °C, standard deviation of the case temperature at a step of the reading
-_STAY_STD = 6.0  # °C, standard deviation of a constant reading over 1 s
-_COUPLING = 0.25  # unobservable τ_w error, as a fraction of W − C
+_STEP_STD = 0.12  # standard deviation of the case temperature when the reading steps [°C]
+_STAY_STD = 6.0  # standard deviation of a reading that stays constant for 1 s [°C]
+_COUPLING = 0.25  # unobservable error of τ_w, as a fraction of W − C
 
 
 class HeatLaw(Record):
@@ -72,7 +72,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
         return
     _predict(s, square, dt)
     stepped = reading - s.reading
-    if abs(stepped) > 1.0:  # the filter missed steps, or the sensor was replaced
+    if abs(stepped) > 1.0:  # The filter missed steps, or the sensor was replaced.
         _correct(s, reading, 1.0)
     elif stepped != 0.0:
         _correct(s, reading - 0.5 * stepped, _STEP_STD * _STEP_STD)
@@ -106,11 +106,11 @@ def _predict(s: HeatState, square: float, dt: float) -> None:
     f[CASE, AMBIENT] = dt * 1.25 * loss
     x[WINDING] += dt * (x[HEATING] * heating - flow)
     x[CASE] += dt * (law.share * flow - (x[CASE] - x[AMBIENT]) * loss)
-    for i in range(4):  # P Fᵀ in place, row by row
+    for i in range(4):  # Compute P Fᵀ in place, row by row.
         row0, row1, row2, row3 = p[i, 0], p[i, 1], p[i, 2], p[i, 3]
         for j in range(4):
             p[i, j] = row0 * f[j, 0] + row1 * f[j, 1] + row2 * f[j, 2] + row3 * f[j, 3]
-    for j in range(4):  # F (P Fᵀ) in place, column by column
+    for j in range(4):  # Compute F (P Fᵀ) in place, column by column.
         row0, row1, row2, row3 = p[0, j], p[1, j], p[2, j], p[3, j]
         for i in range(4):
             p[i, j] = f[i, 0] * row0 + f[i, 1] * row1 + f[i, 2] * row2 + f[i, 3] * row3

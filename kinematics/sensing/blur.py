@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Width in points; moment-matching weights are used below it, and Gaussian samples above it.
+# Width in points. Moment-matching weights are used below it, and Gaussian samples above it.
 _MOMENT_MATCHED_MAX = 0.75
 _CUTOFF = 4.5  # truncation of the Gaussian, in standard deviations
 

@@ -31,7 +31,7 @@ class Grid(Record):
     """Grid of cells under a tip; lengths [m] in sensor axes, relative to the tip centre."""
 
     radius: float
-    x: float  # corner of the first cell
+    x: float  # x of the first cell's corner
     y: float
     pitch_x: float
     pitch_y: float

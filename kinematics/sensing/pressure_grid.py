@@ -21,7 +21,7 @@ from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, coun
 
 __all__ = ["SensorGrid"]
 
-_PITCH_MAX = 0.1  # m; a larger value was probably given in millimetres
+_PITCH_MAX = 0.1  # maximum pitch [m]; a larger value was probably given in millimetres
 _POINTS_PER_RADIUS = 150.0  # minimum number of sample points per tip radius
 
 
@@ -160,7 +160,7 @@ class SensorGrid:
         return _images(replace(self, rotation=0.0), tip)
 
 
-# Cache size: the grids of two fingers, and shifted copies for the error budget.
+# The cache holds the grids of two fingers and shifted copies for the error budget.
 @lru_cache(maxsize=16)
 def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     return images(tip, grid.on(tip), grid.blur)

@@ -26,10 +26,11 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
 IMAGES = 2 * MODES
-_IMAGES_PER_PASS = 4  # number of images added per pass; must divide IMAGES
+_IMAGES_PER_PASS = 4  # number of images added per pass; it must divide IMAGES
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
-# Sample points per cell side: for cells inside the rim, cells cut by the rim, and with blur.
+# Number of sample points per cell side: for cells inside the rim, for cells cut by the rim, and
+# with blur.
 _INSIDE, _CUT, _BLURRED = 6, 24, 12
 
 
@@ -154,7 +155,7 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
     by_x = weights.by_x
     by_y = weights.by_y
     _evaluate_ratios(weights, x, y)
-    # F/(N cos θ) differs from 1 for a sticking face.
+    # If the face sticks to the tip, F/(N cos θ) differs from 1.
     held = 1.0 - square * weights.q[0]
     held_t = -square * weights.q_x[0] * table.by_root
     held_s = -weights.q[0] - square * weights.q_y[0] * table.by_square
@@ -163,7 +164,7 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
     both = 2.0 * (normal_s * held + normal * held_s) * cosine - normal * held / cosine
     by_x[0] = n_x * both
     by_y[0] = n_y * both
-    # (n_x + i n_y)^m, and its derivative divided by m; the modes are sorted by m.
+    # (n_x + i n_y)^m, and its derivative divided by m. The modes are sorted by m.
     m = 0
     power = 1.0 + 0.0j
     below = 0.0j

@@ -39,7 +39,7 @@ STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its partials in
 PLANES = 4
 Cells = tuple[int, int]  # half-open range
 _SPREAD_MIN = 1e-12
-# Gauss-Legendre rule on a point's rectangle, scaled to width 1.
+# Gauss-Legendre rule on the rectangle of a point, scaled to a width of 1.
 _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 
 
@@ -63,7 +63,7 @@ class SpringPoints(NamedTuple):
     y: FloatArray  # one value per row
     across: FloatArray  # weights along x [position, cell offset], see `blur.axis_points`
     along: FloatArray  # weights along y
-    law: FloatArray  # σ(ε) coefficients of the material, by increasing powers
+    law: FloatArray  # coefficients of the material's σ(ε), by increasing powers
     sums: FloatArray  # scratch, three rows of cells
 
 
@@ -138,24 +138,25 @@ def _set_strains(
     least = _SPREAD_MIN * a2 * math.sqrt(a2)
     for k in range(first, last):
         x = points.x[k]
-        # ε > 0 where f = ℓ² − z² > 0; f is almost linear up to the rim and beyond.
+        # The strain ε is positive where f = ℓ² − z² > 0. Up to the rim and beyond, f is almost
+        # linear.
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
-        # Width of the uniform distribution of f. If the outline passes through the centre and f is
-        # a plane, the mean of max(f, 0) is then exact to within 2 %; the exact width is 4 (big +
-        # small²/(3 big)).
+        # Width of the uniform distribution of f. The exact width is 4 (big + small²/(3 big)). With
+        # the approximation, the mean of max(f, 0) is correct to within 2 % if the outline passes
+        # through the centre and f is a plane.
         by_x = abs(size_x * (x - z * v))
         by_y = abs(size_y * (y - z * w))
         big = max(by_x, by_y)
         small = min(by_x, by_y)
         spread = 4.0 * max(big, max(0.963 * big + 0.222 * small, 0.77 * big + 0.556 * small))
         part = min(max(f + 0.5 * spread, 0.0), spread)
-        # Value of z in the middle of the part with f > 0; f decreases along (p, q).
+        # Value of z in the middle of the part with f > 0, because f decreases along (p, q).
         p = x - z * v
         q = y - z * w
         away = 0.5 * max(0.5 * part - f, 0.0) / (p * p + q * q + least)
         z = max(z + away * (v * p + w * q), 0.0)
-        # Means of ε and 1/ℓ for values of f that are uniformly distributed from 0 to ``part``.
+        # Means of ε and 1/ℓ if f is uniformly distributed from 0 to ``part``.
         length = math.sqrt(z * z + part)
         mean = part / (spread * (length + z) + least)
         g = points.inverse[row + k]
@@ -279,7 +280,7 @@ def press_springs(
     count_y, reach = points.along.shape
     size_x = 0.5 * grid.pitch_x / count_x
     size_y = 0.5 * grid.pitch_y / count_y
-    # The centre of a rectangle that the outline cuts may be outside the outline.
+    # If the outline cuts a rectangle, the centre of the rectangle may be outside the outline.
     set_around(around, face, a, math.hypot(size_x, size_y))
     low, high = extremes(around, a)
     lines = points.y.shape[0]

@@ -29,7 +29,7 @@ class SoftfingerEnvConfig(EnvConfig):
     fps: int = round(1.0 / STEP)
     control: str = "law"
     profile: str | None = None  # profile of the simulated hand; None selects the default settings
-    rows: int = 44  # size of the profile's grids
+    rows: int = 44  # number of rows and columns of the profile's grids
     cols: int = 44
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)

@@ -20,12 +20,12 @@ class SoftfingerConfig(RobotConfig):
     address: str | None = None  # tcp://HOST or STREAM,COMMANDS; default: SOFTFINGER_ADDRESS
     keys: Path | None = None  # folder with this client's keys, if the daemon requires keys
     control: str = "joints"
-    rows: int = 44  # rows per tactile grid
-    cols: int = 44  # columns per tactile grid
-    full_scale: float = FULL_SCALE  # Pa, pressure shown as white in images
-    least_force: float = 0.5  # N; a smaller `grip.force` opens the hand
-    timeout: float = 5.0  # s, timeout for a reply, a state or a frame
-    start_timeout: float = 120.0  # s, timeout for the first state; the daemon may be compiling
+    rows: int = 44  # number of rows per tactile grid
+    cols: int = 44  # number of columns per tactile grid
+    full_scale: float = FULL_SCALE  # pressure shown as white in images [Pa]
+    least_force: float = 0.5  # minimum grip force [N]; a smaller `grip.force` opens the hand
+    timeout: float = 5.0  # timeout for a reply, a state or a frame [s]
+    start_timeout: float = 120.0  # timeout [s] for the first state; the daemon may be compiling
     disarm_on_disconnect: bool = True  # If True, the hand drops the object on disconnection.
 
     def __post_init__(self) -> None:

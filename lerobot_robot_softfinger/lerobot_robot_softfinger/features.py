@@ -12,15 +12,15 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import HandState, TactileFrame
 
 _PLAIN = {"pos": "q", "vel": "dq", "current": "current", "contact": "contact"}
-_FELT = ("d", "theta", "force")  # 0 without a contact
-_OBJECT = ("angle", "width")  # 0 while the object pose is unknown
+_FELT = ("d", "theta", "force")  # fields that are 0 without a contact
+_OBJECT = ("angle", "width")  # fields that are 0 while the object pose is unknown
 STATE = tuple(
     [f"{name}.{each}" for name in FINGERS for each in (*_PLAIN, *_FELT, "touch_age")]
     + [f"object.{each}" for each in _OBJECT]
 )
 JOINTS = tuple(f"{name}.pos" for name in FINGERS)
 IMAGES = {name: f"{name}_touch" for name in FINGERS}
-FULL_SCALE = 127.5e3  # Pa, 500 Pa per step in an 8-bit image
+FULL_SCALE = 127.5e3  # full-scale pressure [Pa], with 500 Pa per step in an 8-bit image
 
 
 def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[str, float]:

@@ -29,7 +29,7 @@ class Softfinger(Robot):
     def __init__(self, config: SoftfingerConfig) -> None:
         super().__init__(config)
         self.config = config
-        # lerobot-record requires this attribute. The tactile grids are not cameras.
+        # lerobot-record requires this attribute. The tactile grids do not count as cameras.
         self.cameras: dict[str, Any] = {}
         self._hand: Hand | None = None
 

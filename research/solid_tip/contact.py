@@ -20,7 +20,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from research.solid_tip.green import FloatArray, Green
 
-# In units of a; cells up to this distance outside the undeformed overlap may be in contact.
+# Distance in units of a. Cells up to this distance outside the undeformed overlap may be in
+# contact.
 BEYOND = 0.06
 
 
@@ -31,8 +32,8 @@ class Press(NamedTuple):
     theta: float
     push: float  # normal force N
     energy: float  # U
-    base: FloatArray  # (H, B) cosine harmonics of the base pressure at the base nodes
-    shear: float  # force on the tip along (cos θ, 0, −sin θ); 0 without friction
+    base: FloatArray  # cosine harmonics of the base pressure at the base nodes (H, B)
+    shear: float  # force on the tip along (cos θ, 0, −sin θ), or 0 without friction
 
 
 class TiltedPlane:
@@ -45,15 +46,14 @@ class TiltedPlane:
         self.axes = axes = axes if sticking else axes[:1]
         m = np.arange(len(green.rings))[:, None, None]
         rings, places = [], []
-        self.parts = []  # per ring: slice of forces, loads (3, M, n), shares (M, 1)
+        self.parts = []  # slice of forces, loads (3, M, n) and shares (M, 1) of each ring
         count = 0
         for ring, (cells, (r, z)) in enumerate(zip(green.cells, green.place, strict=True)):
             phi = 2 * np.pi * (np.arange(cells // 2) + 0.5) / cells
             height = r * np.cos(phi) * sine + z * cosine
             near = height > 1 - d_max - BEYOND
             phi, half = phi[near, None], cells // 2
-            # Axes in cylindrical components, for the harmonics that the cells of the ring can
-            # resolve.
+            # Axes in cylindrical components, for the harmonics that the ring's cells can resolve.
             x, y, upright = axes.T
             load = np.stack(
                 np.broadcast_arrays(
@@ -69,7 +69,7 @@ class TiltedPlane:
             places.append(np.hstack([0 * phi + z, r * np.cos(phi), r * np.sin(phi)]))
             count += load.shape[2]
         self.ring = np.concatenate(rings)
-        self.places = np.concatenate(places)  # (z, x, y) of each cell
+        self.places = np.concatenate(places)  # coordinates (z, x, y) of each cell
         self.reach = self.places @ (cosine, sine, 0.0)
         self.compliance = np.zeros((count, count))
         used = np.unique(self.ring)

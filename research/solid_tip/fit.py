@@ -20,13 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 from research.solid_tip.contact import Press
 from research.solid_tip.green import GAUSS, RING_EDGES, FloatArray, quadratic
 
-D_MAX, THETA_MAX = 0.4, np.radians(36.0)  # sin 36° < 1 − D_MAX, so the plane stays above the base
+# The plane stays above the base because sin 36° < 1 − D_MAX.
+D_MAX, THETA_MAX = 0.4, np.radians(36.0)
 NU = (0.45, 0.4995)
 S_MAX = np.sqrt(D_MAX)
-ORDERS = (11, 6)  # coefficients in s and sin²θ
+ORDERS = (11, 6)  # numbers of coefficients in s and in sin²θ
 HARMONICS = 9
-# Cells beyond this radius are down-weighted, because bonded stress is singular and a lying base
-# ends.
+# Cells beyond this radius are down-weighted, because the stress of a bonded tip is singular there
+# and the base of a lying tip ends there.
 RIM = 0.95
 
 
@@ -43,7 +44,7 @@ class Samples(NamedTuple):
     push: FloatArray
     energy: FloatArray
     shear: FloatArray
-    base: FloatArray  # (n, H, R) harmonics of the base pressure, averaged over rings
+    base: FloatArray  # harmonics of the base pressure, averaged over rings (n, H, R)
 
     @classmethod
     def of(cls, presses: list[Press], base_radius: FloatArray) -> Samples:
@@ -146,11 +147,11 @@ def fit(
     for m in range(HARMONICS):
         weight = np.sqrt(areas * (1.0 if m == 0 else 0.5)) * np.where(RING_EDGES[1:] > RIM, 0.05, 1)
         flat = patterns[:, :, m] * weight
-        # Include the base moment, so that the modes reproduce it in spite of the rim's low weight.
+        # Include the base moment, so that the modes reproduce it despite the low weight of the rim.
         moment = (m == 1) * 2.0 * patterns[:, :, m] @ levers
         flat = np.concatenate([flat, moment[..., None]], axis=-1)
         _, size, rows = np.linalg.svd(flat.reshape(-1, areas.size + 1), full_matrices=False)
-        # Rms amplitude of the truncated modes.
+        # RMS amplitude of the truncated modes.
         left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / flat[..., 0].size) / scale
         turned = design * np.sin(theta)[:, None] ** m
         for row in rows[: int(np.sum(left > tolerance))]:
@@ -210,7 +211,7 @@ class SolidTip:
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
         """Average the pressure over cells of a square grid centred under the tip; rows along y."""
-        parts, turns = 10, 2000  # radial and angular pieces of each ring
+        parts, turns = 10, 2000  # number of radial and angular pieces of each ring
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,
             np.arange(self.edges.size),

@@ -60,7 +60,7 @@ class Meridian:
         radius, angle = (
             np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2])) for ends in (radii, angles)
         )
-        # Node (i, j) is at radius i and polar angle j. All nodes with i = 0 are the origin, node 0.
+        # Node (i, j) has radius i and polar angle j. All nodes with i = 0 are the origin, node 0.
         number = np.arange(radius.size * angle.size).reshape(radius.size, angle.size)
         number = np.maximum(number - angle.size + 1, 0)
         self.number = number
@@ -77,7 +77,7 @@ class Meridian:
             ]
         )
         self.axis: IntArray = np.unique(number[:, 0])
-        self.base: IntArray = number[:, -1]  # from the origin to the rim
+        self.base: IntArray = number[:, -1]  # base nodes from the origin to the rim
 
     @cached_property
     def _geometry(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -132,20 +132,20 @@ class Meridian:
         return sparse.csc_matrix((matrices.ravel(), (row.ravel(), column.ravel())), (size, size))
 
 
-STIFF = 1e4  # E, stiffness of the springs that suppress rigid motions of harmonic 1
+STIFF = 1e4  # stiffness of the springs that suppress rigid motions of harmonic 1, in units of E
 CONTACT_END = np.radians(85.0)  # maximum polar angle of the rings that may be in contact
-CAP = 0.2  # rad, polar angle of the cap on which the shear force acts
+CAP = 0.2  # polar angle of the cap on which the shear force acts [rad]
 
 
 class Green(NamedTuple):
     """Response of rings and base, with components (r, φ, z); rings start at the pole."""
 
-    place: FloatArray  # (R, 2) mean r and z of each ring [a]
-    weight: FloatArray  # (R,) ∫ r ds of each ring [a²]
-    cells: IntArray  # (R,) number of cells around each ring, even
-    rings: FloatArray  # (M + 1, 3, R, 3, R) weight × mean displacement for unit traction
-    base_radius: FloatArray  # (B,) radii of the base nodes [a]
-    base: FloatArray  # (H, B, 3, R) base pressure at these nodes for unit traction
+    place: FloatArray  # mean r and z of each ring [a], shape (R, 2)
+    weight: FloatArray  # ∫ r ds of each ring [a²], shape (R,)
+    cells: IntArray  # number of cells around each ring, even, shape (R,)
+    rings: FloatArray  # weight × mean displacement for unit traction, shape (M + 1, 3, R, 3, R)
+    base_radius: FloatArray  # radii of the base nodes [a], shape (B,)
+    base: FloatArray  # base pressure at these nodes for unit traction, shape (H, B, 3, R)
 
 
 def arc_loads(mesh: Meridian) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -229,7 +229,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
         factors = splu(
             held, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
-        loads = np.zeros((size, 3 * active.size))  # columns are sorted by component, then by ring
+        loads = np.zeros((size, 3 * active.size))  # sorted by component, then by ring
         for k, ring in enumerate(active):
             for c in range(3):
                 loads[3 * arc[2 * ring : 2 * ring + 3] + c, c * active.size + k] = nodal[ring]

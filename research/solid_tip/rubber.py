@@ -35,14 +35,14 @@ from research.solid_tip.green import (
     quadratic,
 )
 
-WEDGE = 0.1  # rad, angle of the wedge
-STIFF = 1e3  # E, stiffness of the spring that holds the mean position of a lying base
+WEDGE = 0.1  # angle of the wedge [rad]
+STIFF = 1e3  # stiffness of the spring that holds the mean position of a lying base, in units of E
 HARMONICS = 9
 AZIMUTHS = 48  # number of azimuths at which the base pressure is evaluated
 SLICES = 8
 ROOTS = np.linspace(0.2, np.sqrt(0.4), 8)  # √(d/a) of the presses
-REACHED = 0.5  # a, minimum undeformed height of nodes that the plane may touch
-CHUNK = 64  # number of elements processed at once
+REACHED = 0.5  # minimum undeformed height of nodes that the plane may touch [a]
+CHUNK = 64  # number of elements that are processed at once
 
 
 class Strained(NamedTuple):
@@ -52,16 +52,16 @@ class Strained(NamedTuple):
     push: float  # normal force N
     shear: float  # force against the tip along (cos θ, 0, −sin θ)
     energy: float
-    base: FloatArray  # (H, R) harmonics of the base pressure versus radius on the sensor
+    base: FloatArray  # harmonics of the base pressure versus radius on the sensor, shape (H, R)
 
 
 class State(NamedTuple):
     """Current state of a press."""
 
     depth: float
-    motion: FloatArray  # displacement of each dof
+    motion: FloatArray  # displacement of each degree of freedom
     touching: NDArray[np.bool_]  # contact state of the face nodes
-    held: FloatArray  # positions along the plane of the sticking nodes
+    held: FloatArray  # positions of the sticking nodes along the plane
 
 
 class Body:
@@ -87,7 +87,8 @@ class Body:
         self._revolve(mesh, phis)
         gradient = self._geometry()
         turns = self._free_nodes(bonded) if whole else self._axisymmetric(mesh, bonded)
-        # Matrix from element dofs to the displacement gradient at the quadrature points.
+        # Matrix from the element's degrees of freedom to the displacement gradient at the
+        # quadrature points.
         size = self.places.shape[1]
         self.strain = np.zeros((len(self.elements), 243, size))
         for k in range(3):
@@ -314,7 +315,7 @@ class Body:
         four -= both + both.transpose(0, 1, 3, 2)
         one = g[..., :, None] * g[..., None, :]
         four += (2 / 9 * scale * first + bent)[..., None, None] * one
-        # F^−T dFᵀ F^−T: swap the second indices.
+        # For F^−T dFᵀ F^−T, swap the second indices.
         turned = one.reshape(count, 27, 3, 3, 3, 3).transpose(0, 1, 2, 5, 4, 3)
         four += (scale * first / 3 - bent)[..., None, None] * turned.reshape(count, 27, 9, 9)
         return stress, density, four, swell
@@ -339,7 +340,7 @@ class Body:
     def _solve_at_rest(self, right: FloatArray, known: FloatArray) -> FloatArray:
         """Solve for linear elements as in `solve`, using the response to forces on the face."""
         assert self.moves is not None
-        # All forces except those on the face are in equilibrium from the start.
+        # From the start, all forces except those on the face are in equilibrium.
         given = ~np.isnan(known[self.pushed])
         load = right[self.pushed]
         if given.any():
@@ -414,7 +415,7 @@ class Body:
             reaction = (forces + self.times_tangent(numbers, change))[self.normal]
             gap = motion[self.normal] - target
             now = np.where(touching, reaction < 0, gap > 1e-10)
-            if attempt > 15:  # keep alternating nodes active
+            if attempt > 15:  # Keep alternating nodes active after 15 attempts.
                 now |= touching
             still = np.abs(change).max() < 1e-6 and size == 1.0
             if still and (now == touching).all():
@@ -430,7 +431,7 @@ class Body:
     def base_pressure(self, motion: FloatArray, forces: FloatArray) -> FloatArray:
         """Return cosine harmonics of the base pressure at `MIDDLES` in the deformed position."""
         place = self.nodes.copy()
-        if self.at_rest is not None:  # linear elements
+        if self.at_rest is not None:  # for linear elements
             motion = 0 * motion
         if self.frames.shape[2] == 3:
             place += np.einsum("nij,nj->ni", self.frames, motion.reshape(-1, 3))

@@ -29,7 +29,7 @@ from research.solid_tip.rubber import HARMONICS, strained
 NU = fit.chebyshev_nodes(*fit.NU, 3)
 SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
 AREAS = np.pi * np.diff(RING_EDGES**2)
-# For each block, the indices of sin²θ in `SINES` to press, with the values of ν. At the far corner
+# For each block, the indices of sin²θ in `SINES` to press, and the values of ν. At the far corner
 # of the domain, the elements of lying rubber are crushed and the solution does not converge, so the
 # fit extrapolates there.
 TILTS = {
@@ -38,7 +38,7 @@ TILTS = {
     "bonded-sticking": {2: NU[1:2], 4: NU[1:2]},
     "lying-sticking": {2: NU[1:2]},
 }
-IN_ROOT = 5  # terms in √(d/a) for the effect of strain; the lowest order is d/a
+IN_ROOT = 5  # number of terms in √(d/a) for the effect of strain; the lowest order is d/a
 
 
 NOTES = """Hemisphere of neo-Hookean rubber, W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², pressed
@@ -67,11 +67,11 @@ class Change(NamedTuple):
     """Effect of finite strain on presses at one θ and ν, as a function of d."""
 
     s: FloatArray
-    energy: FloatArray  # ratio to the linear energy, minus 1 (n,)
+    energy: FloatArray  # ratio to the linear energy, minus 1, shape (n,)
     push: FloatArray
-    lever: FloatArray  # linear U/(N d)
-    shear: FloatArray  # divided by the normal force
-    base: FloatArray  # divided by the normal force (n, H, R)
+    lever: FloatArray  # U/(N d) of the linear solution
+    shear: FloatArray  # shear divided by the normal force
+    base: FloatArray  # base pressure divided by the normal force, shape (n, H, R)
 
 
 def change(arrays: Mapping[str, FloatArray], theta: float) -> Change:
@@ -176,7 +176,7 @@ class Strain:
         rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
         first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
         shear, harmonics = through(self.sines, shears), through(self.sines, bases)
-        # At small tilts, the higher harmonics are so small that, after division by sin^m θ, they
+        # At small tilts, the higher harmonics are very small. After division by sin^m θ, they
         # contain only mesh errors.
         least = len(self.sines) > 1
         higher = through(self.sines[least:], bases[least:])

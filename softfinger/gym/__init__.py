@@ -16,8 +16,8 @@ from gymnasium.envs.registration import register  # noqa: E402 - require() expla
 __all__ = ["SECONDS", "STEP", "TASKS"]
 
 TASKS = ("grasp", "rotate", "push")
-SECONDS = 4.0  # s, maximum episode duration
-STEP = 0.02  # s, simulated time per step
+SECONDS = 4.0  # maximum episode duration [s]
+STEP = 0.02  # simulated time per step [s]
 
 for _task in TASKS:
     register(

@@ -25,10 +25,10 @@ from softfinger.gym.environment import FORCE, Observation, SoftFingerEnv
 from softfinger.tools import style
 from softfinger.tools.sweep import Sweep, add_sweep
 
-SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, episodes per sample
+SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, and episodes per sample
 STEPS = 200
 FEATURES = 5
-# Factor for the weights; reduces the speed, because an action of 1 is fast (1 rad/s).
+# Scale of the weights. It keeps the joints slow, because an action of 1 is fast (1 rad/s).
 _WEIGHT_SCALE = 0.2
 _ADDED_STD = 0.2  # added to the standard deviation to avoid premature convergence
 

@@ -34,14 +34,14 @@ __all__ = ["Images", "SoftFingerEnv"]
 
 Observation = dict[str, NDArray[Any]]
 
-FORCE = 6.0  # N, target grip force
-REACH = 0.02  # rad, maximum joint goal change per step
-FORCES = 1.0, 12.0  # N, grip forces for the actions −1 and 1
-ANGLE = 0.25  # rad, object angle for the action 1
-WHITE = 50e3  # Pa, pressure shown as white (255) in images
-LOST = 0.03  # m, displacement at which the object counts as lost
-_START_D = 0.004  # m, tip displacement of the initial grip with joint goals
-_GRIP_TIMEOUT = 3.0  # s, timeout for the initial grip
+FORCE = 6.0  # target grip force [N]
+REACH = 0.02  # maximum joint goal change per step [rad]
+FORCES = 1.0, 12.0  # grip forces for the actions −1 and 1 [N]
+ANGLE = 0.25  # object angle for the action 1 [rad]
+WHITE = 50e3  # pressure shown as white (255) in images [Pa]
+LOST = 0.03  # displacement at which the object counts as lost [m]
+_START_D = 0.004  # tip displacement of the initial grip with joint goals [m]
+_GRIP_TIMEOUT = 3.0  # timeout for the initial grip [s]
 _OBSERVATION_MAX = 200.0  # bound on every float observation, in SI units
 
 
@@ -160,7 +160,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._loop.advance(0.1)
         if self._task != "grasp":
             self._take_hold()
-        self.goals = list(self._loop.state.reading.q)  # of the joints [rad]
+        self.goals = list(self._loop.state.reading.q)  # joint goals [rad]
         self._first = self._hand.object_pose.copy()
         self._potential = self._closed()
         if self._task == "push":

@@ -22,10 +22,10 @@ from softfinger.tools.viewing.hand_drawing import COLOURS, hand_parts
 
 Image = NDArray[np.uint8]
 
-_SIDE, _MAP = 400, 150  # pixels, width of the scene and side length of a pressure map
+_SIDE, _MAP = 400, 150  # width of the scene and side length of a pressure map [pixels]
 HEIGHT, WIDTH = 2 * _MAP, _SIDE + _MAP
-_SCALE = 2100.0  # pixels per metre
-_LOWEST = -0.012  # m, y of the lower edge of the scene
+_SCALE = 2100.0  # scale of the picture [pixels/m]
+_LOWEST = -0.012  # y of the scene's lower edge [m]
 _THINNEST = 1.6  # pixels
 _BACKGROUND = 24
 
@@ -52,7 +52,7 @@ class Painter:
         for k, frame in enumerate(pressure):
             level = np.minimum(frame / self._full, len(self._colours) - 1).astype(np.intp)
             rows, cols = (np.arange(_MAP) * n // _MAP for n in frame.shape)
-            shown = self._colours[level[::-1][rows[:, None], cols]]  # row 0 is at the bottom
+            shown = self._colours[level[::-1][rows[:, None], cols]]  # Row 0 is at the bottom.
             image[k * _MAP : (k + 1) * _MAP, _SIDE:] = shown
         return image
 

@@ -22,7 +22,7 @@ from softfinger.daemon.types import FINGERS, Frame, Goal, Reading
 
 __all__ = ["check_servos", "check_shape", "check_tactile", "load"]
 
-_POLL = 1e-3  # s, poll interval, like a control tick
+_POLL = 1e-3  # poll interval [s], as long as a control tick
 
 
 def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:
@@ -34,14 +34,14 @@ def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) 
     for name in settings.scene.fingers:
         sensor = make_sensor(settings, clock, None, FINGERS.index(name))
         assert sensor is not None, "tactile.backend: found none, expected a board"
-        for _ in range(2):  # The daemon reopens a board after losing its port.
+        for _ in range(2):  # The daemon reopens a board after its port was lost.
             sensor.open()
             try:
                 _check_frames(settings, sensor, frames, time.monotonic() + patience)
                 _check_counters(sensor)
             finally:
                 sensor.close()
-            sensor.latest()  # calling `latest` after `close` must not raise an exception
+            sensor.latest()  # After `close`, `latest` must not raise an exception.
         sensor.close()
 
 

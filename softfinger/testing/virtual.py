@@ -35,10 +35,10 @@ from softfinger.tools.recordings.record import RecordingWriter
 
 Controller = Callable[[HandState], Mapping[str, Any] | None]
 
-_QUEUE = 10_000  # maximum number of messages queued for a subscription; older messages are dropped
+_QUEUE = 10_000  # maximum number of messages queued for a subscription; the oldest ones are dropped
 _ROUNDING = 1e-9  # s
 _OWN = b"this process"  # route of this object's own requests
-_EVERYTHING = -1  # all topics, as bits
+_EVERYTHING = -1  # bit mask of all topics
 
 
 class RecordingOver(NoStream):
@@ -51,7 +51,7 @@ class Tap(Link):
     def __init__(self, take: Callable[[bytes, dict[str, Any]], None]) -> None:
         super().__init__()
         self._take = take
-        self.tapped = 0  # topics for `take`, as bits
+        self.tapped = 0  # bit mask of the topics for `take`
         self.answer: dict[str, Any] = {}  # reply to the owner's last request
 
     def request(self, request: dict[str, Any], t: float) -> None:

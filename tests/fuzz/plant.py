@@ -12,11 +12,11 @@ from softfinger.kinematics.compiled.kernel import kernel
 from tests.fuzz import Report
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 
-LONGER = 10  # the step is multiplied by this factor in one of three hands
-EACH = 400  # commands per hand
+LONGER = 10  # factor by which the step of one in three hands is multiplied
+EACH = 400  # number of commands per hand
 SHAPES = ("rectangle", "rectangle", "disc", "wedge", "none")
-# Columns: joint, mode, torque on, goal, current, three load components, load set, reset, seconds,
-# quiet.
+# The columns are joint, mode, torque on, goal, current, three load components, load set, reset,
+# seconds and quiet.
 _COLUMNS = 12
 
 FINE, NOT_FINITE, UNTOLD, RUNAWAY, CREATED = range(5)
@@ -68,11 +68,11 @@ def carry_out(plants, data, ring, commands):
         goals.current[joint] = commands[k, 4]
         if commands[k, 8] > 0.0:
             goals.load[:] = commands[k, 5:8]
-        if commands[k, 9] > 0.0:  # open the hand and put the object back between the fingers
+        if commands[k, 9] > 0.0:  # Open the hand and put the object back between the fingers.
             state.position[:] = 0.0
             state.velocity[:] = 0.0
             state.position[3] = 0.08
-        if commands[k, 11] > 0.0:  # without input, the energy may only decrease from now on
+        if commands[k, 11] > 0.0:  # Without input, the energy may only decrease from now on.
             goals.torque_on[:] = 0
             state.current[:] = 0.0
             goals.load[:] = 0.0

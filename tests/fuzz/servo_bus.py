@@ -38,7 +38,7 @@ def fuzz(count: int, seed: int) -> Report:
     t = 0.0
     for _ in range(count):
         packet = mutated(source, source.choice(SEEDS))
-        if source.random() < 0.7:  # most packets get a valid CRC, so the bus processes them
+        if source.random() < 0.7:  # Most packets get a valid CRC, so that the bus processes them.
             packet = packet[:-2] + crc16(packet[:-2]).to_bytes(2, "little")
         t += source.choice((0.0, 0.0002, 0.002, 0.02))
         bus.feed(packet, t)
@@ -55,6 +55,6 @@ def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
     """
     for each in bus.servos:
         each.silent = each is not servo
-    servo.table.set(reg.PROTOCOL_TYPE, 2)  # a write may have selected protocol 1
+    servo.table.set(reg.PROTOCOL_TYPE, 2)  # A write may have selected protocol 1.
     found = PacketParser().feed(bus.feed(frame(BROADCAST, framing.PING), t), 0.0)
     return [packet.id for packet in found] == [servo.id]

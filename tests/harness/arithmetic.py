@@ -63,7 +63,7 @@ def other() -> dict[str, str]:
     elif core in _AVX512:
         older = "Haswell"
     else:
-        older = "Prescott" if core == "nehalem" else "Nehalem"  # NumPy itself requires Nehalem
+        older = "Prescott" if core == "nehalem" else "Nehalem"  # NumPy itself requires Nehalem.
     variables = {"OPENBLAS_CORETYPE": older, "NUMBA_CPU_NAME": "generic"}
     extensions = simd()
     return variables | ({"NPY_DISABLE_CPU_FEATURES": " ".join(extensions)} if extensions else {})

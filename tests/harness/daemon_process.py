@@ -11,7 +11,7 @@ from typing import Any
 from softfinger.daemon.client.command_client import send
 
 SOFTFINGER = [sys.executable, "-m", "softfinger"]
-# Settings that tolerate stalls on a busy machine, for tests that are not about time-outs.
+# Settings that tolerate stalls on a busy machine, for tests that are not about timeouts.
 PATIENCE = {
     "servos.open_timeout": 60.0,
     "servos.reply_timeout": 0.1,
@@ -38,7 +38,7 @@ def softfinger(*words: object, **options: Any) -> subprocess.CompletedProcess[st
 
 def pip_installed(package: Path, folder: Path) -> Path:
     """Install one package of this repository with pip and return its location."""
-    shutil.copytree(package, folder / "source")  # builds leave files in the source folder
+    shutil.copytree(package, folder / "source")  # Builds leave files in the source folder.
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet")
     words = ("install", *options, "--target", folder / "site", folder / "source")
     done = python("-m", "pip", *words)

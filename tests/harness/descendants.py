@@ -41,13 +41,14 @@ def end_with_this_process() -> None:
             [sys.executable, "-S", __file__, word],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            start_new_session=True,  # ignore Ctrl-C
+            start_new_session=True,  # The new session ignores Ctrl-C.
         )
     )
     os.environ["TESTS_OF_PROCESS"] = str(os.getpid())
 
 
-_watching: list[subprocess.Popen[bytes]] = []  # their standard input closes when this process ends
+# Processes whose standard input closes when this process ends.
+_watching: list[subprocess.Popen[bytes]] = []
 
 
 def running(process: int | None = None) -> set[int]:
@@ -55,7 +56,7 @@ def running(process: int | None = None) -> set[int]:
     tasks = Path(f"/proc/{process or os.getpid()}/task").glob("*/children")
     found: set[int] = set()
     for task in tasks:
-        with contextlib.suppress(OSError):  # the task has ended
+        with contextlib.suppress(OSError):  # The task has ended.
             found |= set(map(int, task.read_text().split()))
     return found
 
@@ -68,14 +69,14 @@ def end(processes: set[int]) -> None:
             os.kill(process, signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             os.waitpid(process, 0)
-        end(below)  # this process has adopted them
+        end(below)  # This process has adopted these descendants.
 
 
 def _sweep(word: bytes) -> bool:
     """Kill every process with ``word`` in its environment; return True if any was found."""
     found = False
     for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # the process has exited or belongs to another user
+        with contextlib.suppress(OSError):  # The process has exited or belongs to another user.
             if word in (folder / "environ").read_bytes().split(b"\0"):
                 os.kill(int(folder.name), signal.SIGKILL)
                 found = True

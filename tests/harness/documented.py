@@ -26,7 +26,7 @@ from tests.harness.daemon_process import SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # marks processes started by a command, which run separately
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
-# Commands with one of these options end by themselves, so they are run.
+# Commands with one of these options end by themselves, so the tests run them.
 _ENDS = {"--record", "--recompute"}
 _SHOWN = re.compile(r"# (?P<mode>\w+)(?: (?P<force>[\d.]+) N)?(?:.*?(?P<angle>-?[\d.]+)°)?")
 _CLIENT = """\
@@ -79,7 +79,7 @@ class Softfinger:
         with contextlib.redirect_stdout(told), contextlib.redirect_stderr(error):
             try:
                 status = self._carry_out(words)
-            except SystemExit as ended:  # raised by argparse
+            except SystemExit as ended:  # argparse raises this exception.
                 status = int(ended.code or 0)
             except SettingsError as wrong:
                 status = 2
@@ -97,7 +97,7 @@ class Softfinger:
             return _await(words[1])
         if name == "emulate" and "--send" not in words:
             return self._emulate(words)
-        if name == "run":  # `run` for a recording uses the default addresses
+        if name == "run":  # For a recording, `run` uses the default addresses.
             for each in ("stream", "commands"):
                 words += ["--set", f"{each}.address=ipc://{Path.cwd()}/{each}"]
             return subprocess.run([*SOFTFINGER, *words, "--duration", "1"], check=False).returncode

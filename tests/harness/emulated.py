@@ -24,7 +24,7 @@ from tests.harness.daemon_process import SOFTFINGER
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 _COMPILED = re.compile(r"^(compil(ing|ed) .*|.*: \d+ of about \d+, .*)\n", re.MULTILINE)
-READY_WITHIN = 200.0  # s, includes kernel compilation
+READY_WITHIN = 200.0  # time limit for the start [s], which includes kernel compilation
 
 
 @contextlib.contextmanager

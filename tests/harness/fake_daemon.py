@@ -95,7 +95,7 @@ class FakeDaemon:
         self.silent = threading.Event()
         self.deaf = threading.Event()
         self.dead: set[str] = set()
-        self.published = 0  # number of states so far
+        self.published = 0  # number of states published so far
         self._extra: list[list[bytes]] = []
         self._context: zmq.Context[Any] = zmq.Context()
         self._publisher = self._context.socket(zmq.PUB)

@@ -66,7 +66,7 @@ class Served:
         for _ in range(times):
             self.service.step(0.0)
             self.link.look()
-        # Long messages take several steps.
+        # A long message takes several steps.
         while select.select([self.service.channel], [], [], 0)[0]:
             self.service.step(0.0)
 

@@ -25,9 +25,9 @@ from tests.harness.reference_hand import ReferenceHand
 
 FloatArray = NDArray[np.float64]
 
-# Equilibrium tolerance relative to the contact forces; rounding errors are about 1e-14.
+# Equilibrium tolerance relative to the contact forces. Rounding errors are about 1e-14.
 _TOLERANCE = 1e-11
-_STEP = 1e-6  # step for force differences: rad for rotations, tip radii for displacements
+_STEP = 1e-6  # Step for force differences, in rad for rotations and in tip radii for displacements.
 
 
 class GraspError(SoftfingerError, ValueError):
@@ -69,11 +69,11 @@ class GraspState:
 class GraspForces:
     """Grasp forces, each of shape (2,), left finger first."""
 
-    force: FloatArray  # F on the tip's base, the sum over a pressure grid [N]
+    force: FloatArray  # force F on the tip's base, which is the sum over a pressure grid [N]
     normal: FloatArray  # N [N]
     tangential: FloatArray  # T [N]
-    turning: FloatArray  # ∂U/∂θ, moment that turns the object relative to the tip [N·m]
-    torque: FloatArray  # joint torques at equilibrium, positive closing [N·m]
+    turning: FloatArray  # ∂U/∂θ, the moment that turns the object relative to the tip [N·m]
+    torque: FloatArray  # joint torques at equilibrium, positive when closing [N·m]
 
 
 class Grasp:
@@ -129,7 +129,7 @@ class Grasp:
         x = state.coordinates
         if q is not None:
             x[:2] = q
-        # Scale displacements and moments by the tip radius, to balance rows and columns.
+        # Scale displacements and moments by the tip radius to balance rows and columns.
         unit = np.array([self.hand.tip_radius, self.hand.tip_radius, 1.0])
 
         def residual(pose: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from tests.conftest import until
 
-WAIT = 60.0  # s, time-out for one reply
+WAIT = 60.0  # time-out for one reply [s]
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _FLAGS = (
     "--headless=new",
@@ -29,7 +29,7 @@ _FLAGS = (
     "--disable-extensions",
     "--disable-dev-shm-usage",
     "--hide-scrollbars",
-    "--disable-gpu",  # test machines have no graphics card
+    "--disable-gpu",  # Test machines have no graphics card.
     "--remote-debugging-port=0",
 )
 
@@ -48,7 +48,7 @@ class Browser:
         self.process = subprocess.Popen(
             [path, *words, "about:blank"], start_new_session=True, **quiet
         )
-        told = folder / "DevToolsActivePort"  # the browser writes this file once it is listening
+        told = folder / "DevToolsActivePort"  # The browser writes this file once it is listening.
         until(lambda: told.exists() and "/" in told.read_text())
         pages: list[dict[str, Any]] = []
 
@@ -57,7 +57,7 @@ class Browser:
                 pages[:] = [each for each in json.load(answer) if each["type"] == "page"]
             return bool(pages)
 
-        until(listed)  # the browser opens its first page after it starts listening
+        until(listed)  # The browser opens its first page after it starts listening.
         waits: Any = {"open_timeout": WAIT, "ping_interval": None}
         url = pages[0]["webSocketDebuggerUrl"]
         self._socket = connect(url, proxy=None, max_size=None, **waits).__enter__()

@@ -16,7 +16,7 @@ from typing import Any
 
 import pyte
 
-_CAPACITY = 1 << 16  # bytes, capacity of a terminal buffer
+_CAPACITY = 1 << 16  # capacity of a terminal buffer [bytes]
 ENVIRONMENT = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "LANG": "C.UTF-8"}
 
 
@@ -99,7 +99,7 @@ class TerminalProcess:
         self.pump()
         pairs = ((b"\x1b[?1049h", b"\x1b[?1049l"), (b"\x1b[?25l", b"\x1b[?25h"))
         pairs += ((b"\x1b[?2004h", b"\x1b[?2004l"),)
-        # Both sequences of each pair must have been sent, and the restoring one last.
+        # Both sequences of each pair must have been sent, with the restoring sequence last.
         given = all(0 <= self.written.rfind(a) < self.written.rfind(b) for a, b in pairs)
         return given and termios.tcgetattr(self.slave) == self.attributes
 

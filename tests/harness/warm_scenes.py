@@ -91,12 +91,12 @@ def run(settings: Settings) -> dict[str, Any]:
     with event.install_listener("numba:compiler_lock", watch), hand:
         for wait, request in SCRIPT:
             hand.loop.advance(wait)
-            for _ in range(300):  # a busy machine may need long in real time
+            for _ in range(300):  # A busy machine may need a long time for these ticks.
                 if hand.loop.state.mode not in ("grasping", "rotating"):
                     break
                 hand.loop.advance(0.1)
             fault = hand.loop.state.fault_name
-            with contextlib.suppress(Refused):  # not every scene supports every command
+            with contextlib.suppress(Refused):  # Some scenes do not support every command.
                 hand.loop.command(request)
             hand.loop.advance(hand.loop.period)
             modes.append(hand.loop.state.mode)
@@ -133,7 +133,7 @@ def main(folder: Path, names: list[str]) -> None:
             print(json.dumps({"scene": name, **run(scenes[name])}), flush=True)
             os._exit(0)
         if os.waitpid(child, 0)[1]:
-            sys.exit(f"{name}: failed")  # the child has already printed the reason
+            sys.exit(f"{name}: failed")  # The child has already printed the reason.
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ class Shared(NamedTuple):
 
     running: Running
     profile: Path
-    addresses: tuple[str, str]  # stream and commands
+    addresses: tuple[str, str]  # stream address and command address
 
     @property
     def commands(self) -> str:
@@ -70,5 +70,5 @@ def daemon(shared: Shared) -> Iterator[Shared]:
     """Return the module's daemon, disarmed and without faults before and after the test."""
     yield shared
     assert ask(shared.commands, "stop")["ok"]
-    ask(shared.commands, "clear")  # the daemon refuses `clear` if there is no fault
+    ask(shared.commands, "clear")  # The daemon refuses `clear` if there is no fault.
     assert ask(shared.commands, "status")["mode"] == "disarmed"

@@ -82,7 +82,7 @@ def test_all_file_types_give_the_same_contacts(counts, tmp_path):
     save_stream(tmp_path / "run.mcap", counts, Settings())
     np.save(tmp_path / "press.npy", counts)
     for name in ("press.npz", "press.npy", "frames", "export.asf", "run.mcap"):
-        # The export contains its pitch, so a wrong pitch in the settings must not affect it.
+        # The export contains its own pitch, so a wrong pitch in the settings must have no effect.
         wrong = {"rows": 10, "cols": 10, "pitch": 0.002} if name == "export.asf" else {}
         tactile = Settings().tactile.model_copy(update=wrong)
         settings = Settings().model_copy(update={"tactile": tactile})

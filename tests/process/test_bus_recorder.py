@@ -74,7 +74,7 @@ def test_torque_on_far_from_the_goal_is_recorded():
     hand.write(reg.GOAL_CURRENT, 20, 2)
     assert hand.report(1)["goal_q"] is None, "without torque, the position is not a goal"
     hand.write(reg.TORQUE_ENABLE, 1, 1)
-    hand.write(reg.TORQUE_ENABLE, 1, 1)  # already on
+    hand.write(reg.TORQUE_ENABLE, 1, 1)  # Torque is already on.
     on = hand.report(1)["torque_on"]
     assert hand.report(1)["torque"]
     assert (on["count"], on["far"], on["t"]) == (1, 0, hand.t)

@@ -12,10 +12,10 @@ from tests.conftest import own_addresses
 from tests.harness.daemon_process import Running
 from tests.harness.emulated import HIL, EmulatorProcess
 
-# True values of the hand; the profile has 0.05 and 0.015.
+# True values of the hand. The profile contains 0.05 and 0.015.
 FRICTION, AT_REST, LATENCY = 0.09, 0.13, 0.035
-BYTES = 5.13e-3  # s, duration of a frame on the wire
-COUNT = 1.78 * 2.69e-3  # N·m per current count
+BYTES = 5.13e-3  # duration of a frame on the wire [s]
+COUNT = 1.78 * 2.69e-3  # torque per current count [N·m]
 PLANT = {
     "simulation.joint_friction": FRICTION,
     "simulation.joint_stribeck": AT_REST - FRICTION,

@@ -59,7 +59,7 @@ def test_duration_and_settings_on_the_command_line(profile, inline):
 def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
     second = softfinger("run", "--config", str(daemon.profile))
     assert second.returncode == 1
-    # Both addresses are in use; the order of start-up determines which one is found first.
+    # Both addresses are in use. The order of start-up determines which one is found first.
     taken = (f"stream.address: {daemon.addresses[0]}", f"commands.address: {daemon.commands}")
     assert any(f"{each} is in use; is another softfinger" in second.stderr for each in taken)
 
@@ -90,7 +90,7 @@ def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
 )
 def test_a_signal_during_start_up_exits_without_a_traceback(profile, number):
     process = started("run", "--config", profile(""))
-    # This line is printed once the signal handlers are installed, before compilation.
+    # The daemon prints this line once the signal handlers are installed, before compilation.
     first = process.stderr.readline()
     process.send_signal(number)
     said = first + process.communicate(timeout=300)[1]
@@ -119,7 +119,7 @@ def test_fatal_signals_turn_torque_off_first(profile, addresses, number):
 @pytest.mark.extended
 def test_a_log_reader_that_stops_reading_does_not_block_the_daemon(profile, addresses):
     process = started("run", "--config", profile(""))
-    process.stderr.close()  # from now on, every write to stderr fails
+    process.stderr.close()  # From now on, every write to stderr fails.
     assert ask(addresses[1], "arm")["ok"]
     assert ask(addresses[1], "status")["mode"] == "armed"
     process.terminate()
@@ -131,16 +131,16 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     socket = context.socket(zmq.DEALER)
     socket.connect(daemon.commands)
     socket.send_multipart([b"", msgpack.packb({"command": "status"})])
-    assert socket.poll(60_000)  # the client is connected
+    assert socket.poll(60_000)  # The client is connected.
     socket.recv_multipart()
     daemon.running.process.send_signal(signal.SIGSTOP)
     for request in requests:
         socket.send_multipart([b"", msgpack.packb(request)])
-    # This message exceeds the size limit, so the gateway refuses it itself.
+    # This message exceeds the size limit, so the gateway itself refuses it.
     socket.send_multipart([b"", b"x" * 5000])
-    assert socket.poll(60_000)  # the gateway has also read all earlier requests
+    assert socket.poll(60_000)  # The gateway has also read all earlier requests.
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"
-    select.select([], [], [], 0.5)  # the stall
+    select.select([], [], [], 0.5)  # This is the stall.
     daemon.running.process.send_signal(signal.SIGCONT)
     replies = []
     for _ in requests:
@@ -154,7 +154,8 @@ def test_a_command_received_during_a_stall_is_refused(daemon, context):
     assert (arm["ok"], arm["reason"]) == (False, "late")
     assert ask(daemon.commands, "status")["torque"] is False
     (disarm,) = stalled(daemon, context, {"command": "disarm"})
-    assert disarm["ok"] or disarm["reason"] == "late"  # may arrive late on a busy machine
+    # The command may arrive late on a busy machine.
+    assert disarm["ok"] or disarm["reason"] == "late"
 
 
 def test_a_stop_received_during_a_stall_also_cancels_waiting_commands(daemon, context):
@@ -173,7 +174,7 @@ def test_a_client_waiting_for_its_reply_is_served_after_a_stall(daemon):
         hand.status()
         daemon.running.process.send_signal(signal.SIGSTOP)
         arming = pool.submit(hand.arm)
-        select.select([], [], [], 0.5)  # the stall
+        select.select([], [], [], 0.5)  # This is the stall.
         daemon.running.process.send_signal(signal.SIGCONT)
         arming.result(60.0)
         assert hand.status()["torque"] is True

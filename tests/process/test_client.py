@@ -41,7 +41,7 @@ from tests.harness import fake_daemon
 from tests.harness.daemon_process import python
 from tests.harness.fake_daemon import FakeDaemon
 
-IN_VAIN = 6.0  # s, enough for a state to arrive even on a busy machine
+IN_VAIN = 6.0  # time in which a state arrives even on a busy machine [s]
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_grasp_turn_and_release_with_asyncio(daemon):
                 seen = (await frames.next(60.0)).counts.size
             states = await hand.collect(0.1)
             assert [each.seq for each in states] == sorted({each.seq for each in states})
-            await hand.arm()  # already armed
+            await hand.arm()  # The hand is already armed.
             assert (await hand.state()).mode == "holding"
             with pytest.raises(NotInTime, match="mode holding"):
                 await hand.wait_for(lambda state: state.mode == "releasing", IN_VAIN)
@@ -236,9 +236,9 @@ def test_a_cancelled_command_is_not_repeated(fake):
                 await arming
 
     fake.replies["arm"] = LATE
-    asyncio.run(cancelled())  # cancellation waits for the attempt in progress
+    asyncio.run(cancelled())  # Cancellation waits for the attempt in progress.
     count, published = len(fake.requests), fake.published
-    until(lambda: fake.published > published + 50)  # half a second
+    until(lambda: fake.published > published + 50)  # This takes half a second.
     assert len(fake.requests) == count
 
 
@@ -252,17 +252,17 @@ def test_state_returns_a_current_state(fake, hand):
 
 def test_gaps_are_counted_with_the_step_of_the_topic():
     gaps = Gaps()
-    for seq in (5, 10, 16, 30, 36):  # the publisher sends one of five states, at any phase
+    for seq in (5, 10, 16, 30, 36):  # The publisher sends one of five states, at any phase.
         gaps.take({"seq": seq, "seq_step": 5})
     assert gaps.lost == 2
-    gaps.take({"seq": 5, "seq_step": 5})  # the daemon has restarted; this is not a loss
+    gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, which is not a loss.
     gaps.take({"seq": 10, "seq_step": 5})
     assert gaps.lost == 2
-    for finger in ("left", "right"):  # counted separately per finger
+    for finger in ("left", "right"):  # Losses are counted separately per finger.
         for seq in (1, 2, 4):
             gaps.take({"seq": seq, "finger": finger})
     assert gaps.lost == 4
-    for seq, number in ((10, 1), (15, 2), (16, 4)):  # frames have their own numbers
+    for seq, number in ((10, 1), (15, 2), (16, 4)):  # Frames have their own numbers.
         gaps.take({"seq": seq, "seq_step": 1, "number": number, "finger": "middle"})
     assert gaps.lost == 5
     again = Gaps()
@@ -270,9 +270,9 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     assert [again.take({"seq": seq, "again": True}) for seq in (3, 4, 5)] == [True, True, False]
     assert again.take({"seq": 8, "again": False})
     assert again.lost == 2
-    assert again.take({"seq": 7, "again": True})  # the repeated message fills a gap
+    assert again.take({"seq": 7, "again": True})  # The repeated message fills a gap.
     assert again.lost == 1
-    assert again.take({"seq": 1, "again": False})  # another daemon
+    assert again.take({"seq": 1, "again": False})  # This message comes from another daemon.
     assert again.take({"seq": 5, "again": False})
     assert not again.take({"seq": 5, "again": True})
 
@@ -454,10 +454,10 @@ def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeyp
     with pytest.raises(SettingsError, match=r"unknown host 'lab7' \(no address for lab7\)"):
         Hand("tcp://lab7")
     with Hand("ipc:///run/a,ipc:///run/b"):
-        pass  # has no host
+        pass  # This address has no host.
     monkeypatch.undo()
     with Hand("tcp://127.0.0.1:0;127.0.0.1:9872", "tcp://[::1]:9873"):
-        pass  # one address with a source, and one numeric address
+        pass  # One address has a source, and the other one is numeric.
 
 
 @pytest.mark.parametrize("words", [["monitor"], ["send", "stop"], ["status"], ["record", "a.mcap"]])
@@ -477,7 +477,7 @@ def in_a_thread(use: Callable[[], object]) -> BaseException | None:
 
 def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     states = hand.stream(60.0)
-    assert in_a_thread(hand.grasp) is None  # commands use a separate socket
+    assert in_a_thread(hand.grasp) is None  # Commands use a separate socket.
     next(states)
     for use in (
         lambda: next(states),
@@ -538,7 +538,7 @@ def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):
     left, right = fake_daemon.finger(0.0, 0), fake_daemon.finger(0.0, 1)
     fake.changes = {"left": left, "right": right}
     before = fake.published
-    until(lambda: fake.published > before + 1)  # all further states include the changes
+    until(lambda: fake.published > before + 1)  # All further states include the changes.
     told = inline("status", "--address", fake.state_address)
     assert told.returncode == 0
     line = re.fullmatch(r"(\w+) (\S+) N \(\S+ ± \S+, \S+ ± \S+\), (\S+)°, (\S+) mm\n", told.stdout)

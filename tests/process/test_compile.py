@@ -54,7 +54,7 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     done = python("-m", "softfinger.tools.processes.compile", **own)
     *kernels, last = done.stdout.splitlines()
     assert last == "done"
-    # The count is for the newest Numba; the oldest supported version reports a third fewer.
+    # The count is for the newest Numba. The oldest supported version reports a third fewer kernels.
     assert 0.6 * table.kernels <= len(kernels) <= 1.2 * table.kernels
     # Mark the other set of kernels as compiled.
     (mark,) = (tmp_path / "softfinger").glob("kernels-*/contact-table-springs.built")
@@ -68,7 +68,7 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     assert first == "compiling kernels, on the first start only: contact table"
     assert part.startswith("contact table: ")
     assert last.startswith("compiled in ")
-    # A failed compilation is reported in the output and by the exit status.
+    # The output and the exit status report a failed compilation.
     mark.unlink()
     bad = compiled(tmp_path, "--config", str(steep(tmp_path)))
     assert bad.returncode == 1

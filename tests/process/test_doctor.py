@@ -132,7 +132,7 @@ def test_boards_are_checked(hands, capsys):
     status, lines = hand.doctor(capsys)
     assert status == 0, lines
     for side in ("left", "right"):
-        # On a busy machine the boards may be reported as slow, which is not a failure.
+        # On a busy machine, the boards may be reported as slow, which is not a failure.
         assert [line for line in lines if f" tactile {side}: 32 × 32 cells, " in line]
     hand.emulator.request("left:drift=0.1")
     status, lines = hand.doctor(capsys)
@@ -144,7 +144,7 @@ def test_boards_are_checked(hands, capsys):
     assert status == 1
     assert "256 cells" in next(line for line in lines if line.startswith("FAIL   tactile left"))
     assert "       → set tactile.rows and tactile.cols" in lines
-    assert scanned(capsys, hand.folder, "--wait", "1") == [  # the servos reply at any rate
+    assert scanned(capsys, hand.folder, "--wait", "1") == [  # The servos reply at any rate.
         f"ID {servo} at 2000000, 1000000 baud: XM430-W350, firmware 48" for servo in (1, 2)
     ]
     assert main(["doctor"]) == 0
@@ -294,7 +294,7 @@ def test_the_process_using_a_port_is_named(terminal, locked):
 
 
 def test_latency_timer_is_checked_and_repaired(tmp_path, monkeypatch):
-    path, sysfs = "/dev/ttyUSB7", tmp_path / "sys"  # a fake adapter
+    path, sysfs = "/dev/ttyUSB7", tmp_path / "sys"  # This is a fake adapter.
     timer = sysfs / "ttyUSB7" / "device" / "latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text("16\n")

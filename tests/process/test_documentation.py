@@ -46,9 +46,10 @@ FENCE = re.compile(
     r'(?ms)^(?P<indent> *)```(?P<language>\w*)(?: title="(?P<title>[^"\n]+)")?[^\n]*\n'
     r"(?P<text>.*?)^(?P=indent)```$"
 )
-STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")  # with the expected status
-PRINTS = 20  # lines printed by a program that never ends
-PATIENCE = 300.0  # s for one block
+# `softfinger status` with its expected exit status.
+STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")
+PRINTS = 20  # number of lines after which a program that never ends is stopped
+PATIENCE = 300.0  # time limit for one code block [s]
 
 
 class Block(NamedTuple):

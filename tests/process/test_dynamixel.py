@@ -51,7 +51,7 @@ def test_readings_match_the_servos(running, firmware, connect):
     assert reading.seq == 1
     assert reading.t >= now
     assert reading.alert == 0
-    # Direction is +1 for the left and −1 for the right joint.
+    # The direction is +1 for the left joint and −1 for the right joint.
     assert reading.q == pytest.approx([100 * RADIAN, 50 * RADIAN])
     assert [bool(n) for n in map(str, backend.notices)] == [True] * (2 if firmware == 44 else 0)
 
@@ -77,7 +77,7 @@ def test_torque_on_starts_at_the_current_position(bus, connect):
         assert goal == expected
         assert struct.unpack_from("<h", memory, reg.GOAL_CURRENT)[0] == 0
         assert memory[reg.TORQUE_ENABLE] == 1
-        assert memory[reg.BUS_WATCHDOG] == 100  # units of 0.02 s
+        assert memory[reg.BUS_WATCHDOG] == 100  # The register has units of 0.02 s.
     assert read(backend).q == pytest.approx([0.4, -0.3], abs=RADIAN)
     assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
@@ -135,7 +135,7 @@ def test_joints_follow_their_goals(running, model, level):
     until(there)
     assert reading.valid
     counters = backend.counters()
-    counters.pop("timeouts")  # this may happen on a busy machine
+    counters.pop("timeouts")  # Timeouts may occur on a busy machine.
     assert counters == dict.fromkeys(counters, 0)
     backend.close()
 
@@ -190,18 +190,18 @@ def test_corrupted_replies_never_give_wrong_readings(running, kind, firmware, co
 @FIRMWARES
 def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connect):
     bus = running(placed(firmware, 0, 0))
-    backend = connect(bus, reply_timeout=0.004, zero=(0, 0))  # a late reply arrives after 0.01 s
+    backend = connect(bus, reply_timeout=0.004, zero=(0, 0))  # A late reply arrives after 0.01 s.
     reading = Reading()
 
     def at_another_place(count: int) -> None:
         """Read the joints at ``count``, which differs from the positions in earlier replies."""
         bus.call(lambda: bus.bus.plant.q.__setitem__(slice(2), count * RADIAN))
         backend.read(reading)
-        if reading.valid:  # the reply was late, and not only because this thread was suspended
+        if reading.valid:  # The reply was late, and not only because this thread was suspended.
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")
-    # On a busy machine, few late replies are received, so this may take many readings.
+    # On a busy machine, few late replies are received, so this loop may take many readings.
     while backend.counters()["late"] <= 20 and reading.seq < 1000:
         at_another_place(reading.seq)
     bus.fault("late=0")
@@ -216,7 +216,7 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
     until(lambda: bus.memory(0)[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR)
 
     def look() -> None:
-        for _ in range(2):  # the first read checks the supply voltage
+        for _ in range(2):  # The first read checks the supply voltage.
             backend.read(Reading())
 
     with pytest.raises(ServoError, match="its bus watchdog stopped the servo"):
@@ -254,7 +254,7 @@ def test_torque_off_needs_confirmation_from_every_servo(bus, connect):
     assert not backend.torque_off(Reading())
     until(lambda: not bus.servo(0).torque_on)
     bus.fault("answer=2")
-    until(lambda: backend.torque_off(Reading()))  # on a busy machine the servo may reply too late
+    until(lambda: backend.torque_off(Reading()))  # On a busy machine, the servo may reply too late.
     assert not bus.servo(1).torque_on
 
 

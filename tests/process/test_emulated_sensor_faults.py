@@ -16,7 +16,7 @@ from tests.soak.rig import Rig
 
 pytestmark = pytest.mark.extended
 FORCE = 6.0  # N
-# Times of the emulated hand in s: total duration, and final interval used for means.
+# Total duration, and final interval used for means, in the emulated hand's time [s].
 LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"
@@ -34,7 +34,7 @@ def running(hand: Sequence[str] = (), daemon: Sequence[str] = ()) -> Iterator[Ri
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")
         made.config.write_text(text, encoding="utf-8")
         made.hand_words = tuple(word for each in hand for word in ("--set", each))
-        told = ("servos.fault_after=1.0", *daemon)  # s of the hand's time
+        told = ("servos.fault_after=1.0", *daemon)  # The time is that of the hand.
         made.start(*(word for each in told for word in ("--set", each)))
         yield made
 
@@ -83,7 +83,7 @@ def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
         driven = any(servo["torque"] for servo in report["servos"])
         if report["t"] > begin + seconds or not driven:
             return
-        select.select([], [], [], 0.005)  # leave the processor to the hand and the daemon
+        select.select([], [], [], 0.005)  # Leave the processor to the hand and the daemon.
 
 
 @pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])
@@ -94,7 +94,7 @@ def test_a_sensor_fault_has_a_bounded_effect_and_is_the_only_one_reported(rig, l
     rig.send(lie)
     reports = list(watched(rig))
     assert max(max(report["force"]) for report in reports) < 1.3 * FORCE
-    if lie != GAIN:  # a gain error may be partly accepted and need not be reported
+    if lie != GAIN:  # A gain error may be partly accepted, so it need not be reported.
         until(lambda: any(false in line for line in rig.log()[before:]))
     assert not [line for line in rig.log()[before:] if "consistency." in line and false not in line]
     if lie == REFUSED:

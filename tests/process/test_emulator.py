@@ -68,7 +68,7 @@ def test_boards_send_the_default_grid(hand, finger):
     last = sensor.latest()
     sensor.close()
     assert last.data.shape == (32, 32)
-    # Without contact, only noise of about 3 counts remains, clipped at 0.
+    # Without contact, only a noise of about 3 counts remains, clipped at 0.
     assert 0 < last.data.mean() < 3
     counters = sensor.counters()
     assert counters["resyncs"] == counters["skipped_bytes"] == 0
@@ -87,7 +87,7 @@ def test_a_folder_in_use_is_refused_and_the_first_emulator_continues(hand, servo
 )
 def test_a_signal_during_start_up_ends_the_emulator_cleanly(tmp_path, number):
     with EmulatorProcess("--dir", tmp_path / "new", "--config", HIL) as process:
-        # The folder is locked first, long before the servos respond.
+        # The emulator locks the folder first, long before the servos respond.
         until((tmp_path / "new" / ".emulator.lock").exists)
         assert process.end(number) == (0, "", "")
     assert list((tmp_path / "new").iterdir()) == []
@@ -113,7 +113,7 @@ def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues
         process.popen.send_signal(signal.SIGSTOP)
         assert servos.silent(7)
         process.popen.send_signal(signal.SIGCONT)
-        assert servos.ping(7) == 1200  # one of the two pings got this reply
+        assert servos.ping(7) == 1200  # One of the two pings received this reply.
         servos.close()
         assert process.end(signal.SIGHUP) == (0, "", "")
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
@@ -200,7 +200,7 @@ def test_emulated_time_is_synchronised_with_a_late_daemon(monkeypatch, tmp_path,
     apart = []
     for k in range(200):
         daemon.sleep_until(100.0 + 0.002 * k)
-        for _ in range(10):  # the emulator reads its clock while the daemon is late
+        for _ in range(10):  # The emulator reads its clock while the daemon is late.
             machine.work(0.1 * late * (k % 3))
             apart.append(clock.now() - daemon.now())
     assert max(apart[20:]) - min(apart[20:]) <= 0.0045
@@ -265,7 +265,7 @@ full_count = {full}
         assert estimate.contact
         assert 3e-4 < estimate.d < 8e-3
         assert abs(estimate.tilt_x) < 0.05
-        assert sensor.counters()["resyncs"] <= 1  # the first packet may be incomplete
+        assert sensor.counters()["resyncs"] <= 1  # The first packet may be incomplete.
         sensor.close()
 
 
@@ -307,7 +307,7 @@ def test_sending_without_an_emulator_fails(tmp_path, capsys):
 def test_the_control_socket_survives_misbehaving_clients_and_is_removed_at_the_end(
     tmp_path, monkeypatch
 ):
-    folder = tmp_path / ("long" * 30)  # longer than the limit for a socket path
+    folder = tmp_path / ("long" * 30)  # The path is longer than the limit for a socket path.
     folder.mkdir()
     with emulated(folder):
         place = folder / "control"
@@ -329,7 +329,7 @@ def test_injected_faults_change_measurements_but_not_the_hand(tmp_path):
     log: list[str] = []
     faults = "right:drift=0.2@0.5..1", "left:current=3@0.5"
     with emulated(tmp_path, *faults, tell=log.append) as made:
-        until(lambda: board_mean(tmp_path, 1) > 48)  # of 255
+        until(lambda: board_mean(tmp_path, 1) > 48)  # The maximum is 255.
         assert board_mean(tmp_path, 0) < 10
         left, right = made.hand.measurement_faults
         assert (left("current", 9.0), right("current", 9.0)) == (3.0, 1.0)
@@ -355,11 +355,12 @@ def board_mean(folder: Path, finger: int) -> float:
 
 def test_an_object_is_put_back_and_moved_by_a_load(tmp_path):
     with emulated(tmp_path) as made:
-        made.hand.object_pose[:] = 0.07, 0.02, 1.2  # the object slipped out
+        made.hand.object_pose[:] = 0.07, 0.02, 1.2  # The object has slipped out of the grip.
         assert made.request("place report").startswith("{")
         until(lambda: np.allclose(made.hand.object_pose, (0.0, 0.08, 0.0), atol=1e-3))
         made.request("push=5")
-        until(lambda: made.hand.object_pose[1] > 0.082)  # moved along its faces, away from the palm
+        # The object has moved along its faces, away from the palm.
+        until(lambda: made.hand.object_pose[1] > 0.082)
         assert made.report(made.clock.now())["force"] == [0.0, 0.0]
         made.request("place twist=0.02")
         until(lambda: made.hand.object_pose[2] > 0.05)

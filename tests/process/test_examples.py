@@ -23,12 +23,13 @@ def test_grasp_and_turn_example(start, profile, addresses, tmp_path):
     assert re.sub(r"no .* from .* yet, waiting up to .* s\n", "", done.stderr) == ""
     ((states, lost),) = re.findall(r"(\d+) states, (\d+) lost", done.stdout)
     assert int(states) > 50
-    assert int(lost) < int(states)  # a gateway without processor time drops messages
+    assert int(lost) < int(states)  # A gateway without processor time drops messages.
     force = float(re.findall(r"while holding: ([\d.]+) N", done.stdout)[0])
     assert force == pytest.approx(8.0, rel=0.1)
     pixels = imread(picture)[..., :3]
     assert pixels.shape[:2] == (504, 1080)
-    for colour in ((0, 114, 178), (213, 94, 0), (0, 158, 115)):  # left, right, object
+    # Colours of the left finger, the right finger and the object.
+    for colour in ((0, 114, 178), (213, 94, 0), (0, 158, 115)):
         near = abs(pixels * 255.0 - colour).max(axis=2) < 25.0
         assert near.sum() > 300, colour
     assert daemon.end() == 0

@@ -51,7 +51,7 @@ def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running)
     assert found.text.startswith("50 read and write cycles: p50 ")
     until(lambda: len(re.findall(rb"\xff\xff\xfd\x00\xfe..\x83", heard, re.DOTALL)) == 50)
     reads = re.findall(rb"\xff\xff\xfd\x00\xfe..\x8a", heard, re.DOTALL)
-    assert len(reads) == 54  # the doctor first tests each of the four spans
+    assert len(reads) == 54  # The doctor first tests each of the four spans.
     assert [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)] == before
 
 
@@ -73,10 +73,10 @@ def test_assessment_of_exchange_times():
 
     assert judged(0.0004, 0.0009).status == "pass"
     assert judged(0.0004, 0.0009).text == "50: p50 0.4 ms, p99 0.9 ms, 0% failed"
-    near = judged(0.0017, 0.0018)  # `run` issues the same warning
+    near = judged(0.0017, 0.0018)  # `run` issues the same warning.
     assert (near.status, near.fix.split(",")[0]) == ("warn", "set loop.rate = 440")
     assert near.text.endswith("too much of a tick of 2 ms (loop.rate = 500): ticks will be late")
-    both = judged(0.0028, 0.003)  # shorter than reply_timeout and longer than a tick
+    both = judged(0.0028, 0.003)  # This time is shorter than reply_timeout and longer than a tick.
     assert (both.status, both.fix.split(",")[0]) == ("FAIL", "set loop.rate = 260")
     assert "expected at most one tick of 2 ms (loop.rate = 500) and at most 4 ms" in both.text
     slow = judged(0.016, 0.016)
@@ -96,7 +96,7 @@ def test_assessment_of_exchange_times():
 
 def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bus):
     for i in (0, 1):
-        bus.servo(i).fast_reads = False  # contradicts the firmware version
+        bus.servo(i).fast_reads = False  # This setting contradicts the firmware version.
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
     assert notice.fix == "the slower sync read is used"
@@ -151,7 +151,7 @@ def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
     until(connects)
     assert len(opened) == 1
     backend.close()
-    connected(bus).close()  # the port has been released
+    connected(bus).close()  # The port has been released.
 
 
 def test_doctor_waits_as_long_as_run(running):

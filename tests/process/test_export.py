@@ -78,7 +78,8 @@ def test_times_of_all_files_count_from_one_zero(tmp_path, first):
     messages.insert(first != schema.TACTILE, (schema.TACTILE, frame(0.0, 1) | scan))
     for topic, message in messages:
         writer.add(topic, message)
-    late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}  # Unix time was set in between
+    # The Unix time was set between the two messages.
+    late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}
     writer.add(schema.STATE, sample(schema.STATE) | late)
     writer.close()
     recording = Recording(tmp_path / "a.mcap")
@@ -99,7 +100,7 @@ def test_nan_values_are_empty_cells(tmp_path):
     writer = RecordingWriter(tmp_path / "a.mcap")
     message = sample(schema.STATE)
     message["left"]["force"] = math.nan
-    message["news"] = 3.5  # field of a newer daemon
+    message["news"] = 3.5  # Only a newer daemon sends this field.
     writer.add(schema.STATE, message)
     writer.close()
     export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [schema.STATE])

@@ -16,7 +16,7 @@ from tests.conftest import until
 from tests.harness.tactile import why_not_open
 from tests.unit.test_flexitac_decoder import CELLS, COLS, ROWS, frame, numbered
 
-LATE = 1026 * 10 / 2e6 + 0.02  # s, time to transmit 32 × 32 cells, plus latency
+LATE = 1026 * 10 / 2e6 + 0.02  # time to transmit 32 × 32 cells, plus the latency [s]
 
 
 class Board(FrameWriter):
@@ -78,14 +78,15 @@ def test_frames_are_received_through_a_port_with_their_times(own_threads, board)
     first = tactile.latest()
     until(lambda: tactile.latest().seq >= first.seq + 20)
     now = tactile.latest()
-    # Wait for a frame that was read alone; a frame read together with later ones arrived earlier.
+    # Wait for a frame that was read alone. A frame that was read together with later frames arrived
+    # earlier.
     until(lambda: (n := tactile.latest()).t_arrival - n.t_sample == pytest.approx(LATE))
     assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1
     counters = tactile.counters()
     assert counters["resyncs"] == counters["port_lost"] == 0
     tactile.close()
-    assert len(own_threads()) == 1  # the board's thread
+    assert len(own_threads()) == 1  # The only thread is that of the board.
 
 
 def test_a_frame_is_delivered_before_the_next_one_arrives(board):
@@ -94,7 +95,7 @@ def test_a_frame_is_delivered_before_the_next_one_arrives(board):
     opener.start()
     until(lambda: board.send(frame(bytes(CELLS)) * 2) and tactile.counters()["bytes"] > 0)
     opener.join()
-    until(lambda: board.send(frame(b"\x07" * CELLS)))  # no further bytes follow
+    until(lambda: board.send(frame(b"\x07" * CELLS)))  # No further bytes follow.
     until(lambda: tactile.latest().data[0, 0] == 7)
     tactile.close()
 

@@ -37,7 +37,7 @@ TOPICS = {
     "hand/tactile/left": "foxglove.RawImage",
     "hand/tactile/right": "foxglove.RawImage",
 }
-WAIT = 60.0  # s, time-out for one message
+WAIT = 60.0  # time-out for one message [s]
 
 
 class Client:
@@ -108,7 +108,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
             assert (log["level"], log["message"], log["name"]) == (3, early["text"], "start")
             assert log["timestamp"]["sec"] == int(early["timestamp"])
             client.unsubscribe("hand/state")
-            client.subscribe("hand/event")  # the reply follows once the subscription is active
+            client.subscribe("hand/event")  # The reply follows once the subscription is active.
             client.next("hand/event")
             rest: set[str] = set()
             while not rest >= {"hand/scene", "hand/tactile/left", "hand/tactile/right"}:
@@ -136,7 +136,7 @@ def check_numbers(client: Client) -> None:
     assert message.keys() == expected.keys() == described.keys()
     assert message["left"].keys() == expected["left"].keys()
     assert 8.0 <= message["left"]["force"] <= 12.0
-    assert message["goal_force"] is None  # NaN is not available in JSON
+    assert message["goal_force"] is None  # JSON cannot represent NaN.
     assert stamp == pytest.approx(message["timestamp"], abs=1e-6)
 
 
@@ -159,20 +159,20 @@ def check_scene(client: Client) -> None:
     named = {entity["id"]: entity for entity in scene["entities"]}
     assert list(named) == ["palm", "left", "right", "object", "simulated"]
     for finger in ("left", "right"):
-        assert len(named[finger]["lines"]) == 5  # link, base, skin, face, force
+        assert len(named[finger]["lines"]) == 5  # link, base, skin, face and force
         (label,) = (text["text"] for text in named[finger]["texts"])
         assert 8.0 <= float(label.removesuffix(" N")) <= 12.0
     (outline,) = named["object"]["lines"]
     points = np.array([[each["x"], each["y"]] for each in outline["points"]])
     (expected,) = hand_parts(Settings(), read(schema.HandState, state(0.0, 0)))["object"].lines
-    assert points == pytest.approx(expected[2], abs=6e-3)  # the object rotates by at most 5°
+    assert points == pytest.approx(expected[2], abs=6e-3)  # The object rotates by at most 5°.
 
 
 @pytest.fixture(scope="module")
 def stranger() -> Iterator[tuple[FakeDaemon, str]]:
     """Yield a fake daemon and the address of its Foxglove server."""
     with FakeDaemon() as fake, served(fake) as (address, _):
-        # This avoids a warning at exit that no state has arrived.
+        # Connecting here avoids a warning at exit that no state has arrived.
         with connected(address) as line:
             client = Client(line)
             client.subscribe("hand/state")
@@ -217,7 +217,7 @@ def connections(address: str) -> int:
 @pytest.mark.extended
 def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
     fake, address = stranger
-    fake.changes = {"fault": "x" * 30_000}  # large states soon fill a buffer
+    fake.changes = {"fault": "x" * 30_000}  # Large states soon fill a buffer.
     with ExitStack() as stack:
         lazy = []
         for _ in range(CLIENT_COUNT_MAX):
@@ -237,13 +237,13 @@ def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
                 client.sendall(masked({"subscriptions": [{"id": 1, "channelId": channel}]}))
         until(lambda: connections(address) < CLIENT_COUNT_MAX)
         with connected(address) as line:
-            Client(line)  # the server accepts this client
+            Client(line)  # The server accepts this client.
 
 
 def test_incomplete_and_invalid_requests_are_closed(stranger):
     _, address = stranger
     with socket.create_connection(place(address.removeprefix("ws://")), timeout=WAIT) as client:
-        client.sendall(b"GET / HTTP/1.1\r\n")  # an incomplete header
+        client.sendall(b"GET / HTTP/1.1\r\n")  # The header is incomplete.
         assert client.recv(100) == b""
     for odd in ("{", "[]", '{"op": 3}x', '"id": 1, "channelId": 99', '"id": NaN, "channelId": 0'):
         with connected(address) as line:

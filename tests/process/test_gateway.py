@@ -146,7 +146,8 @@ sys.exit(gateway.main(sys.argv[1:]))
     [
         ("STALLED", "while True: pass", -signal.SIGPROF),
         ("BLOCKED", "select.select([], [], [])", -signal.SIGALRM),
-        ("STALLED", "select.select([], [], [], 0.5)", 0),  # resembles a stopped or starved process
+        # This stall resembles a stopped or starved process.
+        ("STALLED", "select.select([], [], [], 0.5)", 0),
     ],
 )
 def test_a_hanging_gateway_ends_itself_but_not_on_a_busy_machine(bound, does, status):
@@ -188,10 +189,10 @@ def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses)
         publisher = Publisher(gateway.link)
         gateway.link.look()
         os.kill(gateway.process, signal.SIGSTOP)
-        for k in range(50_000):  # would never end if the loop waited
+        for k in range(50_000):  # The loop would never end if it waited for the gateway.
             publisher.event(0.0, 0.0, "info", "test", f"event {k}")
         assert len(gateway.link._channel._unsent) < 1000, "the queue exceeds its limit"
-        with suppress(ProcessLookupError):  # a slow gateway may have been replaced
+        with suppress(ProcessLookupError):  # A slow gateway may have been replaced.
             os.kill(gateway.process, signal.SIGCONT)
     finally:
         gateway.close()
@@ -211,7 +212,7 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
     ):
         hand.arm()
         page.shows("ARMED")
-        os.kill(ticking.gateway.process, signal.SIGSTOP)  # clients are not served
+        os.kill(ticking.gateway.process, signal.SIGSTOP)  # The gateway no longer serves clients.
         try:
             assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
             assert ticking.loop.state.mode == "disarmed"
@@ -230,7 +231,7 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
             os.kill(ticking.gateway.process, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
-        hand.arm()  # commands sent after this reply are received
+        hand.arm()  # The gateway receives all commands that are sent after this reply.
         hand.stop()
 
 

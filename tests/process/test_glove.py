@@ -33,7 +33,7 @@ def test_a_board_sends_all_its_bits(full_count):
     decoder = GloveDecoder(2, 3, bits_of(full_count))
     assert decoder.feed(data, 1.0).data.tolist() == sent.tolist()
     if full_count == 4095:
-        plain = GloveDecoder(2, 3, bits_of(65535))  # this profile lacks full_count
+        plain = GloveDecoder(2, 3, bits_of(65535))  # This profile lacks full_count.
         assert plain.feed(data, 1.0) is None
         assert "full_count = 4095" in plain.diagnosis()
 

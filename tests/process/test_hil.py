@@ -20,13 +20,14 @@ from tests.harness.daemon_process import Running, ask, softfinger, started
 from tests.harness.descendants import ending
 from tests.harness.emulated import HIL, EmulatorProcess
 
-WATCHDOG = 2.0  # s, well above the delays of a busy machine
+WATCHDOG = 2.0  # watchdog time [s], well above the delays of a busy machine
 REAL = [
-    *("--set", "loop.clock=real"),  # with a shared clock, the hand would wait for a stalled daemon
+    *("--set", "loop.clock=real"),  # With a shared clock, the hand would wait for a stalled daemon.
     *("--set", f"servos.watchdog={WATCHDOG}", "--set", f"servos.fault_after={WATCHDOG}"),
     *("--set", "servos.reply_timeout=0.1", "--set", "servos.open_timeout=60"),
 ]
-# These use the hand's time, which hardly advances while the emulator gets no processor time.
+# These settings use the hand's time, which hardly advances while the emulator gets no processor
+# time.
 WAITING = [
     *("--set", "servos.fault_after=1.0", "--set", "safety.frame_age_fault=100"),
     *("--set", "servos.open_timeout=60"),
@@ -128,7 +129,7 @@ def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
             for process in (daemon.process, rig.hand.popen):
                 stood = hand.state().behind_s + 0.4
                 process.send_signal(signal.SIGSTOP)
-                select.select([], [], [], 0.5)  # five times the watchdog time
+                select.select([], [], [], 0.5)  # This pause is five times the watchdog time.
                 process.send_signal(signal.SIGCONT)
                 hand.wait_for(lambda state, at=stood: state.behind_s > at, 120.0)
             with hand.stream(120.0) as states:
@@ -150,7 +151,7 @@ def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
             assert not any(each["watchdog_fired"]["count"] for each in rig.report()["servos"])
             hand.arm()
             hand.wait_for(lambda state: state.torque, 120.0)
-        daemon.kill()  # the hand does not wait for a dead daemon
+        daemon.kill()  # The hand does not wait for a dead daemon.
         until(rig.stopped)
     finally:
         rig.close()
@@ -200,7 +201,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     assert "16" in last
     assert "Traceback" not in done.stderr
 
-    # Kill the daemon, so nothing is sent to the servos.
+    # Kill the daemon, so that nothing is sent to the servos.
     daemon = rig.start()
     stops_in_time(rig, daemon.kill)
     daemon = rig.start()
@@ -277,7 +278,7 @@ def test_lost_packets_do_not_keep_torque_on(rig):
     )
     send_words(rig.folder, "well")
     until(lambda: not rig.status()["torque"])
-    if rig.status()["mode"] == "fault":  # depends on when torque off was confirmed
+    if rig.status()["mode"] == "fault":  # The mode depends on when torque off was confirmed.
         rig.does("clear")
     rig.works()
 

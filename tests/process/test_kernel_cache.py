@@ -169,7 +169,7 @@ def test_the_folder_is_private_and_the_least_recently_used_ones_are_removed(pack
     assert found == ["3.0", "0"], "the kernel must be compiled, not loaded from the cache"
     assert f"{base / new}: other users can write to it (0777): chmod go-w" in told
     (base / new).chmod(0o700)
-    package.cache.chmod(0o777)  # this is a parent folder of the kernels
+    package.cache.chmod(0o777)  # This is a parent folder of the kernels.
     found, told = package.run()
     assert found == ["3.0", "0"]
     assert f"{package.cache}: other users can write to it (0777): chmod go-w" in told
@@ -200,7 +200,7 @@ def test_a_damaged_kernel_is_recompiled_with_a_warning(package, tmp_path):
     with OwnFolder(tmp_path / "kept") as folder:
         for name, spoil in SPOILT.items():
             if name == "another's" and os.geteuid() != 0:
-                continue  # only root can change a file's owner
+                continue  # Only root can change the owner of a file.
             kernel_folder.keep(folder, "one", b"machine code")
             assert kernel_folder.kept(folder, "one") == b"machine code"
             spoil(folder.path / "one.kernel")

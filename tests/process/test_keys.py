@@ -102,7 +102,7 @@ def test_keys_that_others_own_or_may_write_are_refused(folder, which, monkeypatc
         load_server(folder)
     path.chmod(mode)
     load_server(folder)
-    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # pretend to be a user other than the owner
+    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # Pretend to be a user other than the owner.
     if os.getuid() == 0:
         for each in [path, *path.parents]:
             if each.is_relative_to(folder):
@@ -179,7 +179,8 @@ def ask(
         if socket is subscriber:
             socket.subscribe(b"")
         socket.connect(address)
-    commander.send(msgpack.packb({"command": "arm", "client": "local"}))  # the daemon ignores it
+    # The daemon ignores the client name in this request.
+    commander.send(msgpack.packb({"command": "arm", "client": "local"}))
     return subscriber, commander
 
 
@@ -200,7 +201,7 @@ def test_the_key_identifies_a_client_and_clients_without_a_key_get_nothing(
     theirs = ask(others, addresses, stranger(folder, kind))
     ours = ask(others, addresses, load_client(folder / "alice"))
     seen = 0
-    while seen < 200:  # only the client with a key receives messages
+    while seen < 200:  # Only the client with a key receives messages.
         guarded.step()
         if ours[0].poll(2):
             ours[0].recv_multipart()
@@ -219,7 +220,7 @@ def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addr
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.server.raise_fence()  # every stop raises a fence
+        guarded.served.server.raise_fence()  # Every stop raises a fence.
         guarded.step()
         return stopper.poll(0)
 
@@ -263,7 +264,7 @@ def test_clients_are_removed_and_added_while_the_daemon_runs(profile, addresses,
         except NoAnswer:
             return False
 
-    until(bob_is_let_in)  # the daemon checks for new keys periodically
+    until(bob_is_let_in)  # The daemon checks for new keys periodically.
     with Hand(*addresses, keys=folder, timeout=60.0) as local:
         assert local.state().mode == "disarmed"
     assert running.end() == 0

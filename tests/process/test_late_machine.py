@@ -12,8 +12,8 @@ from softfinger.daemon.wire.schema import Event
 from tests.conftest import Addresses
 from tests.harness.daemon_process import Running
 
-STILL = 1.0  # s, ten times the watchdog time and the maximum frame age
-PATIENCE = 60.0  # s, time-out for an event on a busy machine
+STILL = 1.0  # duration of a stall [s], ten times the watchdog time and the maximum frame age
+PATIENCE = 60.0  # timeout for an event on a busy machine [s]
 
 
 @pytest.fixture
@@ -63,4 +63,4 @@ def test_on_real_time_a_stall_is_a_fault_and_the_task_restarts(start, profile, h
         assert fault.startswith("this machine was busy for ")
         told(events, "task", "task clears the fault and restarts")
         told(events, "mode", "armed → grasping")
-    assert running.end() in (0, 1)  # a busy machine may cause a fault at any time
+    assert running.end() in (0, 1)  # A busy machine may cause a fault at any time.

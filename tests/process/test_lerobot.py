@@ -75,7 +75,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
         make(rows=10).connect()
     robot.connect()
     first = robot.get_observation()
-    assert robot._hand.state().mode == "disarmed"  # connecting and reading do not arm the hand
+    assert robot._hand.state().mode == "disarmed"  # Connecting and reading do not arm the hand.
     assert set(first) == set(robot.observation_features)
     robot.calibrate()
 
@@ -87,7 +87,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     with pytest.raises(Refused, match=r"left: found 515.7° \(9 rad\), expected"):
         robot.send_action({"left.pos": 9.0, "right.pos": 0.0})
     robot._hand.disarm()
-    # A hand disarmed by another client is not armed again.
+    # A hand that another client has disarmed is not armed again.
     with pytest.raises(Refused, match="arm first"):
         robot.send_action(goal)
     robot.disconnect()
@@ -101,7 +101,8 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     )
     assert held["left_touch"].max() > first["left_touch"].max()
     assert robot.send_action(grip)["grip.force"] == 5.0
-    assert abs(held["left.touch_age"]) < 60.0  # a frame newer than the state may have arrived
+    # A frame that is newer than the state may have arrived.
+    assert abs(held["left.touch_age"]) < 60.0
     act_until(
         robot,
         {"grip.force": 5.0, "grip.angle": 0.1},
@@ -133,7 +134,7 @@ def test_the_environment_has_the_features_and_actions_of_the_robot(plugin):
     env = made(task="Rotate-v0")
     seen, _ = env.reset(seed=[1])
     goal = float(seen["environment_state"][0, 0])
-    for _ in range(100):  # the robot's actions are in N and rad
+    for _ in range(100):  # The robot's actions are in N and rad.
         seen, reward, *_, info = env.step(np.array([[6.0, goal]], np.float32))
     observed = preprocess_observation(seen)
     for name, feature in env_to_policy_features(kind()).items():
@@ -165,7 +166,7 @@ def record(kind, robot, first, action, moved, root):
     """Write two observations with LeRobot's own recorder and read them back."""
     try:
         from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
-    except ImportError:  # LeRobot 0.4
+    except ImportError:  # LeRobot 0.4 has a different module.
         from lerobot.datasets.utils import build_dataset_frame, hw_to_dataset_features
     features = hw_to_dataset_features(robot.action_features, "action", False)
     features |= hw_to_dataset_features(robot.observation_features, "observation", False)

@@ -18,7 +18,7 @@ from tests.harness.descendants import ending
 from tests.harness.fake_daemon import FakeDaemon, finger
 from tests.harness.terminal_process import TerminalProcess
 
-NOBODY = "tcp://127.0.0.1:1"  # nothing listens at this address
+NOBODY = "tcp://127.0.0.1:1"  # Nothing listens at this address.
 
 
 def command(fake: FakeDaemon, *more: str) -> list[str]:
@@ -35,11 +35,12 @@ def test_page_shows_the_hand_and_the_state_of_its_stream(fake):
         fake.send_event("mode", "grasping → holding")
         page.shows("grasping → holding")
         bright = {page.screen.buffer[y][x].fg for y in range(3, 14) for x in range(22)}
-        assert len(bright) > 10  # the footprint has many colours
+        assert len(bright) > 10  # The footprint has many colours.
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
         fake.silent.set()
-        page.shows("○ lost", "the stream has stopped")  # after at most 1.5 s in the stale state
+        # The stale state before this lasts at most 1.5 s.
+        page.shows("○ lost", "the stream has stopped")
         fake.changes = {}
         fake.silent.clear()
         page.shows("● live", "HOLDING")
@@ -63,7 +64,8 @@ def test_terminal_is_restored(fake, how):
         assert page.ended() == (1 if how == "exception" else 0)
         assert page.is_restored()
         after = page.written[page.written.rfind(b"\x1b[?1049l") :]
-        assert (b"the tenth page" in after) == (how == "exception")  # printed on the main screen
+        # The traceback is printed on the main screen.
+        assert (b"the tenth page" in after) == (how == "exception")
 
 
 BREAKS_AT_THE_TENTH_PAGE = """
@@ -87,8 +89,9 @@ sys.exit(monitor.run(parser.parse_args()))
 def test_a_signal_ends_it_while_the_terminal_is_blocked(fake):
     with TerminalProcess(command(fake)) as page:
         page.shows("HOLDING")
-        termios.tcflow(page.slave, termios.TCOOFF)  # like Ctrl-S
-        until_later = fake.published + 50  # several redraws with different noise in the maps
+        termios.tcflow(page.slave, termios.TCOOFF)  # This call has the effect of Ctrl-S.
+        # Wait for several redraws with different noise in the maps.
+        until_later = fake.published + 50
         until(lambda: fake.published >= until_later)
         page.process.terminate()
         assert page.ended() == 0
@@ -121,14 +124,15 @@ def test_keys_command_the_hand(fake):
         page.shows("LEFT contact")
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 10.0°")
-        page.type(b"\x1b[C")  # steps from the target, although the object is still at 4.98°
+        # The key steps from the target, although the object is still at 4.98°.
+        page.type(b"\x1b[C")
         page.shows("✓ rotate to 15.0°")
         page.type(b"\x1bOD")
         page.shows("✓ rotate to 10.0°")
         assert [r["command"] for r in fake.requests[-3:]] == ["rotate"] * 3
         assert fake.requests[-1]["angle"] == pytest.approx(0.17418, abs=1e-4)
         fake.replies["rotate"] = {"ok": False, "error": "rotate: angle: too much"}
-        # A refused turn does not count, so the next one starts at the object's angle.
+        # A refused turn does not count, so the next turn starts at the object's angle.
         for _ in range(2):
             count = len(fake.requests)
             page.type(b"\x1b[D")
@@ -136,7 +140,7 @@ def test_keys_command_the_hand(fake):
             page.shows("✗ rotate: angle: too much")
         assert fake.requests[-1]["angle"] == pytest.approx(-0.00035, abs=1e-4)
         count = len(fake.requests)
-        page.type(b"\x1b[200~gado \x1b[201~zZ\x1b[A\x1b[15~")  # a paste and unused keys
+        page.type(b"\x1b[200~gado \x1b[201~zZ\x1b[A\x1b[15~")  # These are a paste and unused keys.
         page.type(b" ")
         page.shows("✓ stop: ok")
         assert [r["command"] for r in fake.requests[count:]] == ["stop"]
@@ -164,14 +168,14 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         page.type(b"++")
         page.shows("+- 12 N")
         page.type(b"+")
-        page.shows("+- 12.6 N")  # nine tenths of the force limit
+        page.shows("+- 12.6 N")  # The page shows nine tenths of the force limit.
         page.type(b"-" * 10)
-        page.shows("+- 4 N")  # steps are smaller below 5 N
+        page.shows("+- 4 N")  # Below 5 N, the steps are smaller.
         assert fake.requests == []
         page.type(b"g")
         page.shows("✓ grasp with 4 N: ok")
         assert asked() == [4.0]
-        # During a grip, the keys change the last commanded force of any client, and the hand
+        # During a grip, the keys change the force last commanded by any client, and the hand
         # follows.
         fake.changes = {"goal_force": 9.0}
         page.shows("HOLDING", "+- 9 N")
@@ -204,13 +208,14 @@ def test_the_page_shows_another_commander_of_a_real_daemon(start, profile, addre
     daemon = start("--config", str(profile("commands.lease = 60.0\n")))
     where = ["--address", f"{stream},{commands}"]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
-        page.shows("DISARMED", "running, disarmed")  # published before the page was opened
+        # The daemon published this event before the page was opened.
+        page.shows("DISARMED", "running, disarmed")
         page.shows("compute", "late", "25.0", "°C")
         with Hand(stream, commands, client="notebook", timeout=60.0) as hand:
             hand.arm()
             page.shows("ARMED", "notebook commands the hand")
             page.press(b"g", "✗ grasp: notebook holds the lease for another")
-            page.type(b" ")  # stop requires no lease
+            page.type(b" ")  # A stop requires no lease.
             page.shows("✓ stop: ok", "DISARMED")
         assert daemon.end() == 0
         page.shows("○ lost")
@@ -278,7 +283,7 @@ def test_plain_lines_through_a_pipe(fake):
         assert "(12.3 ± 0.1, " in text
         assert "), 5.0°, 40.0 mm" in text
         assert any("warning mode: grasping → holding" in line for line in lines)
-        plain.stdout.close()  # the reader is gone
+        plain.stdout.close()  # The reader has closed the pipe.
         assert plain.wait(300.0) == 0
         assert plain.stderr.read() == ""
 
@@ -291,7 +296,7 @@ def test_no_wait_exits_without_a_stream_and_when_the_stream_ends(fake):
         assert page.is_restored()
         assert f"no stream from {NOBODY} within 5 s" in page.written.decode()
     with TerminalProcess(command(fake, "--no-wait")) as page:
-        page.wait(lambda: b"HOLDING" in page.written)  # the process may already have ended
+        page.wait(lambda: b"HOLDING" in page.written)  # The process may already have ended.
         fake.silent.set()
         assert page.ended() == 0
         assert page.is_restored()
@@ -350,7 +355,8 @@ def test_the_page_has_lower_priority_and_quitting_it_ends_both(fake, tmp_path):
         assert os.getpriority(os.PRIO_PROCESS, page.child) == min(
             os.getpriority(os.PRIO_PROCESS, page.process.pid) + 5, 19
         )
-        page.type(b"\x1a")  # Ctrl-Z is ignored here: suspending the daemon would leave torque on
+        # The page ignores Ctrl-Z here, because suspending the daemon would leave torque on.
+        page.type(b"\x1a")
         page.type(b"q")
         assert page.ended() == 0
         assert page.is_restored()

@@ -49,7 +49,7 @@ def figures() -> str:
 
 @pytest.mark.extended
 def test_plain_numba_passes_tests_of_every_kind_of_kernel_with_the_same_results(request):
-    # Use a separate cache, because the shared one is in use.
+    # Use a separate cache, because the shared cache is in use.
     kept = str(request.config.cache.mkdir("plain-numba"))
     environment = os.environ | {"NUMBA_CACHE_DIR": kept}
     done = python("-c", SCRIPT, cwd=Path(__file__).parents[2], env=environment)

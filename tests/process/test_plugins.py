@@ -38,13 +38,13 @@ def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_example_meets_the_backend_interface(caplog):
     settings = load(changes=METAL)
     check_tactile(settings)
-    assert not caplog.records  # a closed board that has no frame is not an error
+    assert not caplog.records  # A closed board that has no frame is not an error.
     check_servos(settings, torque=True)
     check_shape(load(changes=["simulation.object_shape=hexagon"]))
     found = {each.subject: each for each in doctor.results(settings, False)}
     assert found["servos"].text.startswith("following: the servos use a plugin")
     assert "44 × 44 cells" in found["tactile left"].text
-    assert "/dev/ttyUSB0" not in found  # the ports of plugin backends are not checked
+    assert "/dev/ttyUSB0" not in found  # Ports of plugin backends are not checked.
 
 
 @pytest.mark.usefixtures("here")

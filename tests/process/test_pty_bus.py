@@ -79,7 +79,7 @@ def test_replies_take_wire_time_and_return_delay_one_after_another(wires):
     first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE_TIME
     assert wire.when(first - 1e-5) == b""
     assert len(wire.when(2e-5)) == PONG
-    second = PONG * byte + 500e-6  # replies of a group are sent one after another
+    second = PONG * byte + 500e-6  # The replies of a group are sent one after another.
     assert wire.when(second - 4e-5) == b""
     assert len(wire.when(6e-5)) == PONG
 
@@ -124,7 +124,7 @@ def test_a_client_may_reconnect_and_leave_the_terminal_in_cooked_mode(wires):
 def test_a_client_that_never_reads_does_not_block_the_bus(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     request = frame(1, framing.READ, b"\x00\x00\x93\x00")
-    for _ in range(400):  # far more than a terminal buffer holds
+    for _ in range(400):  # The number of bytes is far more than a terminal buffer holds.
         wire.send(request)
     assert wire.port.bus.packets == 400
 

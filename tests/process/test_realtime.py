@@ -18,7 +18,8 @@ from softfinger.tools.benchmarks.measuring import Report, attempt
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE, python
 
-# Print the system's view of a process that requests everything: before, during and after.
+# Script that prints how the system sees a process before, during and after it requests all
+# measures.
 HELD = """
 import json, os, sys, threading
 from pathlib import Path
@@ -59,7 +60,7 @@ finally:
     over.set()
 """
 
-# Do the same for a user without permissions.
+# Script that does the same as HELD for a user without permissions.
 REFUSED = """
 import json, os, resource
 from softfinger.daemon.loop.realtime import RealTime
@@ -135,7 +136,7 @@ def test_disabled_measures_are_not_requested():
         {"loop": {"clock": "virtual"}, "realtime": {"priority": 7, "cpus": (0,)}}
     )
     affinity = os.sched_getaffinity(0)
-    with RealTime(settings) as measures:  # virtual time never waits
+    with RealTime(settings) as measures:  # Virtual time never waits.
         assert (measures.granted, measures.refused) == (["garbage collector frozen"], [])
         assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
         assert os.sched_getaffinity(0) == affinity

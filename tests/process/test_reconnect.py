@@ -22,9 +22,9 @@ class Rig:
         servos = {
             "backend": "dynamixel",
             "port": str(folder / "servos"),
-            "reply_timeout": 1.0,  # the emulator shares this process's interpreter lock
+            "reply_timeout": 1.0,  # The emulator shares this process's interpreter lock.
             "fault_after": 3.0,
-            "watchdog": 0.0,  # a servo keeps its torque on
+            "watchdog": 0.0,  # Without a watchdog, a servo keeps its torque on.
         }
         own = {"servos": servos, "tactile": {"backend": "none"}, "loop": {"rate": 100.0}}
         self.settings = Settings.model_validate(own | sections)
@@ -81,14 +81,14 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     rig.unplug()
     rig.until(lambda: loop.state.mode == "fault")
     assert "the port is lost" in loop.state.fault
-    assert rig.torque() == [1, 1]  # the daemon could not reach the servos
+    assert rig.torque() == [1, 1]  # The daemon could not reach the servos.
     # From here on, `clear` reopens the port.
     rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
     rig.refuses("clear", "port not found")
     rig.plug()
     seq = loop.state.reading.seq
     loop.advance(0.2)
-    assert loop.state.mode == "fault"  # the fault is not cleared automatically
+    assert loop.state.mode == "fault"  # The daemon does not clear the fault automatically.
     assert not loop.state.reading.valid
     assert rig.does("clear")["mode"] == "disarmed"
     assert rig.torque() == [0, 0]
@@ -130,7 +130,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         until(lambda: left.counters()["port_lost"] == 1)
         rig.until(lambda: loop.state.mode == "fault")
         assert loop.state.fault_name == "tactile.silent"
-        for _ in range(2):  # a failed attempt can be repeated
+        for _ in range(2):  # A failed attempt can be repeated.
             rig.refuses("clear", "port not found")
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)

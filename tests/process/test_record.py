@@ -73,7 +73,7 @@ def test_read_messages_equal_the_published_ones(tmp_path):
     recording = Recording(tmp_path / "a.mcap")
     read = list(recording.messages())
     assert read == sent
-    # The types are equal too, so the messages can be published again, byte for byte.
+    # The types are equal, too, so the messages can be published again byte for byte.
     for (_, before), (_, after) in zip(sent, read, strict=True):
         assert {key: type(value) for key, value in before.items()} == {
             key: type(after[key]) for key in before
@@ -117,7 +117,7 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path, topic):
     described = json.loads(schema.data)["properties"]
     assert set(json.loads(raw.data)) == set(described)
     assert raw.log_time == int(golden["timestamp"] * 1e9)
-    if topic == EVENT:  # Foxglove requires this layout
+    if topic == EVENT:  # Foxglove requires this layout.
         line = json.loads(raw.data)
         assert schema.name == "foxglove.Log"
         assert (golden["level"], line["level"]) == ("warning", 3)
@@ -151,12 +151,12 @@ def test_non_finite_numbers_are_read_as_nan(tmp_path):
     assert writer.messages == 1
     [(_, read)] = Recording(tmp_path / "a.mcap").messages()
     assert math.isnan(read["left"]["force"])
-    assert math.isnan(read["tick_s"])  # JSON cannot represent infinity either
+    assert math.isnan(read["tick_s"])  # JSON cannot represent infinity either.
 
 
 @pytest.mark.extended
 def test_reading_a_time_range_and_selected_topics(tmp_path):
-    sent = written(tmp_path / "a.mcap", 2000)  # several chunks
+    sent = written(tmp_path / "a.mcap", 2000)  # The recording contains several chunks.
     recording = Recording(tmp_path / "a.mcap")
     assert recording.chunks > 3
     part = [each for each in sent if 499.5 <= each[1]["timestamp"] - 1e9 <= 600.5]
@@ -186,7 +186,7 @@ def test_a_truncated_recording_is_readable_up_to_the_cut_and_can_be_closed(tmp_p
         assert not closed.truncated
         assert list(closed.messages()) == read
     assert longest > 1000
-    assert recover(path) == (len(read), "")  # an intact file is not changed
+    assert recover(path) == (len(read), "")  # An intact file is not changed.
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
 
 
@@ -242,7 +242,7 @@ def test_messages_lost_while_recording_a_daemon_are_counted(start, profile, addr
     assert not recording.truncated
     seqs = [m["seq"] for _, m in recording.messages([schema.STATE])]
     assert len(seqs) > 10
-    # A gateway without processor time loses messages; the reported number must then be exact.
+    # A gateway without processor time loses messages. The reported number must then be exact.
     told = re.search(rf"(\d+) of {schema.STATE}", out)
     assert seqs[-1] - seqs[0] + 1 - len(seqs) == (int(told[1]) if told else 0)
     kinds = {message["kind"] for _, message in recording.messages([schema.EVENT])}
@@ -252,7 +252,7 @@ def test_messages_lost_while_recording_a_daemon_are_counted(start, profile, addr
 
 def test_a_full_disk_ends_the_recording_with_a_message_and_keeps_earlier_data(fake, tmp_path):
     path = tmp_path / "run.mcap"
-    fake.changes = {"padding": os.urandom(10_000).hex()}  # incompressible
+    fake.changes = {"padding": os.urandom(10_000).hex()}  # These data are incompressible.
 
     def small_disk() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -283,7 +283,7 @@ def test_messages_sent_before_the_end_are_written(addresses, tmp_path):
     for k in range(4000):
         publisher.send(schema.STATE, zmq.SNDMORE)
         publisher.send(pack({**message, "seq": k}))
-    context.destroy(linger=-1)  # returns once everything is sent
+    context.destroy(linger=-1)  # This call returns once everything is sent.
     process.send_signal(signal.SIGTERM)
     status, out, _ = ended(process)
     assert status == 0
@@ -311,7 +311,7 @@ def test_the_recorder_waits_for_a_daemon_except_with_no_wait(addresses, tmp_path
     assert "waiting for a stream" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
     assert ended(process)[0] == 0
-    assert not list(tmp_path.iterdir())  # no empty file is left behind
+    assert not list(tmp_path.iterdir())  # No empty file is left behind.
 
 
 def test_invalid_messages_on_the_stream_are_counted_and_omitted(fake, tmp_path):
@@ -352,7 +352,8 @@ def test_repeated_messages_do_not_extend_the_time_range(tmp_path):
     recording = Recording(path)
     assert (recording.start, recording.duration) == (pytest.approx(1.7e9), pytest.approx(0.5))
     kept = [message for topic, message in recording.messages() if b"state" not in topic]
-    assert [each["timestamp"] for each in kept] == [1.7e9 - 7200.0] * 2  # the original times
+    # The messages keep their original times.
+    assert [each["timestamp"] for each in kept] == [1.7e9 - 7200.0] * 2
     lonely = RecordingWriter(tmp_path / "b.mcap")
     lonely.add(b"hand/settings", dict(old))
     lonely.close()
@@ -379,7 +380,7 @@ def test_a_damaged_chunk_is_reported_and_skipped_and_the_file_can_be_recovered(
     assert "damaged (" in told[0]
     assert 500 < len(read) < len(sent)
     assert read[0] == sent[0]
-    assert read[-1] == sent[-1]  # chunks after the damaged one are readable
+    assert read[-1] == sent[-1]  # Chunks after the damaged chunk are readable.
     fast = ("--no-wait", "--speed", "1e6", "--address", addresses[0])
     for words in (("export", "--topics", "state"), ("replay", *fast)):
         assert "damaged (" in inline(words[0], path, *words[1:]).stderr, words

@@ -21,7 +21,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 LEFT = "servo 1 (left)"
 FIX = "`softfinger doctor --fix`"
-# Values that another program may leave: register, value, status and text of the finding.
+# Values that another program may leave: register, value, and status and text of the finding.
 EEPROM = [
     (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, expected at most 50 µs"),
     (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: the servo also executes commands for the servo"),
@@ -121,7 +121,7 @@ def test_arm_overwrites_changed_ram_registers(bus, connect, reboots):
         backend.torque_on()
         bus.call(lambda: bus.servo(0).reboot(bus.now()))
         until(lambda: bus.call(lambda: bus.servo(0).awake(bus.now())))
-        for address, value in RAM:  # another program immediately writes to the servo
+        for address, value in RAM:  # Another program immediately writes to the servo.
             put(bus, address, value)
     backend.torque_on()
     model = MODELS["XM430-W350"]

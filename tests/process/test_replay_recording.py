@@ -31,7 +31,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
     due = {
         50: {"command": "arm"},
         51: {"command": "grasp", "force": 6.0},
-        750: {"command": "move", "left": 0.1},  # refused while holding
+        750: {"command": "move", "left": 0.1},  # The daemon refuses this command while holding.
         800: {"command": "rotate", "angle": 0.1},
         1100: {"command": "stop"},
     }
@@ -70,9 +70,9 @@ def test_other_settings_report_the_first_difference(taken, tmp_path):
     used = load(changes=["loop.clock=virtual", "stream.state_rate=500", "control.force_gain=0.5"])
     result = recompute(recording, used)
     assert "left.goal_current" in result.differences
-    assert "left.q" not in result.differences  # inputs are unchanged
+    assert "left.q" not in result.differences  # The inputs are unchanged.
     different = result.differences["left.goal_current"]
-    assert different.first_tick > 50  # the first difference appears after arming
+    assert different.first_tick > 50  # The first difference appears after arming.
     assert different.worst > 1e-3
     assert different.recorded != different.recomputed
 

@@ -68,7 +68,7 @@ def test_ready_is_sent_first_and_then_four_watchdog_messages_per_interval(manage
 
 def test_a_missing_or_slow_manager_does_not_block_the_daemon(manager):
     service = Service(str(manager.path), watchdog=0.004)
-    for tick in range(5000):  # far more than the socket can buffer
+    for tick in range(5000):  # These messages are far more than the socket can buffer.
         service.alive(tick * 0.002)
     manager.close()
     service.alive(1e6)
@@ -168,7 +168,7 @@ def test_the_unit_has_the_settings_of_a_control_daemon(tmp_path, inline):
     assert words[0] == sys.executable
     assert words[4:6] == ["run", "--no-task"], "the service must restart disarmed"
     assert words[6:] == ["--log", "json", "--config", str(config)]
-    # The program that the unit starts exists: its command line also prints the help.
+    # The program that the unit starts exists, and its command line prints the help.
     shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=300, check=False)
     assert shown.returncode == 0
     analyze = shutil.which("systemd-analyze")

@@ -149,7 +149,7 @@ def test_unusable_ports_are_reported(bus):
     first.read(reading)
     assert reading.valid
     first.close()
-    connected(bus).close()  # the port is available again
+    connected(bus).close()  # The port is available again.
 
 
 def test_minor_findings_are_notices(bus):
@@ -172,7 +172,7 @@ def test_minor_findings_are_notices(bus):
     goal = bus.memory(0)[span]
     backend.write(Goal(q=[0.5, 0.5], current=[1.0, 1.0]))
     backend.close()
-    assert bus.memory(0)[span] == goal  # a servo with torque on is not changed
+    assert bus.memory(0)[span] == goal  # A servo with torque on is not changed.
     assert servo.torque_on
 
 
@@ -183,7 +183,7 @@ def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     gears = "gear friction consumes 0.25 of the transmitted torque, so a grip may never settle"
     assert [each.text for each in backend.notices] == 2 * [constant, gears]
     backend.close()
-    for name in ("hil", "small"):  # these profiles have forces that match their servos
+    for name in ("hil", "small"):  # The forces in these profiles match their servos.
         settings = load(find(Path(name)), Path("/tmp"))
         assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 
@@ -198,7 +198,7 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     text = "16 ms, expected 1 ms: every read takes at least this long"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     assert refusal(bus.port, reply_timeout=0.004)[0] == f"{bus.port} latency timer: {text}: {fix}"
-    backend = connected(bus)  # the time-out is longer than the latency timer
+    backend = connected(bus)  # The timeout is longer than the latency timer.
     assert (backend.notices[0].text, backend.notices[0].fix) == (text, fix)
     backend.close()
     # The port has a low-latency mode, so a driver sets the timer to 1 ms by itself.
@@ -247,7 +247,8 @@ def test_temperature_and_supply_are_read_with_the_joints(bus, servos):
 
 
 def test_both_kinds_of_read_give_the_same_readings(bus, servos, monkeypatch):
-    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)  # only the first read is wide
+    # Only the first read includes all registers.
+    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)
     wide = read(servos, Reading())
     narrow = read(servos, Reading())
     assert wide.temperature[0] > 0.0
@@ -295,7 +296,8 @@ def test_simulated_servos_heat_up_with_their_current_and_shut_down():
     servos.connect()
     reading = read(servos, Reading())
     assert reading.temperature == [25.0, 25.0]
-    assert reading.voltage == pytest.approx([12.05, 12.05], abs=0.06)  # 0.35 Ω supply resistance
+    # The supply resistance is 0.35 Ω.
+    assert reading.voltage == pytest.approx([12.05, 12.05], abs=0.06)
     servos.torque_on()
     while not read(servos, reading).alert:
         clock.sleep_until(clock.now() + 0.05)

@@ -19,7 +19,7 @@ Line = tuple[SerialPort, PacketHandler]
 
 @pytest.fixture
 def line(bus: RunningBus) -> Iterator[Line]:
-    port = SerialPort(bus.port, 2_000_000, 1.0)  # the bus shares this process's interpreter lock
+    port = SerialPort(bus.port, 2_000_000, 1.0)  # The bus shares this process's interpreter lock.
     port.openPort()
     yield port, PacketHandler()
     port.closePort()
@@ -32,7 +32,7 @@ def line(bus: RunningBus) -> Iterator[Line]:
 )
 def test_arbitrary_bytes_are_transferred_unchanged(bus, line, data, kind):
     port, handler = line
-    start = 224  # indirect data that refers to itself acts as plain memory
+    start = 224  # Indirect data that refer to themselves act as plain memory.
     assert handler.writeTxRx(port, 1, start, len(data), list(data)) == (OK, 0)
     assert bus.memory(0)[start : start + len(data)] == data
     assert handler.readTxRx(port, 1, start, len(data)) == (list(data), OK, 0)
@@ -47,13 +47,13 @@ def test_other_sdk_calls_work_with_our_handler(line):
     assert handler.write4ByteTxRx(port, 1, reg.PROFILE_VELOCITY, 77) == (OK, 0)
     assert handler.read4ByteTxRx(port, 1, reg.PROFILE_VELOCITY) == (77, OK, 0)
     assert handler.write1ByteTxOnly(port, 2, reg.LED, 1) == OK
-    # This write's unread reply must not be mistaken for the reply to the next request.
+    # The unread reply to this write must not be mistaken for the reply to the next request.
     assert handler.read1ByteTxRx(port, 2, reg.LED) == (1, OK, 0)
     bulk = sdk.GroupBulkRead(port, handler)
     bulk.addParam(1, reg.PRESENT_POSITION, 4)
     bulk.addParam(2, reg.PRESENT_TEMPERATURE, 1)
     for exchange in ("txRxPacket", "fastBulkRead"):
-        assert getattr(bulk, exchange, lambda: OK)() == OK  # SDK version 3.7 has no fast reads
+        assert getattr(bulk, exchange, lambda: OK)() == OK  # SDK version 3.7 has no fast reads.
         assert bulk.getData(1, reg.PRESENT_POSITION, 4) == 2048
         assert bulk.getData(2, reg.PRESENT_TEMPERATURE, 1) == 25
     assert handler.reboot(port, 1) == (OK, 0)
@@ -63,8 +63,8 @@ def test_the_unmodified_sdk_works(bus):
     port = sdk.PortHandler(bus.port)
     handler = sdk.PacketHandler(2.0)
     assert port.openPort()
-    assert port.setBaudRate(1_000_000)  # closes and reopens the pty
-    # A busy machine may exceed the SDK's time-out of 35 ms.
+    assert port.setBaudRate(1_000_000)  # This call closes and reopens the pty.
+    # A busy machine may exceed the SDK's timeout of 35 ms.
     port.setPacketTimeout = lambda _: port.setPacketTimeoutMillis(60_000)
     assert handler.ping(port, 2) == (1020, OK, 0)
     read = sdk.GroupSyncRead(port, handler, reg.PRESENT_POSITION, 4)
@@ -94,7 +94,8 @@ def test_error_bytes_of_a_group_read_are_kept(bus, line):
         group = kind(*line, reg.PRESENT_POSITION, 4, [1, 2])
         assert group.exchange() == OK
         assert group.errors == {1: 0x80, 2: 0}
-        assert kind(*line, 660, 4, [1, 2]).exchange() != OK  # addresses beyond the control table
+        # These addresses are beyond the control table.
+        assert kind(*line, 660, 4, [1, 2]).exchange() != OK
 
 
 def test_noise_before_a_reply_is_skipped_and_counted():

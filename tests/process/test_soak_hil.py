@@ -17,7 +17,8 @@ from tests.soak.rig import judge_wire
 @pytest.mark.extended
 def test_the_real_time_soak_checks_wire_memory_and_streams(monkeypatch):
     monkeypatch.setattr(hil, "_LOOK", 0.5)
-    monkeypatch.setattr(hil, "_FLAT", 30.0)  # MB, because all processes are still warming up
+    # Allow 30 MB, because all processes are still warming up.
+    monkeypatch.setattr(hil, "_FLAT", 30.0)
     account = hil.soak(4.0)
     # A busy machine may delay the emulated hand itself, whose watchdog then trips late.
     assert [each for each in account.wrong if "without a packet" not in each] == []

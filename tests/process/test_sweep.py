@@ -78,7 +78,7 @@ def test_an_interrupted_sweep_continues_from_its_journal(tmp_path):
     assert [next(first) for _ in range(4)] == EXPECTED[:4]
     first.close()
     with journal.open("a", encoding="utf-8") as file:
-        file.write("[4, 0.")  # truncated
+        file.write("[4, 0.")  # The last line is truncated.
     done = []
 
     def counted(seed: int) -> float:

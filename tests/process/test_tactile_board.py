@@ -91,7 +91,7 @@ def test_the_next_event_is_the_next_frame_delivery():
         source.make(seq)
         made.service(t)
         assert made.next_event() == pytest.approx(due)
-    made.service(0.0562)  # a late frame is soon checked again
+    made.service(0.0562)  # The board soon checks again for a late frame.
     assert made.next_event() == pytest.approx(0.0567)
     made.service(0.0638)
     assert made.next_event() == pytest.approx(0.064)
@@ -115,7 +115,7 @@ def test_without_a_reader_only_whole_frames_are_dropped(cells):
         got += client.expect(1) + client.read()
     assert got == frame * sent.count(True)
     assert client.read() == b""
-    assert writer.send(frame)  # sending continues once there is a reader
+    assert writer.send(frame)  # Sending continues once there is a reader.
     os.close(client.fd)
     writer.close()
 

@@ -38,7 +38,7 @@ def test_a_frame_object_is_kept_until_a_newer_one_and_never_modified(rig):
     assert later.t_arrival > first.t_arrival
     assert later.t_sample > first.t_sample
     assert np.array_equal(first.data, kept)
-    if rig.backend in ("simulated", "replay"):  # only the test advances the time
+    if rig.backend in ("simulated", "replay"):  # Only the test advances the time.
         assert rig.sensor.latest() is later
 
 
@@ -49,7 +49,7 @@ def test_numbers_and_times_only_increase(rig):
         seen.append(rig.wait(lambda frame: frame is not seen[-1]))
     assert (np.diff([frame.seq for frame in seen]) > 0).all()
     assert (np.diff([frame.t_sample for frame in seen]) >= 0).all()
-    # Frames read in one call have the same arrival time.
+    # Frames that are read in one call have the same arrival time.
     assert (np.diff([frame.t_arrival for frame in seen]) >= 0).all()
 
 
@@ -100,7 +100,7 @@ def test_another_grid_is_reported_with_both_sizes(backend, tmp_path):
             rig.sensor.open()
         return "16 × 32" in str(error.value)
 
-    until(told)  # on a busy machine the board may not have sent anything yet
+    until(told)  # On a busy machine, the board may not have sent anything yet.
 
 
 @pytest.mark.parametrize("backend", SERIAL)
@@ -119,9 +119,9 @@ def test_incomplete_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
 def test_a_silent_board_keeps_the_last_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="silent@0.2") as rig:
         rig.sensor.open()
-        rig.wait(lambda frame: rig.images.number > 60)  # of which 40 were sent
+        rig.wait(lambda frame: rig.images.number > 60)  # Of these frames, 40 were sent.
 
-        def silent() -> bool:  # earlier frames may still be in transit
+        def silent() -> bool:  # Earlier frames may still be in transit.
             last, number = rig.sensor.latest(), rig.images.number
             rig.wait(lambda frame: rig.images.number > number + 10)
             assert last.valid
@@ -136,7 +136,7 @@ def test_a_frozen_board_has_new_numbers_and_times_but_the_same_image(backend, tm
         rig.sensor.open()
         rig.wait(lambda frame: rig.images.number > 60)
 
-        def still() -> bool:  # earlier frames may still be in transit
+        def still() -> bool:  # Earlier frames may still be in transit.
             first = rig.sensor.latest()
             later = rig.wait(lambda frame: frame.seq >= first.seq + 3)
             assert later.t_sample > first.t_sample
@@ -146,7 +146,7 @@ def test_a_frozen_board_has_new_numbers_and_times_but_the_same_image(backend, tm
         until(still)
 
 
-# The glove-style board behaves in the same way, after 40 unanswered requests of 0.1 s each.
+# The glove-style board behaves in the same way after 40 unanswered requests of 0.1 s each.
 @pytest.mark.parametrize("backend", ["flexitac", "cobs"])
 def test_a_board_that_changes_its_grid_gives_an_invalid_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="wrong-size@0.2") as rig:

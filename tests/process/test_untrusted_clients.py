@@ -55,7 +55,7 @@ def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
         raw.sendall(request)
         wait()
         answer = b""
-        with contextlib.suppress(OSError):  # the daemon may have closed the connection
+        with contextlib.suppress(OSError):  # The daemon may have closed the connection.
             raw.shutdown(socket.SHUT_WR)
         with contextlib.suppress(ConnectionError):
             while part := raw.recv(4096):
@@ -83,7 +83,7 @@ def test_a_web_page_can_neither_send_nor_receive(daemon, wrap):
         )
         assert b"ok" not in answer
         assert hand.state().mode == "disarmed"
-        hand.arm()  # clients are still served
+        hand.arm()  # The daemon still serves clients.
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
         hand.stop()
         request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), daemon.addresses[0])

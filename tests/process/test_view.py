@@ -129,7 +129,7 @@ def test_an_invalid_command_gets_a_reply(served, odd):
     query = viewed.commanding.partition("/?")[2]
     address = f"ws://{viewed.host}/command?{query}"
     with connect(address, proxy=None, open_timeout=WAIT) as line:
-        for _ in range(2):  # the page may continue
+        for _ in range(2):  # The connection stays open after a refusal.
             line.send(odd)
             assert str(line.recv(timeout=WAIT)).startswith(
                 "✗ invalid command: expected a JSON object"
@@ -146,7 +146,7 @@ def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
             # The viewer waits.
             assert any("no reply to arm" in line for line in viewed.process.stderr)
             viewed.process.send_signal(signal.SIGINT)
-            assert viewed.process.wait(WAIT) == 1  # the viewer has displayed nothing
+            assert viewed.process.wait(WAIT) == 1  # The viewer has displayed nothing.
 
 
 def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
@@ -157,14 +157,14 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             page.connect((host, int(port)))
             page.settimeout(WAIT)
             page.sendall(WATCH.format(host=viewed.host).encode())
-            wish = bytes([0x81, 0x80, 0, 0, 0, 0])  # an empty text frame
+            wish = bytes([0x81, 0x80, 0, 0, 0, 0])  # This is an empty text frame.
             page.setblocking(False)
             begun = fake.published
 
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
                     page.send(wish)
-                return fake.published > begun + 500  # the page's queue holds 5 s of pictures
+                return fake.published > begun + 500  # The page's queue holds 5 s of pictures.
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)
@@ -198,7 +198,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     assert seqs == sorted(seqs)
     assert seqs[0] < picture["seq"]
     numbers = [row[0] for each in (*pictures, picture) for row in each["rows"]]
-    assert numbers == [*range(numbers[0], picture["row"][0])]  # each row appears once
+    assert numbers == [*range(numbers[0], picture["row"][0])]  # Each row appears once.
     expected = {
         "left.force": 7.5,
         "left.force_std": 0.05,
@@ -228,10 +228,12 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
-        assert levels.max() > 20  # of 31 levels; the peak is 45 kPa of 50 kPa
+        # Of 31 levels, more than 20 are used, because the peak is 45 kPa of 50 kPa.
+        assert levels.max() > 20
         assert levels[20:24, 20:24].min() > 10
-        assert levels[:8].max() < 6  # this area contains only noise
-        assert len(picture["panels"][name]["lines"]) == 2  # rim and footprint
+        assert levels[:8].max() < 6  # This area contains only noise.
+        # The lines are the rim and the footprint.
+        assert len(picture["panels"][name]["lines"]) == 2
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
@@ -404,8 +406,8 @@ def test_other_machines_need_a_one_time_code() -> None:
         assert ask(viewed.host, query, {"command": "stop"}) == "✓ stop: ok"
         with pytest.raises(InvalidStatus, match="403"):
             ask(viewed.host, query, {"command": "stop"}, origin="http://evil.example")
-        assert got(viewed.host, code)[0] == 403  # another browser has already used this code
-        line = viewed.process.stdout.readline()  # this is the code for the next browser
+        assert got(viewed.host, code)[0] == 403  # Another browser has already used this code.
+        line = viewed.process.stdout.readline()  # This code is for the next browser.
         assert location(viewed.host, line.split()[1].removeprefix(f"http://{viewed.host}")) == place
         listening = psutil.Process(viewed.process.pid).net_connections()
         assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.2"]
@@ -426,7 +428,7 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
         thread = threading.Thread(target=playback.run, args=(ending,))
         thread.start()
         try:
-            until(lambda: playback.position > 0.3)  # playing
+            until(lambda: playback.position > 0.3)  # The recording is playing.
             playback.ask("pause")
             for place in (2.0, 0.5, 1.5):
                 playback.ask(str(place))
@@ -443,15 +445,16 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
                     assert force == (pytest.approx(was, abs=1e-4) if math.isfinite(was) else None)
             assert playback.position == 1.5
             playback.ask("play")
-            until(lambda: not playback.playing)  # the playback stops at the end
+            until(lambda: not playback.playing)  # The playback stops at the end.
             assert playback.position == pytest.approx(recording.duration)
             drawn = kept.newest
-            until(lambda: kept.newest is not drawn)  # the playback stays at the end
+            until(lambda: kept.newest is not drawn)  # The playback stays at the end.
             for odd in ("speed 0", "speed fast", "speed 1e9", "speed nan", "nan", "later"):
                 playback.ask(odd)
             playback.ask("speed 0.5")
             playback.ask("play")
-            until(lambda: 0.0 < playback.position < 1.0)  # it starts again from the beginning
+            # The playback starts again from the beginning.
+            until(lambda: 0.0 < playback.position < 1.0)
             until(lambda: kept.newest["place"]["speed"] == 0.5)
             marks = [(kind, text) for _, _, kind, text in kept.scene["marks"]]
             assert ("mode", "disarmed → armed") in marks
@@ -474,7 +477,8 @@ def test_a_recording_is_saved_as_a_page(recorded, tmp_path):
     recording, path = Recording(recorded), tmp_path / "run.html"
     save(path, recording, 0.1, print)
     page = path.read_text("utf-8")
-    assert "://" not in re.sub("ws://|xmlns=.[^ ]*", "", page)  # loads nothing
+    # The page loads nothing from other addresses.
+    assert "://" not in re.sub("ws://|xmlns=.[^ ]*", "", page)
     assert 'name="stop"' not in page
     scene, *pictures, rows = stored_in(page)
     assert [mark[3] for mark in scene["marks"]][:2] == ["disarmed → armed", "armed → grasping"]
@@ -494,7 +498,7 @@ def test_a_recording_is_saved_as_a_moving_picture(recorded, tmp_path):
     lines = [each for each in ElementTree.parse(path).getroot().iter() if "values" in each.attrib]
     counts = {len(each.attrib["values"].split(";")) for each in lines}
     assert counts == {1 + math.ceil(Recording(recorded).duration / 0.1)}
-    assert len(lines) >= 6 + 5  # fingers and tips; contacts, arrows and object
+    assert len(lines) >= 6 + 5  # The lines show fingers and tips, and contacts, arrows and object.
 
 
 def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline):
@@ -539,7 +543,7 @@ def test_invalid_messages_are_tolerated() -> None:
 
 def test_states_are_queued_while_a_picture_is_drawn(context, addresses):
     publisher = context.socket(zmq.XPUB)
-    publisher.setsockopt(zmq.SNDHWM, 2000)  # the daemon uses the same value
+    publisher.setsockopt(zmq.SNDHWM, 2000)  # The daemon uses the same value.
     publisher.bind(addresses[0])
     kept, drawn = Kept(live=True), threading.Event()
     kept.pictures.draw, draw = drawn.wait, kept.pictures.draw
@@ -604,11 +608,11 @@ def test_invalid_input_is_reported_in_one_line(tmp_path, inline, monkeypatch, wo
 
 
 def test_pages_without_a_chosen_port_get_different_ports() -> None:
-    with ExitStack() as stack:  # the first page occupies its port
+    with ExitStack() as stack:  # The first page occupies its port.
         here = "127.0.0.1"
         ports = [stack.enter_context(listen(here, None)).getsockname()[1] for _ in range(3)]
         assert len(set(ports)) == 3
         with pytest.raises(ViewError, match=f"port {ports[0]}"):
             listen(here, ports[0])
         with pytest.raises(ViewError, match=r"--host 192\.0\.2\.1 can't be used"):
-            listen("192.0.2.1", None)  # an address reserved for documentation
+            listen("192.0.2.1", None)  # This address is reserved for documentation.

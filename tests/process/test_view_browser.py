@@ -39,7 +39,7 @@ FRACTION = """((selector, colour) => {
     count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
   return 4 * count / data.length;
 })"""
-# Visible texts with a contrast below WCAG AA: 4.5, or 3 for large letters.
+# Visible texts with a contrast below WCAG AA, which is 4.5, or 3 for large letters.
 PALE = """(() => {
   const linear = part => part <= 10.31 ? part / 3294.6 : ((part / 255 + 0.055) / 1.055) ** 2.4;
   const parts = colour => colour.match(/[\\d.]+/g).map(Number);
@@ -209,10 +209,10 @@ def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
         page.focus("[name=grasp]")
         page.key("Space", " ", text=" ")
         hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
-        until(lambda: page.text(".reply") == "✓ stop: ok")  # the grasp button was not pressed
+        until(lambda: page.text(".reply") == "✓ stop: ok")  # The grasp button was not pressed.
         page.click("[name=tare]")
         until(lambda: page.text(".reply") == "✓ tare: ok")
-        hand.collect(1.0)  # collects the frames that the tare averages
+        hand.collect(1.0)  # The tare averages these frames.
         press("[name=arm]", "armed")
         press("[name=grasp]", "holding")
         page.click("[name=disarm]")
@@ -230,7 +230,7 @@ def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
         press("[name=stop]", "disarmed")
         press("[name=arm]", "armed")
         page.browser.open("about:blank")
-        hand.collect(LEASE + 0.5)  # the daemon's clock advances without messages from the page
+        hand.collect(LEASE + 0.5)  # The daemon's clock advances without messages from the page.
         assert command(commands, "release", client="another")["ok"]
         viewed.end()
 
@@ -298,9 +298,10 @@ def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
         page.mouse("mouseMoved", page.place(plot, 0.9), button="left", buttons=1)
         page.mouse("mouseReleased", page.place(plot, 0.9), button="left", clickCount=1)
         until(lambda: page("view.end") is not None)
-        assert 5.0 < page("view.span") < 8.0  # 0.3 of the 20 s, including margins
+        assert 5.0 < page("view.span") < 8.0  # The zoom shows 0.3 of the 20 s, including margins.
         assert page.text("#hold") == "Resume"
-        assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")  # labels are times of day
+        # The labels are times of day.
+        assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")
         page.click("#follow")
         assert page("[view.span, view.end]") == [20, None]
         page.mouse("mouseWheel", page.place(plot, 0.5), deltaX=0, deltaY=-100, modifiers=2)
@@ -319,7 +320,7 @@ def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
         assert page("scene.modes.includes('holding')")
         until(lambda: page.text(".legend") == "holding")
         for name in ("left", "right"):
-            scale = page.text(f".{name} .scale")  # the scale follows the peaks of noisy frames
+            scale = page.text(f".{name} .scale")  # The scale follows the peaks of noisy frames.
             assert re.fullmatch(r"≤ 3[3-7]0 kPa", scale), scale
         viewed.end()
 
@@ -338,7 +339,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
             return bool(page(value) == [force, force])
 
         until(lambda: shows(9.0))
-        fake.changes = {"goal_force": 12.0}  # set by another client
+        fake.changes = {"goal_force": 12.0}  # Another client has set this force.
         until(lambda: shows(12.0))
         page.focus(slider)
         page.arrow("Right")
@@ -346,14 +347,14 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         fake.changes = {"goal_force": 12.5}
         until(lambda: page.text("#force output") == "✓ 12.5 N accepted")
 
-        fake.deaf.set()  # a slow daemon
+        fake.deaf.set()  # The daemon is slow.
         for _ in range(8):
             page.arrow("Right")
         assert shows(16.5)
         assert "is being sent" in page.text("#force output")
         fake.deaf.clear()
         until(lambda: forces(fake)[-1] == 16.5)
-        assert len(forces(fake)) <= 3  # the page skips intermediate values
+        assert len(forces(fake)) <= 3  # The page skips intermediate values.
         until(lambda: page.text("#force output") == "✓ 16.5 N accepted")
         fake.changes = {"goal_force": 16.5}
         until(lambda: page("settings.force.wanted") is None)
@@ -363,7 +364,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         until(lambda: forces(fake)[-1] == 7.3)
         fake.changes = {"goal_force": 7.3}
         until(lambda: page("settings.force.wanted") is None)
-        fake.changes = {"goal_force": 11.0}  # set by another client
+        fake.changes = {"goal_force": 11.0}  # Another client has set this force.
         until(lambda: page.text("#force output") == "" and shows(11.0))
         fake.changes = {"goal_force": 7.3}
         until(lambda: page("settings.force.value") == 7.3)
@@ -376,7 +377,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         fake.replies["grasp"] = {"ok": False, "error": "grasp: too hot for that"}
         page.key("Equal", "+", text="+")
         until(lambda: page.text("#force output") == "✗ grasp: too hot for that")
-        until(lambda: page("settings.force.wanted") is None)  # the hand did not adopt this force
+        until(lambda: page("settings.force.wanted") is None)  # The hand did not adopt this force.
         del fake.replies["grasp"]
         until(lambda: page("document.querySelector('#force [type=number]').value") == "7.3")
 
@@ -395,7 +396,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
 def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page, fake):
     fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
     with viewing(fake) as viewed:
-        page.open(viewed.address)  # this fills the browser's cache for the second visit
+        page.open(viewed.address)  # This visit fills the browser's cache for the second visit.
         assert "Watching" in page.text("aside")
         page.click("#help")
         explained = page("document.querySelector('#explained').innerText")
@@ -413,12 +414,14 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
 
         os.killpg(page.browser.process.pid, signal.SIGSTOP)
         asleep = fake.published
-        until(lambda: fake.published > asleep + 1000)  # 10 s of the stream
+        # This wait corresponds to 10 s of the stream.
+        until(lambda: fake.published > asleep + 1000)
         os.killpg(page.browser.process.pid, signal.SIGCONT)
         until(lambda: page.lag() < 0.5)
         rows = page("past.rows.map(row => row[0])")
-        assert rows == [*range(rows[0], rows[0] + len(rows))]  # includes the states during sleep
-        page.click("[name=stop]")  # sent although the connection was closed in between
+        # The rows include the states during sleep.
+        assert rows == [*range(rows[0], rows[0] + len(rows))]
+        page.click("[name=stop]")  # The stop is sent although the connection was closed in between.
         until(lambda: fake.requests[-1]["command"] == "stop")
 
         page("location.reload()")
@@ -434,7 +437,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         ]
         assert not foreign
 
-        page.browser.open("data:text/html,another page")  # this is a page with a different origin
+        page.browser.open("data:text/html,another page")  # This page has a different origin.
         until(lambda: page("location.protocol") == "data:")
         socket = f"new WebSocket('ws://{viewed.host}/pictures')"
         page(f"({socket}).onopen = event => window.came = event.type")
@@ -456,7 +459,7 @@ def test_the_record_button_writes_a_recording(page, fake, tmp_path):
         until(lambda: page.text("[name=record]") == "Record")
         assert Recording(path).count(b"hand/state") > 0
         assert not Recording(path).truncated
-        page.click("[name=record]")  # the recording stops when the page's server exits
+        page.click("[name=record]")  # The recording stops when the page's server exits.
         until(lambda: len(list(tmp_path.glob("softfinger-*.mcap"))) == 2)
         viewed.end()
         assert not any(Recording(each).truncated for each in tmp_path.glob("*.mcap"))
@@ -478,7 +481,7 @@ def test_colours_labels_and_keys_are_accessible(page, fake):
             assert page(PALE) == []
         page.click("#theme")
         until(lambda: page("document.documentElement?.dataset.theme") == "light")
-        page.open(viewed.commanding)  # this browser keeps its selection
+        page.open(viewed.commanding)  # This browser keeps its selection.
         assert page("document.documentElement?.dataset.theme") == "light"
 
         tree = page.browser.ask("Accessibility.getFullAXTree")["nodes"]
@@ -542,7 +545,8 @@ def test_a_recording_is_played(page, tmp_path):
         assert page("document.querySelector('[name=stop]')") is None
         assert page.text(".mode") == "holding"
         until(lambda: page("scene.marks.length") == 3)
-        for colour in ((100, 109, 124), (158, 93, 0), (0, 122, 90)):  # disarmed, grasping, holding
+        # Colours for disarmed, grasping and holding.
+        for colour in ((100, 109, 124), (158, 93, 0), (0, 122, 90)):
             until(lambda: page.fraction(".track", colour) > 0.001)  # noqa: B023
         page.focus("#place")
         page.key("Home", "Home", windowsVirtualKeyCode=36)
@@ -578,7 +582,8 @@ def test_a_saved_recording_is_played_from_its_file(page, tmp_path):
     page.focus("#place")
     page.key("Home", "Home", windowsVirtualKeyCode=36)
     until(lambda: page.text(".mode") == "disarmed")
-    until(lambda: page.text(".headline p span") == "0.0")  # also while paused
+    # This value appears even while the playback is paused.
+    until(lambda: page.text(".headline p span") == "0.0")
     assert page("past.rows.every(row => row[1] - view.start < 0.5)")
     page("document.activeElement.blur()")
     page.key("Period", ".", text=".")

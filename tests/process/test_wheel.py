@@ -126,7 +126,7 @@ def test_a_script_next_to_an_editable_clone_finds_the_package(tmp_path):
     script = tmp_path / "script.py"
     begin = f"import site; site.addsitedir({str(tmp_path / 'site')!r})\n"
     script.write_text(begin + "from softfinger import Refused, __file__ as at; print(at)\n")
-    alone = os.environ | {"PYTHONPATH": ""}  # without the site-packages of this test run
+    alone = os.environ | {"PYTHONPATH": ""}  # Exclude the site-packages of this test run.
     told = python("-S", script, cwd=tmp_path, env=alone)
     assert told.stdout.strip() == str(source / "softfinger" / "__init__.py"), told.stderr
 
@@ -162,7 +162,7 @@ def test_pinned_versions_support_the_oldest_supported_python():
     assert oldest.startswith(">=")
     looked_at = 0
     for line in (ROOT / "constraints.txt").read_text().splitlines():
-        with contextlib.suppress(PackageNotFoundError):  # an extra that tests do not need
+        with contextlib.suppress(PackageNotFoundError):  # The tests do not need this package.
             wanted = metadata(line.split("==")[0]).get("Requires-Python") or ""
             assert SpecifierSet(wanted).contains(oldest.removeprefix(">=")), f"{line}: {wanted}"
             looked_at += 1

@@ -24,15 +24,15 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 LIMIT = 70.0  # °C
 _DT = 0.5  # s
 _MODELS = ("XM430-W350", "XL330-M288")
-_LONG = 8000.0  # s, long enough to reach steady state
+_LONG = 8000.0  # duration long enough to reach steady state [s]
 
 
 class Foreseen(NamedTuple):
     """Result of the prediction for one hold."""
 
-    warned: float  # s from the warning until the reading reached the limit
-    told: float  # s, prediction when 60 s remained
-    lasted: float  # s, total duration
+    warned: float  # time from the warning until the reading reached the limit [s]
+    told: float  # predicted time when 60 s remained [s]
+    lasted: float  # total duration [s]
 
 
 class Bench:
@@ -108,8 +108,9 @@ def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
 class Held(NamedTuple):
     """Result of a grip with more force than the servos can sustain."""
 
-    dropped: bool  # the object was dropped, because of an overheated servo or for another reason
-    force: float  # N, requested force at the end
+    # True if the object was dropped, because of an overheated servo or for another reason.
+    dropped: bool
+    force: float  # requested force at the end [N]
     events: list[str]
 
 

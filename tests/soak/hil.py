@@ -36,20 +36,20 @@ from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0
 SUBSCRIBERS = 3
-_LOOK = 5.0  # s between checks of the bus and memory
-# Length in s of the compared windows at both ends; at most a third of the run.
+_LOOK = 5.0  # time between checks of the bus and of the memory [s]
+# Length of the compared windows at both ends [s]. It is at most a third of the run.
 _WINDOW = 600.0
-_FLAT = 2.0  # MB, maximum memory growth of a process
-_FAULT_EVERY = 40.0  # s, average
+_FLAT = 2.0  # maximum memory growth of a process [MB]
+_FAULT_EVERY = 40.0  # average time between faults [s]
 _FAULT_FOR = 0.3
-_SETPOINT = 0.02  # s between setpoints
-_STREAM = 3.0  # s, duration of a setpoint stream
-_SPLIT = 300  # s per recorder file; the recorder keeps an index until the file is closed
-# These faults leave the object tilted after a stop; the soak then puts it upright.
+_SETPOINT = 0.02  # time between setpoints [s]
+_STREAM = 3.0  # duration of a setpoint stream [s]
+_SPLIT = 300  # time per recorder file [s]; the recorder keeps an index until the file is closed
+# These faults leave the object tilted after a stop, and the soak then puts the object upright.
 _ASKEW = ("hand.angle", "tip.tilt")
-_DROPPED = 20.0  # s without a grip, after which an object that slipped away is put back
+_DROPPED = 20.0  # time without a grip after which an object that slipped away is put back [s]
 _HELD = 0.3  # minimum fraction of grasps that must reach a hold
-_MANY = 50  # number of grasps above which this is required
+_MANY = 50  # number of grasps above which _HELD is required
 _BEGUN = 1500  # maximum difference between the numbers of states received by any two listeners
 
 
@@ -64,17 +64,17 @@ class Account:
     done: Counter[str] = field(default_factory=Counter)  # accepted commands
     injected: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
-    held: int = 0  # grips that reached a hold
+    held: int = 0  # number of grips that reached a hold
     placed: int = 0  # number of times the object was put upright
-    # (received, lost) per subscriber
+    # Pairs (received, lost) for each subscriber.
     received: list[tuple[int, int]] = field(default_factory=list)
     recorded: tuple[int, int] = 0, 0  # states in the recorder's files, and lost states
     wrong: list[str] = field(default_factory=list)
-    # MB of private memory per process, at each check.
+    # Private memory of each process at each check [MB].
     memory: dict[str, list[float]] = field(default_factory=dict)
-    # Delay of each state's tick, in s.
+    # Delay of each state's tick [s].
     late: array[float] = field(default_factory=lambda: array("f"))
-    # (time [s], number of `late` values so far)
+    # Pairs of time [s] and number of `late` values so far.
     looked: list[tuple[float, int]] = field(default_factory=list)
 
     def growth(self) -> dict[str, float]:
@@ -161,7 +161,7 @@ def soak(seconds: float, seed: int = 1) -> Account:
                     request = _next(chance, mode)
                     if request is not None and rig.ask(request, 5.0)["ok"]:
                         account.done[str(request["command"])] += 1
-                    elif request is not None and mode == "armed":  # arming reopens a lost board
+                    elif request is not None and mode == "armed":  # Arming reopens a lost board.
                         rig.ask({"command": "disarm"}, 5.0)
                 if end_fault is not None and now > ends_at:
                     end_fault()
@@ -255,7 +255,7 @@ def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
         ]
         for each in subscribers:
             assert each.stdout is not None
-            each.stdout.readline()  # the subscriber has received a state
+            each.stdout.readline()  # The subscriber has received a state.
         while not file.exists() or not file.stat().st_size:
             rig.states()
         try:
@@ -312,7 +312,7 @@ def subscribe(address: str) -> None:
     with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()
         while not ending.is_met:
-            with suppress(NoStream):  # the daemon may have exited
+            with suppress(NoStream):  # The daemon may have exited.
                 next(states)
                 received += 1
                 if received == 1:

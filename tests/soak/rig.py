@@ -27,16 +27,16 @@ from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError
 from softfinger.tools.processes.emulate import emulator_process
 
-_PATIENCE = 300.0  # s, time-out for the start of a process, including kernel compilation
+_PATIENCE = 300.0  # time-out for the start of a process, including kernel compilation [s]
 _STATE_RATE = 250.0  # Hz
-# These settings affect only start-up, because a busy machine may delay the emulated hand's first
-# bytes.
+# These settings affect only the start-up, because a busy machine may delay the first bytes of the
+# emulated hand.
 _PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
-_POLL = 0.003  # s between polls of the stream
-_SLACK = 0.05  # s, tolerated delay of a process
-_RESOLUTION = 0.0016  # rad, one encoder count
+_POLL = 0.003  # time between polls of the stream [s]
+_SLACK = 0.05  # tolerated delay of a process [s]
+_RESOLUTION = 0.0016  # one encoder count [rad]
 _CURRENT_UNIT = 0.0027  # A
-_ROOM = 1 << 18  # bytes that the daemon may still allocate when its memory is limited
+_ROOM = 1 << 18  # number of bytes that the daemon may still allocate while its memory is limited
 
 
 class Rig:
@@ -163,7 +163,7 @@ class Rig:
         return found
 
 
-# Function that starts a fault and returns a function that ends it.
+# Function that starts a fault and returns a function that ends the fault.
 End = Callable[[], object]
 Inject = Callable[[Rig, random.Random], End]
 

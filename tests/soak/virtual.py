@@ -44,30 +44,32 @@ from softfinger.daemon.wire.schema import INPUT, TOPICS
 from softfinger.tools.recordings.record import RecordingWriter
 
 SEQUENCES, TICKS = 1000, 5000
-LONG = 1_000_000  # ticks; longer sequences count as long
+LONG = 1_000_000  # number of ticks above which a sequence counts as long
 HELD = 0.3  # fraction of the sequences that must reach a hold
 _GRIPPING = ("grasping", "holding", "rotating")
-_COMMAND_EVERY = 150  # average ticks between commands
-_DISTURBED_EVERY = 800  # average ticks between loads or faults
+_COMMAND_EVERY = 150  # average number of ticks between commands
+_DISTURBED_EVERY = 800  # average number of ticks between loads or faults
 _DISTURBED_FOR = 500
 _WILD = 0.1  # fraction of commands that are drawn regardless of the mode
-_LOOKS = 96  # memory checks in a long sequence
-_WARM = 2  # memory checks excluded as warm-up: ten minutes of eight hours
-_FLAT = 2.0  # MB, maximum memory growth after the warm-up
-_STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # Hz, in a long sequence
-_SPLIT = 16e6  # bytes per file of the long sequence's recording
+_LOOKS = 96  # number of memory checks in a long sequence
+_WARM = 2  # number of memory checks excluded as warm-up: ten minutes of eight hours
+_FLAT = 2.0  # maximum memory growth after the warm-up [MB]
+_STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # message rates in a long sequence [Hz]
+_SPLIT = 16e6  # file size limit for the recording of the long sequence [bytes]
 # With "deaf", written data are lost but readings arrive. With "jumped", the angle is off by 0.2
 # rad. With "numb", angle, velocity and current stay constant.
 SERVO_FAULTS = (
     *("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed"),
     *("jumped", "numb"),
 )
-_ENCODER = ("fast", "strayed", "jumped", "numb")  # the joint angle also contradicts the frames
-_UNHEARD = ("silent", "gone", "deaf")  # the servo does not receive torque off
-_WATCHDOG = 100  # ticks (0.2 s) until the servo watchdogs stop the motors
-_LOST = 20  # consecutive lost goals that suffice for detection
+# Faults in which the joint angle also contradicts the frames.
+_ENCODER = ("fast", "strayed", "jumped", "numb")
+_UNHEARD = ("silent", "gone", "deaf")  # faults in which the servo does not receive torque off
+_WATCHDOG = 100  # number of ticks until the servo watchdogs stop the motors (0.2 s)
+_LOST = 20  # number of consecutive lost goals that is sufficient for detection
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
-# Faults of a sensor or of a current measurement: range of values, and channel that may be named.
+# Faults of a sensor or of a current measurement, each with its range of values and the channel that
+# may be named.
 LIES = {
     "gain": ((0.5, 1.6), "sensor"),
     "shift-x": ((-4.0, 4.0), "sensor"),
@@ -78,14 +80,14 @@ LIES = {
     "current": ((0.4, 2.5), "current"),
 }
 LOADS = ("push", "twist")
-_TOO_LONG = 0.05  # s, maximum time for which a tip force may exceed its bound
-_TOO_MUCH = 1.3  # maximum ratio to the requested force without a reason for more
-_UNSURE = 1.2  # ratio to the maximum raised force, because tip forces differ under load
-_REMEMBERED = 5.0  # s, maximum time for which a grip stays raised after a load or measurement fault
-_RETARGETED = 0.5  # s, maximum time for which the previously requested force may persist
-_UNCOVERED = 1.0  # s, time after which a tip near the object's edge is ignored
+_TOO_LONG = 0.05  # maximum time for which a tip force may exceed its bound [s]
+_TOO_MUCH = 1.3  # maximum ratio to the requested force if nothing justifies a higher force
+_UNSURE = 1.2  # maximum ratio to the raised force, because tip forces differ under load
+_REMEMBERED = 5.0  # maximum time for which a grip stays raised after a load or fault [s]
+_RETARGETED = 0.5  # maximum time for which the previously requested force may persist [s]
+_UNCOVERED = 1.0  # time after which a tip near the object's edge is ignored [s]
 
-# Requirements; the checks of each one are counted.
+# Requirements. The checks of each requirement are counted.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
 OFF = "no torque after disarm or fault"
 WATCHDOG = "no torque 0.2 s after a stop that no servo hears"
@@ -170,8 +172,8 @@ class FaultyServos:
         self.finger = 0
         self.last_good = -math.inf
         self.torque = False
-        self.armed = False  # armed since the last event that disarms
-        self._last = 0.0  # angle reported by a numb joint [rad]
+        self.armed = False  # True if the hand was armed after the last event that disarms
+        self._last = 0.0  # last angle reported by a numb joint [rad]
         self._unheard = 0
 
     def connect(self) -> None:
@@ -270,7 +272,7 @@ class FaultySensor:
         self._given: Frame | None = None
         self._seen: Frame | None = None
         self.fault = ""
-        self.last_sent = 0.0  # arrival of the last valid frame of a fault-free sensor [s]
+        self.last_sent = 0.0  # arrival time of the last valid frame from a fault-free sensor [s]
 
     def open(self) -> None:
         self._sensor.open()
@@ -312,12 +314,12 @@ class Account:
     """Results of the sequences."""
 
     sequences: int = 0
-    held: int = 0  # sequences that reached a hold
+    held: int = 0  # number of sequences that reached a hold
     ticks: int = 0
     seconds: float = 0.0  # run time
     judged: Counter[str] = field(default_factory=Counter)
-    modes: Counter[str] = field(default_factory=Counter)  # ticks in each mode
-    faults: Counter[str] = field(default_factory=Counter)  # latched faults by name
+    modes: Counter[str] = field(default_factory=Counter)  # number of ticks in each mode
+    faults: Counter[str] = field(default_factory=Counter)  # number of latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
     # Channels named as faulty, with the actual fault.
     named: Counter[str] = field(default_factory=Counter)
@@ -326,7 +328,7 @@ class Account:
     failures: list[str] = field(default_factory=list)
     broken: Counter[str] = field(default_factory=Counter)  # violations in a long sequence, in ticks
     published: tuple[int, int] = 0, 0  # messages of a long sequence: published, lost
-    memory: list[float] = field(default_factory=list)  # resident memory after the warm-up, MB
+    memory: list[float] = field(default_factory=list)  # resident memory after the warm-up [MB]
 
     @property
     def growth(self) -> float:
@@ -410,9 +412,10 @@ class Soak:
         self._lie = ""  # kind of the current measurement fault
         self._false: set[str] = set()  # channels that have been faulty and may be named
         self._loaded = 0.0  # N along the faces
-        # s, most recent times of these conditions
+        # Most recent time of each of these conditions [s].
         self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
-        self._asked: list[tuple[float, float]] = []  # (time [s], force [N]); empty outside grips
+        # Pairs of time [s] and force [N], empty outside grips.
+        self._asked: list[tuple[float, float]] = []
         # Start of the current interval above the bound [s].
         self._above = {MOST: math.inf, CALM: math.inf}
 
@@ -490,7 +493,7 @@ class Soak:
         if name == "grasp" or (name == "hold" and ("force" in request or mode not in _GRIPPING)):
             force = request.get("force", self.settings.control.force_default)
             t = self.daemon.clock.now()
-            if not self._asked:  # a motion may have applied a higher force
+            if not self._asked:  # A motion may have applied a higher force.
                 self._asked.append((t, max(self.hand.force.tolist())))
             self._asked.append((t, force))
         elif name in ("arm", "move", "release", "stop", "disarm"):
@@ -652,7 +655,7 @@ class Soak:
         bound = _TOO_MUCH * asked
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
-        bound += 2.0 * friction  # for the compensation and for static friction
+        bound += 2.0 * friction  # Allow for the compensation and for static friction.
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)
@@ -763,7 +766,7 @@ def main() -> int:
     else:
         for seed in range(arguments.seed, arguments.seed + arguments.sequences):
             sequence(seed, arguments.ticks, account)
-            gc.collect()  # a daemon's reference cycles hold megabytes of frames
+            gc.collect()  # A daemon's reference cycles hold megabytes of frames.
     account.seconds = time.monotonic() - begin
     print("\n".join(account.lines()))
     few = account.held < HELD * account.sequences

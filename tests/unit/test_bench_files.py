@@ -91,12 +91,12 @@ def test_cells_above_the_saturation_pressure_of_the_header_are_excluded(
     press, tmp_path, unit, pascal, digits, told
 ):
     frames, full = clipped(press)
-    name = f" {unit}" if told else ""  # without a unit, the value has the unit of the readings
+    name = f" {unit}" if told else ""  # Without a unit, the value has the unit of the readings.
     line = f"SATURATION_PRESSURE {full / pascal:.6f}{name}"
     path = tmp_path / "a.asf"
     path.write_bytes(export(frames, unit, 1.0 / pascal, digits=digits, header=[line]))
     settings, within = SETTINGS, 3e-5
-    if digits == 0:  # rounding to whole kPa adds noise of a third of a kPa
+    if digits == 0:  # Rounding to whole kPa adds noise of a third of a kPa.
         tactile = SETTINGS.tactile.model_copy(update={"noise": 600.0})
         settings, within = SETTINGS.model_copy(update={"tactile": tactile}), 6e-5
     check(path, settings, within)
@@ -135,7 +135,7 @@ def test_round_readings_do_not_count_as_saturated(press, tmp_path, step):
     np.save(tmp_path / "a.npy", np.round(press / step).astype(np.uint16))
     assert not load_recording(tmp_path / "a.npy", step, 100.0).notes
     upright = SensorGrid(44, 44, PITCH).pressure(TIP, MATERIAL, 0.004)
-    np.save(tmp_path / "b.npy", upright)  # the four middle cells have the same reading
+    np.save(tmp_path / "b.npy", upright)  # The four middle cells have the same reading.
     assert not load_recording(tmp_path / "b.npy", SCALE, 100.0).notes
 
 

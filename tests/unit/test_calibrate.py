@@ -102,7 +102,7 @@ def bench(tmp_path_factory):
     step("centre", "--recording", *presses, "--theta", *map(str, tilts))
     d = np.linspace(-0.001, 0.006, 57)
     frames = np.concatenate([sensor.press(max(x, 0.0)) for x in d])
-    run = keep("run.npz", frames, d=d + 1e-4)  # the recorded d has a zero offset of 0.1 mm
+    run = keep("run.npz", frames, d=d + 1e-4)  # The recorded d has a zero offset of 0.1 mm.
     step("modulus", "--recording", run)
     return folder, sensor
 
@@ -165,7 +165,7 @@ def test_the_daemon_applies_the_file(bench, tmp_path):
         assert contact.tilt_y == pytest.approx(0.0, abs=0.01)
         assert contact.force == pytest.approx(math.pi * E * 0.003**2 / math.cos(0.15), rel=0.04)
         for perception in daemon.loop.perception.fingers:
-            perception.tare()  # the converter applies the new zero offset, which is in counts
+            perception.tare()  # The converter applies the new zero offset, which is in counts.
         daemon.loop.advance(0.3)
         assert daemon.loop.state.contacts[0].d == 0.0
 

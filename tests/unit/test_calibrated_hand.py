@@ -30,10 +30,10 @@ from softfinger.daemon.types import Frame, State
 from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
-LEFT = 0.25e6  # Pa, a constant modulus
+LEFT = 0.25e6  # constant modulus of the left tip [Pa]
 STRAIN = [0.0, 0.1, 0.2, 0.4, 0.6]
-STRESS = [0.0, 14e3, 31e3, 75e3, 130e3]  # Pa, material law of the right tip
-TRUE = 0.28e6  # Pa, modulus of the simulated tips
+STRESS = [0.0, 14e3, 31e3, 75e3, 130e3]  # stresses of the right tip's material law [Pa]
+TRUE = 0.28e6  # modulus of the simulated tips [Pa]
 
 
 @pytest.fixture
@@ -132,7 +132,7 @@ def test_the_material_of_each_tip_reaches_estimate_table_and_prediction(settings
 
 
 PASCAL_PER_COUNT = 150.0
-FULL = 255  # counts: 38 kPa, less than the contact's peak pressure of 46 kPa
+FULL = 255  # full count, 38 kPa, which is less than the contact's peak pressure of 46 kPa
 
 
 def counting(**tactile: object) -> Settings:

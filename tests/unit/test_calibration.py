@@ -47,7 +47,7 @@ def test_tare_is_the_mean_of_each_cell():
 
 def test_a_tare_under_load_is_refused():
     frames = 10.0 + RNG.standard_normal((20, 8, 8))
-    frames[:, 2:4, 3] *= 20.0  # the tare ignores two faulty cells
+    frames[:, 2:4, 3] *= 20.0  # The tare ignores two faulty cells.
     tare(frames)
     frames[10:, 4:6, 4:7] += 100.0
     with pytest.raises(CalibrationError, match="found changing readings in 8 cells"):
@@ -60,13 +60,14 @@ def test_a_tare_measures_noise_correlation_and_common_drift():
     plain = tare(50.0 + white)
     assert plain.correlation.size == 0
     assert plain.drift == 0.0
-    # The noise of each cell combines two sources, each shared with one neighbour.
+    # The noise of each cell combines two sources, each of which is shared with one neighbour.
     shared = 50.0 + (white[:, :, 1:] + white[:, :, :-1]) / math.sqrt(2.0)
-    shared[:, 3, 3] += 100.0 * rng.standard_normal(100)  # a faulty cell
+    shared[:, 3, 3] += 100.0 * rng.standard_normal(100)  # This cell is faulty.
     found = tare(shared + 0.7 * rng.standard_normal((100, 1, 1)))
     assert found.correlation.shape == (1, 2)
     np.testing.assert_allclose(found.correlation, [[1.0, 0.5]], atol=0.02)
-    assert found.drift == pytest.approx(0.7, rel=0.3)  # from 100 frames: 1 ± 0.07
+    # With 100 frames, the estimate has a relative scatter of 0.07.
+    assert found.drift == pytest.approx(0.7, rel=0.3)
 
 
 def test_equilibration_equalises_cells_and_finds_dead_ones():
@@ -84,12 +85,12 @@ def test_equilibration_equalises_cells_and_finds_dead_ones():
 
 @pytest.mark.parametrize("kind", ["power", "cubic"])
 def test_the_curve_is_recovered_from_known_weights(kind):
-    # The sensor's response is p = p(x); x is interpolated from the model's pressure.
+    # The sensor's response is p = p(x), where x is interpolated from the model's pressure.
     x = np.linspace(0, 1000, 4001)
     true = 0.9 * x**1.4 if kind == "power" else 60 * x + 0.08 * x**2 + 5e-5 * x**3
     depths = (0.001, 0.0015, 0.002, 0.003, 0.004)
     readings = [np.interp(GRID.pressure(TIP, LINEAR, d), true, x) for d in depths]
-    # The highest stiffness would exceed the table's range.
+    # The highest stiffness would exceed the range of the table.
     if kind == "power":
         readings = [(GRID.pressure(TIP, LINEAR, d) / 0.9) ** (1 / 1.4) for d in depths]
     found = fit_curve(kind, readings, [force(d) for d in depths], AREA, 4000.0)
@@ -112,7 +113,7 @@ def test_centre_and_rotation_are_recovered_from_tilted_loads(rotation):
     assert found.centre == pytest.approx(true.centre, abs=2e-5)
     assert found.rotation == pytest.approx(rotation, abs=5e-3)
     assert found.residual < 3e-5
-    assert 2e-5 < found.std < 2e-4  # the loads are upright to within half a degree
+    assert 2e-5 < found.std < 2e-4  # The loads are upright to within half a degree.
 
 
 def test_upright_loads_determine_the_centre_but_not_the_rotation():

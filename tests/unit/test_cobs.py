@@ -75,12 +75,12 @@ def test_frames_have_numbers_and_times_and_losses_are_counted():
     decoder = CobsDecoder(2, 3)
     counts = np.arange(6, dtype=np.uint16).reshape(2, 3) * 300
     first = decoder.feed(encode(counts, 65534, 4294.0), 1.0)
-    second = decoder.feed(encode(counts, 1, 4295.0), 2.0)  # the clock wraps at 4294.97 s
+    second = decoder.feed(encode(counts, 1, 4295.0), 2.0)  # The clock wraps around at 4294.97 s.
     assert np.array_equal(second.data, counts)
     assert second.steps == 3
     assert second.t_sensor == pytest.approx(first.t_sensor + 1.0)
     assert decoder.counters()["missed"] == 2
-    again = decoder.feed(encode(counts, 0, 0.0), 3.0)  # the board has restarted
+    again = decoder.feed(encode(counts, 0, 0.0), 3.0)  # The board has restarted.
     assert again.steps == 1
 
 
@@ -107,7 +107,7 @@ def test_every_single_bit_flip_is_detected():
         wrong = bytearray(good)
         wrong[bit // 8] ^= 1 << bit % 8
         decoder = CobsDecoder(4, 5)
-        # If the flip creates or removes the delimiter, there is no complete frame.
+        # If the flipped bit creates or removes a delimiter, there is no complete frame.
         assert decoder.feed(bytes(wrong) + b"\0", 0.0) is None
 
 
@@ -119,14 +119,14 @@ def test_the_sensor_clock_uses_the_minimum_delay_and_follows_drift_and_restarts(
         scan = 0.01 * k
         late = 0.003 * rng.random()
         misses.append(clock.arrival(scan * (1 - 5e-5) + 77.0, scan + late) - scan)
-    assert max(misses[200:]) < 3e-4  # the delays are up to 3 ms
+    assert max(misses[200:]) < 3e-4  # The delays are up to 3 ms.
     assert min(misses) > -1e-4
     assert clock.arrival(0.0, 30.0) == 30.0
 
 
 def test_the_longest_frame_consists_of_zeros():
     rng = np.random.default_rng(3)
-    # Half of the cells are zero, as without contact; the worst case contains only zero bytes.
+    # Half of the cells are zero, as without contact. The worst case contains only zero bytes.
     frames = [
         encode(np.maximum(rng.normal(0, 380, (44, 44)), 0).astype(np.uint16), k, 0.01 * k)
         for k in range(30)

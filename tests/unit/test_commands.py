@@ -99,7 +99,7 @@ def test_malformed_multipart_messages_and_disconnecting_clients_have_no_effect(
 ):
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
-    socket.send_multipart([b"", b"a", b"b", b"c"])  # clients never send this form
+    socket.send_multipart([b"", b"a", b"b", b"c"])  # Clients never send messages in this form.
     socket.send(msgpack.packb({"command": "arm"}))
     socket.close(linger=1000)
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
@@ -199,7 +199,7 @@ def test_a_proxy_may_be_used(context, addresses):
         ([*[b"hop"] * (bounds.PART_COUNT_MAX - 3), b"", ARM], bounds.PART_COUNT_MAX - 2, True),
         ([*[b"hop"] * (bounds.PART_COUNT_MAX - 2), b"", ARM], 0, False),
         ([b"x" * 700, b"x" * 400, b"", ARM], 0, False),
-        ([b"", ARM, ARM], 1, False),  # a REQ socket that sends two frames
+        ([b"", ARM, ARM], 1, False),  # A REQ socket sends two frames here.
         ([b"id", ARM], 0, False),
         ([ARM, b""], 0, False),
         ([b"part"] * 500, 0, False),
@@ -254,7 +254,8 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
         if stalled == "loop":
             on_the_link(served)
         elif stalled == "gateway":
-            # libzmq has received the request or is about to, so its waiting time is unknown.
+            # libzmq has received the request or is about to receive it, so its waiting time is
+            # unknown.
             until(lambda: served.service.commands.socket.poll(0))
         pass_time(clock, 0.5)
         # After the stall, libzmq's own thread may run later than the gateway's check.
@@ -292,7 +293,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         pass_time(clock, 0.5)
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
-        for _ in range(4):  # wait until the gap is over
+        for _ in range(4):  # Wait until the gap is over.
             pass_time(clock, bounds.REFUSAL_TIME / 2)
             served.serve(aged)
         if meanwhile == "signal":
@@ -300,7 +301,8 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         elif meanwhile:
             other = Asking(context, served, addresses[1], meanwhile)
             until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
-        until(lambda: served._is_open())  # long enough after a stop to tell requests apart
+        # Enough time has passed since the stop to tell requests apart.
+        until(lambda: served._is_open())
         count = len(aged.ages)
         asking.send(keyed())
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
@@ -457,7 +459,7 @@ class Flood:
 
 
 def test_a_stop_goes_before_all_waiting_requests(context, addresses):
-    clock = VirtualClock()  # waiting requests do not age while clients connect
+    clock = VirtualClock()  # Waiting requests do not age while clients connect.
     with Served(commands=addresses[1], clock=clock) as served:
         flood = Flood(context, addresses[1], clients=4, each=40)
         order: list[str] = []
@@ -468,7 +470,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             return {}
 
         until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
-        served.serve(note)  # the gateway is processing the flood
+        served.serve(note)  # The gateway is processing the flood.
         carried_out = len(order)
         assert carried_out > 0
         stopper = context.socket(zmq.DEALER)
@@ -482,7 +484,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             served.serve(note)
 
         until(lambda: [serve(), stopper.poll(0)][1])
-        # All requests before the stop receive a reply, and none of them is executed.
+        # All requests before the stop receive a reply, but none of them is executed.
         replies: list[dict[str, Any]] = []
         until(lambda: [serve(), flood.collect(replies) == 160][1])
         assert order[carried_out:] == ["stop"]
@@ -513,7 +515,8 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
         clock.sleep_until(clock.now() + 1.0)
         flood.sockets[0].send(msgpack.packb({"command": "move"}))
         last: list[dict[str, Any]] = []
-        answer = {"ok": True, "heard": "move"}  # follows the remaining requests of the flood
+        # This reply follows the remaining requests of the flood.
+        answer = {"ok": True, "heard": "move"}
         until(lambda: [served.serve(echo), flood.collect(last), answer in last][2])
 
 

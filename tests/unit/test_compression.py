@@ -27,9 +27,9 @@ from softfinger.tools.cli import main
 
 ROOT = Path(__file__).parents[2]
 E, A = 0.25e6, 0.020
-LATE, LOAD = 1.35e-3, 0.21  # m, N: zero offsets of the machine
+LATE, LOAD = 1.35e-3, 0.21  # zero offsets of the machine for d [m] and F [N]
 UNIT = Material.constant(1.0)
-Force = Callable[[float, float], float]  # N of d [m] and θ [rad]
+Force = Callable[[float, float], float]  # force [N] as a function of d [m] and θ [rad]
 WORDS = ["--config", "hil", "--no-plot"]
 
 
@@ -66,7 +66,7 @@ def test_modulus_and_zeros_agree_with_their_standard_deviations(above):
                        (zero - LOAD) / zero_std])  # fmt: skip
         assert fit.chi2 == pytest.approx(1.0, abs=0.3)
     assert fit.std < 0.006
-    # The mean of 40 squares of a standard normal is 1.0 ± 0.22.
+    # The mean of 40 squared standard normal values is 1.0 ± 0.22.
     assert np.mean(np.square(scores), axis=0) == pytest.approx(1.0, abs=0.7)
 
 
@@ -81,7 +81,7 @@ def test_correlated_noise_increases_the_standard_deviation():
         return float(np.mean(np.square(errors)))
 
     smooth = found(np.full(8, 8**-0.5))
-    assert 0.3 < smooth < 3.0  # if correlation is ignored, it is about 8
+    assert 0.3 < smooth < 3.0  # Without the correlation, this value would be about 8.
 
 
 def test_the_toe_region_is_excluded(monkeypatch):
@@ -122,7 +122,7 @@ def rubber(base: str) -> Force:
     with np.load(ROOT / "tests" / "golden" / "solid_frames.npz") as file:
         used = (file["base"] == base) & (file["theta"] == 0.0)
         d, push = file["d"][used], file["push"][used]
-    # The limit at d = 0 is Hertz contact.
+    # For d → 0, the limit is Hertz contact.
     curve = CubicSpline([0.0, *np.sqrt(d)], [4.0 / 3.0 / (1.0 - 0.49**2), *(push / d**1.5)])
     return lambda d, _: E * A**2 * float(curve(math.sqrt(d / A))) * (d / A) ** 1.5
 
@@ -171,7 +171,7 @@ def test_the_last_full_cycle_is_used():
 def test_a_hold_at_the_full_depth_is_excluded():
     d, force = pressed(springs, np.random.default_rng(5), 0.02)
     rng = np.random.default_rng(12)
-    hold = d.max() + 1e-5 * rng.standard_normal(200)  # noise of the encoder
+    hold = d.max() + 1e-5 * rng.standard_normal(200)  # Add noise of the encoder.
     relaxed = np.linspace(force.max(), 0.7 * force.max(), 200)
     peak = int(np.argmax(d)) + 1
     run = loading(np.insert(d, peak, hold), np.insert(force, peak, relaxed))
@@ -230,7 +230,7 @@ def machine(header: str, form: str, **more) -> list[str]:
 )
 def test_file_formats_of_testing_machines_are_read(tmp_path, capsys, header, form):
     rows = machine(header, form)
-    if ";" in header:  # a decimal comma
+    if ";" in header:  # The file has decimal commas.
         rows = [row.replace(".", ",") for row in rows]
     file = written(tmp_path / "a.csv", header, rows)
     out = tmp_path / "left.json"
@@ -292,7 +292,7 @@ def test_a_depth_dependent_modulus_is_stored_as_points(tmp_path, capsys):
     assert main(["calibrate", "law", str(out), *WORDS, "--compression", str(file)]) == 0
     step = load_calibration(out).modulus
     law = step.material()
-    # F at the stored points, by the integral over the strain.
+    # Compute F at the stored points by the integral over the strain.
     deep = 5e-3
     found = 2.0 * math.pi * (A - deep) ** 2
     found *= quad(lambda e: float(law.stress(e)) / (1.0 - e) ** 3, 0.0, deep / A)[0]

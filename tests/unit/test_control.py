@@ -19,7 +19,8 @@ PAPER: dict[str, dict[str, Any]] = {
     "simulation": {"tactile_delay": 0.040},
 }
 ANGLE = math.radians(10.0)
-# Remaining uncertainty after one grip's torque measurements, as a fraction of the grip force.
+# Uncertainty that remains after the torque measurements of one grip, as a fraction of the grip
+# force.
 KNOWN = 0.06
 
 
@@ -49,7 +50,7 @@ def settled(hand: SimulatedDaemon, angle: float) -> float:
 
 @pytest.mark.parametrize(
     ("sections", "plant", "known", "times"),
-    [  # s, settling times of the force and of turns in both directions
+    [  # settling times of the force and of turns in both directions [s]
         ({}, {}, KNOWN, (0.3, 0.4, 0.6)),
         (PAPER, {"object_mass": 0.07, "modulus_scale": 1.3}, 2.0 * KNOWN, (0.8, 0.6, 0.8)),
         (PAPER, {"object_mass": 0.13, "modulus_scale": 0.7}, 2.0 * KNOWN, (0.8, 0.6, 0.8)),
@@ -74,8 +75,8 @@ def test_grasps_and_turns_also_with_mass_and_modulus_off_by_30_percent(
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
 def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip_force(sections):
-    # A sideways push resembles a twist, and a sudden push of 2 N raises the grip. Successive pushes
-    # differ by up to 2 N.
+    # A sideways push resembles a twist, and a sudden push of 2 N raises the grip force. Successive
+    # pushes differ by up to 2 N.
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
         grasped(hand)
@@ -192,7 +193,7 @@ def test_a_known_load_raises_the_grip_within_its_bound():
         control = {"object_load": 12.0, "grip_raise_max": raised}
         with watched({"control": control}) as hand:
             seen = grasped(hand, force=8.0)
-            # Two tips carry 12 N at 80 % of μ = 0.6.
+            # Two tips carry 12 N, which is 80 % of the limit for μ = 0.6.
             assert hand.mode == "holding"
             assert seen.force[-200:].mean() == pytest.approx(expected, rel=KNOWN)
             assert any(
@@ -216,7 +217,7 @@ def test_each_force_increase_is_reported():
 
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
 def test_prediction_during_motion_is_within_its_own_uncertainty(sections):
-    tactile = sections.get("tactile", {}) | {"smooth_error": 0.0}  # with an ideal sensor
+    tactile = sections.get("tactile", {}) | {"smooth_error": 0.0}  # This sensor is ideal.
     with watched(sections | {"tactile": tactile}) as hand:
         hand.grasp(10.0)
         hand.run(1.5)
@@ -232,7 +233,7 @@ def test_prediction_during_motion_is_within_its_own_uncertainty(sections):
         share = np.sqrt(np.mean(np.square(off), axis=0))
         assert (share < 1.5).all(), share
         assert (share > 0.2).all(), share
-        # The frames lag behind the plant; the prediction does not.
+        # The frames lag behind the plant, but the prediction does not.
         old, new = np.abs(frames)[:150].mean(axis=0)
         assert new < 0.25 * old
         assert hand.state.object.width == pytest.approx(0.040, abs=1e-4)
@@ -308,7 +309,7 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
             "setpoint smoothing delays the angle by 0.06 s"
         )
         assert np.abs(np.array(forces) - 1.0).max() < 0.04 + KNOWN
-        for k in range(int(rate)):  # the setpoint fluctuates only slightly
+        for k in range(int(rate)):  # The setpoint fluctuates only slightly.
             hand.command("hold", force=10.0 + 0.05 * (k % 2), angle=1e-3 * (k % 2))
             hand.run(1.0 / rate)
         assert not [event for event in hand.events if event[0] != "info"]

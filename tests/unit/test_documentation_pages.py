@@ -29,7 +29,7 @@ def site() -> tuple[ModuleType, dict[str, str]]:
     texts = {name: make() for name, make in module.PAGES.items()}
     texts |= {path.name: path.read_text(encoding="utf-8") for path in ROOT.glob("docs/*.md")}
     row = validate.between("ζ", 1.46, 1.88, "a book", 2.0)
-    with pytest.MonkeyPatch.context() as patch:  # `test_figures` checks the rows
+    with pytest.MonkeyPatch.context() as patch:  # `test_figures` checks the rows.
         patch.setattr(validate, "comparisons", lambda: iter(30 * [row]))
         return module, {name: module.on_page_markdown(text) for name, text in texts.items()}
 
@@ -94,7 +94,7 @@ def test_every_erratum_is_listed(site):
     text = site[1]["model.md"].replace("\\|", "|")
     for page in pages().values():
         assert all(each.holds in text for each in page.errata)
-    assert "15.8197516322" in text  # F at 4 mm, 15°
+    assert "15.8197516322" in text  # This number is F at 4 mm and 15°.
 
 
 def test_model_values_on_pages_are_computed(site):

@@ -28,8 +28,8 @@ def client(**options: Any) -> BusClient:
     [
         (reg.MODEL_NUMBER, 1, 2, framing.ACCESS),
         (reg.PRESENT_POSITION, 1, 4, framing.ACCESS),
-        (14, 1, 1, framing.ACCESS),  # register does not exist
-        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # address inside a register
+        (14, 1, 1, framing.ACCESS),  # The register does not exist.
+        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # This address is inside a register.
         (reg.GOAL_POSITION, 1, 2, framing.DATA_LENGTH),
         (reg.TORQUE_ENABLE, 2, 1, framing.DATA_RANGE),
         (reg.BAUD_RATE, 8, 1, framing.DATA_RANGE),
@@ -45,7 +45,7 @@ def client(**options: Any) -> BusClient:
         (reg.GOAL_CURRENT, 1194, 2, framing.DATA_RANGE),
         (reg.MIN_POSITION_LIMIT, 4095, 4, framing.OK),
         (reg.LED, 1, 1, framing.OK),
-        (660, 7, 1, framing.OK),  # indirect data of the second block
+        (660, 7, 1, framing.OK),  # These are indirect data of the second block.
         (661, 0, 2, framing.ACCESS),  # past the end
     ],
 )
@@ -78,7 +78,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     ("instruction", "parameters"),
     [
         (0x77, b""),
-        (0x05, b""),  # no write is registered
+        (0x05, b""),  # No write is registered.
         (0x20, b"\x01CTRL"),  # control table backup
     ],
 )
@@ -107,7 +107,7 @@ def test_a_registered_write_waits_for_the_action() -> None:
 def test_a_shadow_id_is_executed_without_a_reply() -> None:
     c = client()
     assert c.write(reg.SHADOW_ID, 2, 1) == 0
-    assert c.write(reg.LED, 1, 1, packet_id=2) == 0  # addressed to servo 2
+    assert c.write(reg.LED, 1, 1, packet_id=2) == 0  # The packet is addressed to servo 2.
     assert [servo.table.get(reg.LED) for servo in c.bus.servos] == [1, 1]
 
 
@@ -123,11 +123,11 @@ def test_protocol_1_if_configured() -> None:
     c = client()
     c.bus.servos[0].table.set(reg.PROTOCOL_TYPE, 1)
     assert c.send(1, framing.PING) == b""
-    # Example from the e-Manual's page on Protocol 1.0.
+    # This example is from the e-Manual's page on Protocol 1.0.
     asked, answered = bytes.fromhex("FFFF010201FB"), bytes.fromhex("FFFF010200FC")
     assert c.bus.feed(asked, c.t) == answered
     assert c.bus.feed(bytes.fromhex("FFFF020201FA"), c.t) == b""
-    assert c.bus.feed(bytes.fromhex("FFFF010201FA"), c.t) == b""  # a wrong checksum
+    assert c.bus.feed(bytes.fromhex("FFFF010201FA"), c.t) == b""  # The checksum is wrong.
 
 
 # Registers that affect how a goal is followed.
@@ -147,7 +147,7 @@ def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
 @pytest.mark.parametrize(
     ("address", "value", "size", "share"),
     [
-        (reg.POSITION_P_GAIN, 80, 2, 0.6),  # a tenth of the factory setting
+        (reg.POSITION_P_GAIN, 80, 2, 0.6),  # The gain is a tenth of the factory setting.
         (reg.POSITION_D_GAIN, 16_000, 2, 0.6),
         (reg.GOAL_PWM, 6, 2, 0.6),
         (reg.PWM_LIMIT, 6, 2, 0.6),
@@ -167,7 +167,7 @@ def test_without_position_gain_or_pwm_the_joint_does_not_move() -> None:
 def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     profile = (reg.PROFILE_VELOCITY, 200, 4)
     limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
-    # 20 · 0.229 rpm for 0.1 s in counts, minus the joint's lag
+    # The limit is 20 · 0.229 rpm for 0.1 s in counts, minus the lag of the joint.
     assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
     c = client()
     for address, value, size in (
@@ -192,7 +192,7 @@ def test_indirect_data_is_redirected_to_its_address(model: str, firmware: int) -
     assert c.write(data, 1, 1) == 0
     assert c.bus.servos[0].table.get(reg.LED) == 1
     assert c.ask(framing.READ, struct.pack("<HH", data, 5)) == (0, bytes.fromhex("01 A6000000"))
-    assert c.write(data + 1, 5, 4) == framing.ACCESS  # present position is read-only
+    assert c.write(data + 1, 5, 4) == framing.ACCESS  # The present position is read-only.
     # Indirect addresses must not refer to EEPROM.
     assert c.write(address, 20, 2) == framing.DATA_RANGE
 
@@ -208,7 +208,7 @@ def test_velocity_mode_keeps_its_velocity() -> None:
 
 def test_a_velocity_based_profile_takes_the_expected_time() -> None:
     c = client()
-    c.write(reg.PROFILE_VELOCITY, 50, 4)  # 1024 counts take 1.31 s at 11.45 rpm
+    c.write(reg.PROFILE_VELOCITY, 50, 4)  # At 11.45 rpm, 1024 counts take 1.31 s.
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.write(reg.GOAL_POSITION, 1024, 4)
     c.later(0.65)
@@ -287,7 +287,7 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     c.write(reg.BUS_WATCHDOG, 5, 1)
     c.write(reg.GOAL_CURRENT, 40, 2)
     c.write(reg.GOAL_POSITION, 4000, 4)
-    for _ in range(20):  # regular packets prevent a trip
+    for _ in range(20):  # Regular packets prevent a trip of the watchdog.
         c.later(0.09)
         assert c.read(reg.BUS_WATCHDOG, 1) == 5
     assert c.bus.plant.dq[0] > 0.0
@@ -302,7 +302,7 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     assert c.write(reg.BUS_WATCHDOG, 0, 1) == 0
     assert c.write(reg.GOAL_POSITION, stood + 10, 4) == 0
     assert c.write(reg.TORQUE_ENABLE, 0, 1) == 0
-    c.write(reg.BUS_WATCHDOG, 1, 1)  # the watchdog is inactive while torque is off
+    c.write(reg.BUS_WATCHDOG, 1, 1)  # The watchdog is inactive while torque is off.
     c.later(5.0)
     assert c.read(reg.BUS_WATCHDOG, 1) == 1
 
@@ -311,7 +311,7 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     ("fault", "bit"), [("overheat=1", 2), ("overload=1", 5), ("undervoltage=1", 0)]
 )
 def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> None:
-    c = client(model="XL330-M288")  # this model's shutdown mask includes all three errors
+    c = client(model="XL330-M288")  # This model's shutdown mask includes all three errors.
     c.write(reg.TORQUE_ENABLE, 1, 1)
     put_fault(c.bus, fault, c.t)
     c.later(0.02)
@@ -329,7 +329,7 @@ def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> 
 
 
 def test_an_error_outside_the_shutdown_mask_only_sets_the_alert() -> None:
-    c = client()  # XM430: mask 52 excludes the voltage bit
+    c = client()  # The XM430's mask of 52 excludes the voltage bit.
     c.write(reg.TORQUE_ENABLE, 1, 1)
     put_fault(c.bus, "undervoltage=1", c.t)
     c.later(0.02)

@@ -25,13 +25,14 @@ def test_a_grip_outside_the_map_gets_a_warning_with_the_reason():
     text = Envelope(settings(0.002)).warning(10.0)
     assert "2 mm (object.width) at friction 0.6 (control.tip_friction) and 0 kg" in text
     assert "the hand cannot grip it" in text
-    # 1 kg at friction 0.2 with 10 N raised to 20 N; a smaller maximum increase allows less load.
+    # 1 kg at a friction of 0.2, with 10 N raised to 20 N. A smaller maximum increase allows less
+    # load.
     for load, force, more in ((9.5, 10.0, 10.0), (7.3, 5.0, 10.0), (5.0, 10.0, 0.0)):
         control = {"tip_friction": 0.25, "object_load": load, "grip_raise_max": more}
         assert "slips out" in Envelope(settings(0.040, **control)).warning(force)
     held = settings(0.040, tip_friction=0.25, object_load=4.8)
     assert Envelope(held).warning(10.0) == ""
-    # The map does not apply to another hand or control law.
+    # The map does not apply to another hand or to another control law.
     assert Envelope(settings(0.002, law="upright")).warning(10.0) == ""
     other = Settings.model_validate({"tip": {"radius": 0.015}, "object": {"width": 0.002}})
     assert Envelope(other).warning(10.0) == ""

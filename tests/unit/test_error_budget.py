@@ -22,7 +22,7 @@ from tests.harness.paper_tip import LINEAR, NOISE, PITCH, TIP, tilts
 
 PLACE = (2e-4, -5e-4)
 GRID = SensorGrid(44, 44, PITCH, PLACE)
-LENGTH = 1.5  # cells, correlation length of the noise
+LENGTH = 1.5  # correlation length of the noise, in cells
 LAGS = np.arange(8.0)
 CORRELATION = np.exp(-(LAGS[:, None] ** 2 + LAGS**2) / (2.0 * LENGTH**2))
 SMOOTH = np.exp(-((np.arange(58) - np.arange(7, 51)[:, None]) ** 2) / LENGTH**2)
@@ -46,7 +46,7 @@ def test_correlated_noise_increases_the_covariance(physics, d, theta):
     tip, truth = Fingertip(0.020, physics), (d, theta, -0.5 * theta)
     frame, rng = GRID.pressure(tip, LINEAR, *truth), np.random.default_rng(12)
     frames = [frame + correlated_noise(rng) for _ in range(400)]
-    n = 4 if tip == TIP else 3  # the fourth value is the gain
+    n = 4 if tip == TIP else 3  # The fourth value is the gain.
 
     def nees(known: Uncertainty | None) -> tuple[float, float]:
         estimator, squares = ContactEstimator(tip, LINEAR, GRID, NOISE, known=known), []
@@ -57,7 +57,7 @@ def test_correlated_noise_increases_the_covariance(physics, d, theta):
         return float(np.mean(squares)), len(squares) / len(frames)
 
     score, valid = nees(KNOWN)
-    assert 0.8 < score < 1.3  # 400 frames with three or four values each: ± 0.04
+    assert 0.8 < score < 1.3  # 400 frames with three or four values each give a scatter of ± 0.04.
     assert valid > 0.9
     assert tip != TIP or nees(None)[0] > 5.0
 
@@ -129,7 +129,7 @@ def misplaced(by):
     return lambda tip, d, x, y, sign: pressed(tip, d, x, y, replace(FLAT, **by(sign)))
 
 
-# Defects of real cells that the sensor model omits, with the uncertainty to declare for each.
+# Defects of real cells that the sensor model omits, each with the uncertainty to declare.
 IMPERFECTIONS = {
     "unloading": (Uncertainty(gain=0.1, smooth=0.04), unloading),
     "crosstalk": (Uncertainty(gain=0.02, smooth=0.01), crosstalk),
@@ -155,7 +155,8 @@ IMPERFECTIONS = {
 }
 
 
-HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")  # or flagged as invalid
+# Harmless defects, or defects that are flagged as invalid.
+HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")
 
 
 def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
@@ -174,7 +175,7 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
                     if e.contact and e.valid and not e.misfit:
                         error = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
                         squares.append(error @ np.linalg.solve(e.covariance[:3, :3], error) / 3.0)
-        if len(squares) > 16:  # at other depths most frames are flagged
+        if len(squares) > 16:  # At other depths, most frames are flagged.
             worst = max(worst, float(np.mean(squares)))
     return worst
 
@@ -184,8 +185,8 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
 def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]
     tip = Fingertip(0.020, physics)
-    # 32 frames of three values per depth: ± 0.14. A solid tip's tilt includes the error of its
-    # data, but these frames are made from the same data.
+    # 32 frames of three values per depth give a scatter of ± 0.14. A solid tip's tilt includes the
+    # error of its data, but these frames are made from the same data.
     least, most = (0.6, 1.5) if physics == "springs" else (0.2, 1.5)
     # With springs, an offset of 0.5 mm changes d by more than the differences between neighbouring
     # cells reveal.
@@ -196,7 +197,7 @@ def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
         assert worst_nees(Uncertainty(), tip, imperfect) > 5.0
 
 
-# Each defect that a profile can declare is present, with its own magnitude, in one hand.
+# One hand has all defects that a profile can declare, each with its own magnitude.
 SECTIONS = {
     "sim": {},
     "velostat": load(Path("velostat")).model_dump(exclude_unset=True),
@@ -281,14 +282,14 @@ def test_errors_match_the_covariance_with_all_declared_imperfections(profile, ph
             slopes = c.force_theta * np.array([e.tilt_x, e.tilt_y]) / total
             slopes = np.array([c.force_d, *slopes])
             variance = slopes @ covariance @ slopes
-            # With springs, the force also depends on the modulus; a solid tip's frames show the
-            # product of both.
+            # With springs, the force also depends on the modulus. The frames of a solid tip show
+            # the product of both.
             variance += (known.modulus * c.force) ** 2 if physics == "springs" else 0.0
             true_force = modulus_factor * float(table(d, tilt).force)
             forces.append(abs(c.force - true_force) < 1.96 * math.sqrt(variance))
             inside.append(np.abs(error) < 1.96 * np.sqrt(covariance.diagonal()))
     assert len(squares) > 0.6 * frames
-    # Errors that are common to a hand's frames are drawn 60 times; other draws give 0.63 to 1.1.
+    # Errors that are common to a hand's frames are drawn 60 times. Other draws give 0.63 to 1.1.
     assert (0.55 if physics == "springs" else 0.35) < np.mean(squares) < 1.3
     assert (np.mean(inside, axis=0) > 0.9).all()
     assert np.mean(forces) > 0.9

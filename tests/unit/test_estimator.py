@@ -28,8 +28,8 @@ from tests.harness.paper_tip import (
 @pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
 @pytest.mark.parametrize("free_gain", [True, False])
 def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain):
-    # Azimuths and tip positions relative to the cells are random. The bias is compared with noise
-    # of 0.2 %.
+    # The azimuths, and the tip positions relative to the cells, are random. The bias is compared
+    # with a noise of 0.2 %.
     rng = np.random.default_rng(7)
     noise = 0.002 * material.reference_modulus
     for _ in range(60):
@@ -42,7 +42,7 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
         assert e.valid
         n = 4 if free_gain else 3
         sigma = np.sqrt(np.diag(e.covariance))[:n]
-        assert np.all(np.abs(errors(e, truth)[:n]) < 0.4 * sigma)  # 0.34 at other positions
+        assert np.all(np.abs(errors(e, truth)[:n]) < 0.4 * sigma)  # Other positions give 0.34.
         assert abs(e.d - d) < 2e-3 * d
 
 
@@ -51,7 +51,8 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
     ("d", "degrees", "share"), [(0.008, 25.0, 0.35), (0.008, 30.0, 1.0), (0.008, 33.5, 5.0)]
 )
 def test_the_bias_is_small_where_the_footprint_nearly_reaches_the_rim(d, degrees, share, free_gain):
-    # Here the outermost cells average 1/√(a² − x² − y²), which has a singularity at the rim.
+    # In this case, the outermost cells average 1/√(a² − x² − y²), which has a singularity at the
+    # rim.
     rng = np.random.default_rng(1)
     noise = 0.002 * E
     for _ in range(25):
@@ -86,7 +87,7 @@ def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percen
     truth = (d, *tilts(math.radians(degrees), azimuth), 1.0)
     bound = fisher(grid, material, truth, noise, free_gain)
     clean = grid.pressure(TIP, material, *truth[:3])
-    if blur:  # avoid the estimator's own forward model
+    if blur:  # Avoid the estimator's own forward model.
         clean = dense(grid, material, truth[:3])
     estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
     rng = np.random.default_rng(3)
@@ -101,15 +102,16 @@ def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percen
         miss[k] = errors(e, truth)[:n]
         nees[k] = miss[k] @ np.linalg.solve(e.covariance[:n, :n], miss[k])
     ratio = np.sqrt((miss**2).mean(axis=0) / np.diag(bound))
-    # With 800 frames the ratio scatters by 2.5 %; 1.12 allows 4.5 times that.
+    # With 800 frames, the ratio scatters by 2.5 %. The limit of 1.12 allows 4.5 times this scatter.
     assert np.all(ratio < 1.12), ratio
     assert np.all(ratio > 0.85), ratio
     # The tolerance is four standard deviations of the mean, plus a bias of a quarter of one frame's
-    # deviation.
+    # standard deviation.
     assert np.all(
         np.abs(miss.mean(axis=0)) < (4.0 / math.sqrt(frames) + 0.25) * np.sqrt(np.diag(bound))
     )
-    # χ² with 800 n degrees of freedom, four standard deviations, and 5 % of model error.
+    # The tolerance is four standard deviations of χ² with 800 n degrees of freedom, plus a model
+    # error of 5 %.
     assert abs(nees.mean() / n - 1.0) < 4.0 * math.sqrt(2.0 / (frames * n)) + 0.05
     # The reported covariance equals the bound.
     np.testing.assert_allclose(
@@ -186,7 +188,7 @@ def test_update_reuses_one_result_and_skips_a_repeated_frame():
     newer = estimator.update(GRID.pressure(TIP, LINEAR, 0.005), seq=5)
     assert newer is first
     assert newer.d == pytest.approx(0.005, rel=1e-4)
-    # A direct call neither reads nor changes the state that `update` keeps.
+    # A direct call neither reads nor changes the state of `update`.
     covariance = newer.covariance.copy()
     alone = estimator(GRID.pressure(TIP, LINEAR, 0.002))
     assert alone.d == pytest.approx(0.002, rel=1e-4)
@@ -212,7 +214,7 @@ def test_the_frame_path_allocates_almost_nothing():
     finally:
         tracemalloc.stop()
     assert now - before < 1024
-    assert peak - before < 8192  # a frame has 15 kB
+    assert peak - before < 8192  # A frame has 15 kB.
 
 
 def test_all_frame_types_and_layouts_give_the_same_estimate():
@@ -307,7 +309,7 @@ def test_a_footprint_cut_off_by_the_sensor_edge_is_estimated():
 
 @pytest.mark.parametrize("degrees", [36.0, 40.0, 50.0])
 def test_the_tilt_is_estimated_at_and_beyond_the_limit(degrees):
-    # At d = 8 mm the limit is 36.87°; larger tilts must be reported as such.
+    # At d = 8 mm, the limit is 36.87°. Larger tilts must be reported as such.
     estimator = ContactEstimator(TIP, MEASURED, GRID, 300.0, free_gain=False)
     e = estimator(GRID.pressure(TIP, MEASURED, 0.008, math.radians(degrees)))
     assert e.valid

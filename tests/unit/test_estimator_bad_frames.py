@@ -26,7 +26,7 @@ def test_saturated_cells_are_excluded():
     assert abs(aware.d - 0.006) < 4.0 * aware.d_std
     assert aware.d_std > plain.d_std
     assert aware.cells < plain.cells
-    # The full scale of an 8-bit board is known from its type.
+    # The full scale of an 8-bit board is known from the type of its frames.
     counts = np.minimum(np.round(clean / 300.0), 255).astype(np.uint8)
     assert counts.max() == 255
     board = ContactEstimator(TIP, LINEAR, GRID, 100.0)(counts, 300.0)
@@ -46,7 +46,8 @@ def test_dead_cells_are_masked_regardless_of_their_readings():
         e = estimator.update(frame)
         assert e.valid
         score.append(errors(e, truth) / np.sqrt(np.diag(e.covariance)))
-    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)  # 300 frames: 1 ± 0.04
+    # With 300 frames, the ratio is 1 ± 0.04.
+    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)
 
 
 EMPTY = np.zeros((44, 44))

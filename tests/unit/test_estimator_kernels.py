@@ -44,7 +44,7 @@ def test_activity_matches_plain_numpy():
     rng = np.random.default_rng(12)
     weights = np.outer([1, 2, 2, 2, 1], [1, 2, 2, 2, 1]).astype(float)
     weights[2, 2] = 0.0
-    # Columns 2 … 21 and rows 2 … 17 are within reach.
+    # Columns 2 to 21 and rows 2 to 17 are within reach.
     active = np.zeros((20, 24), bool)
     active[2:18, 2:22] = True
     state = EstimatorState()
@@ -123,14 +123,14 @@ def test_noise_is_estimated_from_cells_without_contact(ratio):
     readings = noise * np.random.default_rng(1).standard_normal(2_000_000)
     readings[readings < floor] = 0.0
     assert free_noise(float(np.mean(readings**2)), floor) == pytest.approx(noise, rel=0.03)
-    # If all readings are at the floor, the noise is well below it.
+    # If all readings are at the floor, the noise is well below the floor.
     assert free_noise(0.0, floor) == pytest.approx(floor / 3.2, rel=0.02)
 
 
 @pytest.mark.parametrize("free_gain", [True, False])
 @pytest.mark.parametrize(("d", "percent"), [(0.001, 0.1), (0.001, 0.5), (0.002, 1.0), (0.004, 2.0)])
 def test_a_threshold_of_three_8_bit_counts_leaves_d_unbiased(d, percent, free_gain):
-    # Full scale is 204 kPa; the maximum pressure of the envelope is 188 kPa.
+    # The full scale is 204 kPa. The maximum pressure of the envelope is 188 kPa.
     scale, noise = 800.0, percent / 100.0 * E
     rng = np.random.default_rng(9)
     frames, ratios, deviations = 60, [], []
@@ -210,7 +210,7 @@ def test_a_misfit_is_flagged_and_valid_frames_are_not():
             e = estimator.update(frame)
             assert e.contact
             assert e.misfit is expected
-            # This smooth pressure hides 38 % of d, unlike cells with unequal gains.
+            # Unlike cells with unequal gains, this smooth pressure hides 38 % of d.
             assert e.valid is not expected
     unequal = good * rng.normal(1.0, 0.1, grid.shape)
     e = estimator(unequal)

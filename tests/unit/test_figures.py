@@ -67,8 +67,8 @@ def test_checkpoints_of_force_and_energy_versus_displacement(folder, d, theta, f
 
 
 def test_double_integrals_equal_the_one_dimensional_form() -> None:
-    # A different evaluation of eqs. 3 and 10: y analytically, x by Gauss quadrature in t, with a
-    # tilt close to the limit of 36.87°.
+    # This is a different evaluation of eqs. 3 and 10. It integrates over y analytically and over x
+    # by Gauss quadrature in t, with a tilt close to the limit of 36.87°.
     a, d, theta, modulus = 0.02, 0.008, np.radians(34.0), 0.304e6
     points, weights = np.polynomial.legendre.leggauss(200)
     t = points * np.pi / 2
@@ -161,7 +161,8 @@ def test_with_shear_the_minimum_is_before_upright(folder: Path) -> None:
     assert felt["least U [deg]"] == pytest.approx(
         minima["least U [deg]"][minima["share [%]"] == 5.0], abs=0.01
     )
-    # The plant's equilibrium includes the rim's springs, which are sheared from the first contact.
+    # The plant's equilibrium includes the springs at the rim, which are sheared from the first
+    # contact.
     balance = felt["least N cos theta + T sin theta [deg]"]
     assert (balance < minima["least F on the base [deg]"][minima["share [%]"] == 5.0]).all()
     model, plant = read(folder / "fig10_shear.csv"), read(folder / "fig10_shear_plant.csv")
@@ -180,7 +181,7 @@ def test_table_i_values(folder: Path) -> None:
     printed = (0.135, 0.149, 0.182, 0.201, 0.207, 0.255, 0.304)
     assert [float(each) for each in papers] == pytest.approx(printed)
     assert [float(each) for each in laws[:-1]] == pytest.approx(printed[:-1], rel=1e-12)
-    assert strains[-1] == laws[-1] == ""  # the strain exceeds the law's range
+    assert strains[-1] == laws[-1] == ""  # The strain exceeds the range of the law.
     curve = read(folder / "fig3.csv")
     slope = np.gradient(curve["stress [MPa]"], curve["strain [%]"] / 100.0)
     np.testing.assert_allclose(slope[1:-1], curve["modulus [MPa]"][1:-1], rtol=2e-3)
@@ -197,9 +198,9 @@ def test_compression_with_the_sensor_model(folder: Path) -> None:
         law = columns[f"F of Table I's law at {tilt} deg [N]"]
         expected = np.pi * 0.304 * d**2 / np.cos(np.radians(tilt))
         np.testing.assert_allclose(model, expected, rtol=1e-12)
-        # The cells' quadrature is less accurate; the paper's sensor has three digits.
+        # The quadrature over the cells is less accurate. The paper's sensor has three digits.
         np.testing.assert_allclose(sensed, model, rtol=1e-4)
-        # The bounds are the forces for the minimum and maximum modulus below full compression.
+        # The bounds are the forces for the minimum and the maximum modulus below full compression.
         assert np.all(law[1:] > 0.135 / 0.304 * model[1:])
         assert np.all(law[1:] < 0.255 / 0.304 * model[1:])
 
@@ -219,7 +220,7 @@ def test_path_of_rotation_and_rolling(folder: Path) -> None:
         assert np.all(law[theta != 0.0] > ratio[theta != 0.0])
         # Springs that point to the tip's centre give no minimum.
         assert np.ptp(rolling[f"F of radial springs at d = {d} mm [N]"]) == 0.0
-        # The rotation ends at the state where the rolling begins.
+        # The rotation ends in the state in which the rolling begins.
         last = rotation[f"F, d up to {d} mm [N]"][-1]
         assert last == pytest.approx(rolling[f"F at d = {d} mm [N]"][0], rel=1e-12)
         assert rotation[f"d up to {d} mm [mm]"][0] == 0.0
@@ -229,7 +230,8 @@ def test_path_of_rotation_and_rolling(folder: Path) -> None:
 @pytest.mark.parametrize("of", [experiment_pages.printed_terms, experiment_pages.integrated_terms])
 def test_checkpoints_of_the_appendix(of: Callable[..., experiment_pages.Terms]) -> None:
     a, d = 20.0, np.array(4.0)  # mm
-    expected = (31.939525311496, 1.7671458676443, 0.098174770424681)  # eqs. 16, 18 and 19
+    # These are eqs. 16, 18 and 19.
+    expected = (31.939525311496, 1.7671458676443, 0.098174770424681)
     np.testing.assert_allclose(of(a, d), expected, rtol=1e-13)
     assert experiment_pages.limits(a, d)[1] == pytest.approx(0.92729521800161, rel=1e-14)  # eq. 17
     assert of(a, d).energy(a, 0.304, d) == pytest.approx(20.374275556081, rel=1e-12)
@@ -256,7 +258,7 @@ def test_every_plot_is_complete_and_lists_its_errata(drawn: tuple[Path, list[Fig
                 assert (name, erratum.holds) in errata
             # The label contains a unit.
             assert all("[" in axes.get_xlabel() for axes in figure.axes[-1:])
-            # All text lies inside the sheet.
+            # All text is inside the sheet.
             box = figure.get_tightbbox()
             assert min(box.x0, box.y0) > -0.02
             assert max(box.x1 - page.size[0], box.y1 - page.size[1]) < 0.02
@@ -284,7 +286,7 @@ def test_without_matplotlib_only_the_values_are_written(tmp_path, capsys, monkey
 @pytest.fixture(scope="module")
 def rows() -> dict[str, PublishedValue]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(validate, "_TRIALS", 1)  # one trial takes a second
+        patch.setattr(validate, "_TRIALS", 1)  # One trial takes a second.
         return {each.quantity: each for each in validate.comparisons()}
 
 

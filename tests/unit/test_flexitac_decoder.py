@@ -14,7 +14,7 @@ CELLS = ROWS * COLS
 STRIDE = CELLS + 2
 
 payloads = st.binary(min_size=CELLS, max_size=CELLS)
-# Images that often contain the marker, also split over a frame's first or last byte.
+# Images that often contain the marker, which may also be split over a frame's first or last byte.
 nasty = st.lists(
     st.sampled_from([b"\xaa", b"\x55", b"\xaa\x55", b"\x00", b"\x01"]), min_size=CELLS
 ).map(lambda parts: b"".join(parts)[:CELLS])
@@ -80,7 +80,7 @@ def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
         decoded = decoder.feed(frame(images[k]), 0.01 * k)
         assert decoded.data[0, 0] == k
         assert decoded.t == 0.01 * k
-    # Two pieces arrive within the frame time, then two pieces with a gap in between.
+    # Two pieces arrive within the frame time, followed by two pieces with a gap in between.
     assert decoder.feed(frame(images[5])[:7], 0.05) is None
     assert decoder.feed(frame(images[5])[7:], 0.052) is not None
     assert decoder.feed(frame(images[6])[:7], 0.06) is None
@@ -92,7 +92,7 @@ def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
     decoded = decoder.feed(frame(images[7]), 0.09)
     assert decoded.data[0, 0] == 7
     assert decoder.counters()["frames"] == 9
-    # Without gaps on the line, the following bytes confirm the frame.
+    # Without gaps on the line, the bytes that follow confirm the frame.
     assert decoder.feed(frame(images[8]), 0.0903) is None
     assert decoder.feed(MARKER, 0.0904) is not None
 
@@ -111,7 +111,7 @@ def test_trailing_bytes_after_a_frame_are_reported():
     one = frame(bytes(CELLS))
     decoder.feed(one * 2 + MARKER, 1.0)
     assert decoder.feed(one[2:] + one[:5], 2.0).behind == 5
-    late = decoder.feed(one[5:] + one, 3.0)  # the second frame may still be incomplete
+    late = decoder.feed(one[5:] + one, 3.0)  # The second frame may still be incomplete.
     assert late.behind == len(one)
 
 
@@ -147,7 +147,7 @@ def test_frames_do_not_depend_on_how_the_stream_is_split(images, start, cuts):
 )
 def test_no_wrong_frame_for_any_images(images, start):
     """From any starting point in images full of AA 55, only sent frames are decoded, in order."""
-    # Append two frames without a common AA 55, so that a constant image cannot stay ambiguous.
+    # Append two frames without a common AA 55, so that a constant image cannot remain ambiguous.
     images = [*images, *numbered(2)]
     stream = b"".join(frame(image) for image in images)[start:]
     found = decode(FlexiTacDecoder(ROWS, COLS), [stream, MARKER])
@@ -163,7 +163,7 @@ def test_a_constant_image_that_contains_the_marker_is_ambiguous():
     assert decode(decoder, [stream[5:]]) == []
     assert decoder.counters()["ambiguous"] > 0
     assert "several times" in decoder.diagnosis()
-    # Once the image changes, only one position remains possible.
+    # Once the image changes, only one position is possible.
     found = decode(decoder, [frame(image) for image in numbered(3)])
     assert found[-1] == numbered(3)[1]
 
@@ -182,10 +182,11 @@ def test_a_quiet_line_does_not_confirm_a_frame_that_could_be_incomplete():
     decode(decoder, [frame(image) for image in numbered(3)])
     assert decoder.settle() is not None
     torn = frame(bytes(CELLS))[:-1]
-    decoder.feed(torn + MARKER[:1], 0.0)  # one byte missing, then the first half of the next marker
+    # One byte is missing, followed by the first half of the next marker.
+    decoder.feed(torn + MARKER[:1], 0.0)
     assert decoder.pending
     assert decoder.settle() is None
-    # If the next marker was lost, the following bytes reject the frame at once.
+    # If the next marker is lost, the bytes that follow immediately reject the frame.
     decoder = FlexiTacDecoder(ROWS, COLS)
     decode(decoder, [frame(image) for image in numbered(3)])
     spliced = frame(bytes(CELLS))[:-4] + bytes([9]) * (CELLS - 3)

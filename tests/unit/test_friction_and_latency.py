@@ -17,10 +17,10 @@ from tests.harness.recorded_hand import record_hand
 
 Due = dict[int, dict[str, Any]]
 
-EMPTY = "simulation.object_position=[0.0,0.3]"  # the object is out of reach
+EMPTY = "simulation.object_position=[0.0,0.3]"  # The object is out of reach.
 CONFIG = Path(__file__).parents[2] / "config"
 SMALL, VELOSTAT = CONFIG / "small.toml", str(CONFIG / "velostat.toml")
-COUNT = 1.78 * 2.69e-3  # N·m per current count of an XM430
+COUNT = 1.78 * 2.69e-3  # torque per current count of an XM430 [N·m]
 TICK = 2e-3  # s
 
 
@@ -57,8 +57,8 @@ def test_friction_is_measured_by_a_sweep(tmp_path, capsys, friction, more, expec
     assert calibrate("friction", tmp_path) == 0
     told = capsys.readouterr().out
     found = load(tmp_path / "my.toml").control.joint_friction
-    # The additional static friction falls by a factor of e per 0.12 rad/s; at these velocities a
-    # tenth remains.
+    # The additional static friction falls by a factor of e per 0.12 rad/s. At these velocities, a
+    # tenth of it remains.
     assert found == pytest.approx(expected, abs=2 * COUNT)
     assert f"control.joint_friction = {found:g}" in told
     assert ("at break-away" in told) == (at_rest is not None)
@@ -74,7 +74,7 @@ def test_friction_of_a_small_servo(tmp_path):
     record_hand(tmp_path / "run.mcap", due, end, (EMPTY,), profile=str(SMALL), hand=hand)
     assert calibrate("friction", tmp_path) == 0
     found = load(tmp_path / "my.toml").control.joint_friction
-    # The gears' friction is a quarter of their torque.
+    # The gear friction is a quarter of the gear torque.
     assert found == pytest.approx(0.006 / (1.0 - 0.25), abs=1e-3)
 
 
@@ -165,8 +165,8 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
     record_hand(tmp_path / "run.mcap", FORCES, 4.4, profile=path, hand=plant)
     assert calibrate("latency", tmp_path) == 0
     told = capsys.readouterr().out
-    # Cells with a response time of 60 ms hide part of the latency. With other cells, it is found to
-    # within a few ms.
+    # Cells with a response time of 60 ms hide part of the latency. With other cells, the latency is
+    # found to within a few ms.
     tolerance = 6e-3 if profile == "velostat" else 3e-3
     assert load(tmp_path / "my.toml").tactile.latency == pytest.approx(latency, abs=tolerance)
     assert float(told.split(" ± ")[1].split(" ms")[0]) < 1e3 * tolerance

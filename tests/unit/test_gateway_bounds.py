@@ -48,7 +48,7 @@ def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
         Asking(context, served, addresses[1], "arm") for _ in range(2 * bounds.UNANSWERED_MAX)
     ]
     until(lambda: served.settle() or served.service.commands.count == bounds.UNANSWERED_MAX)
-    clock.sleep_until(clock.now() + 2.0)  # a busy machine
+    clock.sleep_until(clock.now() + 2.0)  # This delay represents a busy machine.
     served.settle()
     assert len(served.link.asked) == bounds.UNANSWERED_MAX
     assert is_served(served, context, addresses[1])
@@ -61,7 +61,8 @@ def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
     [
         # This frame exceeds the size of four requests.
         (zmq.DEALER, b"x" * (bounds.PART_SIZE_RATIO * 200 + 1)),
-        (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),  # exceeds any topic's length
+        # This subscription exceeds the length of any topic.
+        (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),
     ],
 )
 def test_a_client_that_sends_an_oversized_message_is_disconnected(

@@ -81,12 +81,13 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
     q, d, angle = (0.12, 0.21), (3e-3, 4e-3), -0.1
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a = HAND.tip_radius
-    middle = tips.mean(axis=0)  # any point of the object will do
+    middle = tips.mean(axis=0)  # Any point of the object is suitable.
     w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
     arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
     for dq in ((1.0, 0.0), (0.0, 1.0), (0.3, -0.8)):
-        # The unknowns are (Gx, Gy, φ): d_t of both tips is constant, and both d change equally.
+        # The unknowns are (Gx, Gy, φ). The equations keep d_t of both tips constant and change both
+        # d equally.
         left = np.array(
             [
                 [*t[0], -w[0]],
@@ -125,14 +126,14 @@ def test_holding_forces_balance_a_tapered_object(grasp, taper):
     felt = [sheared_gradient(looked_up[i], d[i], theta[i], shear[i]) for i in range(2)]
     for i, each in enumerate((normal1, normal2)):
         assert felt[i][0] - shear[i] * math.tan(theta[i]) == pytest.approx(each, rel=1e-4)
-    # Sum the forces on the object at the contacts and the tips' moments on it.
+    # Sum the forces on the object at the contacts, and the moments that the tips apply to it.
     forces = [pressed[0] * n[0] - shear[0] * t[0], -pressed[1] * n[1] + shear[1] * t[1]]
     assert sum(forces) == pytest.approx([0.0, 0.0], abs=1e-12)
     touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]
     moments = [p[0] * f[1] - p[1] * f[0] for p, f in zip(touched, forces, strict=True)]
     turning = felt[0][1] + felt[1][1]
     assert sum(moments) == pytest.approx(turning, abs=5e-4 * normal * a)
-    # Joint torques by virtual work on each face.
+    # Compute joint torques by virtual work on each face.
     force = 0.5 * (looked_up[0][0] + looked_up[1][0])
     torque1 = pressed[0] * n[0] @ v[0] + shear[0] * rolls[0] + felt[0][1]
     torque2 = -pressed[1] * n[1] @ v[1] - shear[1] * rolls[1] - felt[1][1]
@@ -213,7 +214,7 @@ def test_torques_that_no_load_explains_give_a_finite_load(table):
             at = (table.data, table.data, (1e-6, 1e-3), (q, -0.1), 0.3, motion)
             left1, left2, lever, bow = load_torques(*at, (0.3, 0.3), (torque, 0.5))
             if lever == 0.0:
-                continue  # the torques do not depend on a load here
+                continue  # In this pose, the torques do not depend on a load.
             load, slope = load_of(0.5 * (left1 + left2), lever, bow)
             assert math.isfinite(load)
             assert slope > 0.0
@@ -229,7 +230,7 @@ def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, tap
     _, _, mean, normal1, normal2 = holding_moment_arms(data, data, d, theta, taper, motion)
     out = 0.5 * lean * (normal1 + normal2)
     rolled = (mean - out, mean + out)
-    # Torques from both tips' energies, each with its own shear.
+    # Torques from the energies of both tips, each with its own shear.
     v, torques = HAND.tip_jacobian(q), []
     for i, shear in enumerate((rolled[0] + load, rolled[1] - load)):
         at = (i - 0.5) * taper
@@ -244,7 +245,7 @@ def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, tap
     )
     found, _ = load_of(0.5 * (left1 + left2), lever, bow)
     assert found == pytest.approx(load, abs=2e-3)
-    # A load must appear in the torques of both joints.
+    # The load must appear in the torques of both joints.
     assert left1 == pytest.approx(left2, abs=1e-9)
 
 
@@ -332,7 +333,7 @@ def test_symmetric_grasp_values(d, degrees, normal, moment):
     np.testing.assert_allclose(forces.tangential, 0, atol=1e-12)
     lever = 0.080 * np.cos(state.q)
     np.testing.assert_allclose(forces.normal * lever * 1e3, moment, rtol=1e-8)
-    # A joint also carries the moment of the tilted tip, here 0.1 to 0.4 %.
+    # A joint also carries the moment of the tilted tip, which is 0.1 to 0.4 % here.
     turning = forces.turning * [1, -1]
     np.testing.assert_allclose(forces.torque, forces.normal * lever + turning, rtol=1e-12)
     np.testing.assert_allclose(grasp.gradient(state)[2:], 0, atol=1e-12)

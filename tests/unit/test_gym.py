@@ -47,13 +47,13 @@ def test_the_picture_shows_the_hand_and_its_pressure_maps():
     for _ in range(25):
         *_, info = env.step(np.array([0.0, 0.9], np.float32))
     after = env.render()
-    # Both fingers lean clockwise, to the right, to turn the object counter-clockwise.
+    # To turn the object counter-clockwise, both fingers lean clockwise, that is, to the right.
     assert info["truth"][2] > 0.1
     assert found(after, "left")[1] > found(before, "left")[1] + 2
     assert found(after, "right")[1] > found(before, "right")[1] + 2
     maps = after[:, 400:].astype(int).sum(axis=2)
     bright = [np.argwhere(half > half.max() - 60).mean(axis=0) for half in (maps[:150], maps[150:])]
-    assert np.abs(np.array(bright) - 75).max() < 40  # each map shows a footprint near the middle
+    assert np.abs(np.array(bright) - 75).max() < 40  # Each map shows a footprint near its middle.
     assert env.render_mode == "rgb_array"
     env.close()
     assert env.render() is None
@@ -82,7 +82,7 @@ def test_a_window_shows_each_step(display):
     shown = np.array([window._photo.get(x, 40) for x in range(0, 550, 5)])
     np.testing.assert_array_equal(shown, env._picture()[40, ::5])
     assert env.render() is None
-    window.close()  # the user closes the window
+    window.close()  # The user closes the window.
     env.step(np.ones(2, np.float32))
     env.close()
 
@@ -142,7 +142,7 @@ def test_shaping_adds_the_increase_of_the_potential():
         env.reset(seed=1)
         start = env._potential
         sums.append(sum(env.step(np.ones(2, np.float32))[1] for _ in range(20)))
-    assert shaped._potential > start + 2.0  # closing increases the potential even before contact
+    assert shaped._potential > start + 2.0  # Closing increases the potential even before contact.
     assert sums[1] - sums[0] == pytest.approx(shaped._potential - start)
     plain.close()
     shaped.close()

@@ -50,7 +50,8 @@ def test_quasi_static_steering_gain(degrees, gain):
     start = grasp.symmetric(0.004)
     place(hand, start.q, start.pose)
     hand.shear[:] = start.shear
-    # Stiff joints that turn slowly, so that only they and the tips' energy matter.
+    # The joints are stiff and turn slowly, so that only the joints and the energy of the tips
+    # matter.
     parameters = hand.plant.parameters
     parameters.position_gain = 1e5
     parameters.rate_gain = parameters.current_limit = parameters.stall_current = 1e3
@@ -66,9 +67,10 @@ def test_quasi_static_steering_gain(degrees, gain):
 
 
 def test_load_dependent_friction_equals_the_gear_efficiency():
-    # With friction of a fraction μ of motor and contact torque, the transmitted fraction is (1 −
-    # μ)/(1 + μ); when backdriven, it is the inverse.
-    share, rest = 0.25, 0.02  # fraction of the torque; N·m, of which half acts only at standstill
+    # With a friction of a fraction μ of motor and contact torque, the transmitted fraction is (1 −
+    # μ)/(1 + μ). When the gears are backdriven, the fraction is the inverse.
+    # Fraction of the torque, and constant friction [N·m] (half only at standstill).
+    share, rest = 0.25, 0.02
     simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
     simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}
     settings = {"scene": {"fingers": ("left",)}, "simulation": simulation}
@@ -96,7 +98,7 @@ def test_gravity_accelerates_a_free_object_and_a_grasp_holds_it():
     start = grasp.symmetric(0.004)
     place(held, start.q, start.pose)
     settled(held, (0.9, 0.9), 0.7, 1.0)
-    # The y components of the tips' forces carry the weight to within 1 %, without slip.
+    # The y components of the tip forces carry the weight to within 1 %, without slip.
     along = held.tangential * np.cos(held.object_pose[2]) * [-1, 1]
     assert abs(along.sum()) == pytest.approx(0.3 * 9.80665, rel=0.01)
     place_before = held.object_pose[1]
@@ -105,7 +107,7 @@ def test_gravity_accelerates_a_free_object_and_a_grasp_holds_it():
     slippery = make(gravity=(0.0, -9.80665), object_mass=0.3, tip_friction=0.05)
     place(slippery, start.q, start.pose)
     settled(slippery, (0.9, 0.9), 0.7, 1.0)
-    assert slippery.object_pose[1] == pytest.approx(0.03, abs=1e-3)  # on the palm
+    assert slippery.object_pose[1] == pytest.approx(0.03, abs=1e-3)  # The object lies on the palm.
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.6])
@@ -120,7 +122,7 @@ def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
         run(hand, 0.005)
         ratio = np.abs(hand.tangential) / hand.normal
         assert (ratio <= friction * (1 + 1e-9)).all()
-    # Both tips slip at Coulomb's limit; only inertia balances the rest of the push.
+    # Both tips slip at Coulomb's limit, and only inertia balances the rest of the push.
     np.testing.assert_allclose(ratio, friction, rtol=1e-6)
     assert push == pytest.approx(2 * friction * hand.normal.mean(), rel=0.15)
 
@@ -137,13 +139,13 @@ def test_a_dropped_object_comes_to_rest_on_the_palm():
             energy = later
             if hand.t > 0.15:
                 highest = max(highest, np.abs(hand.object_velocity[1]))
-        # The object lies flat on a face, and two corner springs of 1e5 N/m carry the weight; a tip
-        # that touches it may still creep.
+        # The object lies flat on a face, and two corner springs of 1e5 N/m carry the weight. A tip
+        # that touches the object may still creep.
         half = 0.5 * (0.060 if abs(math.sin(hand.object_pose[2])) < 0.5 else 0.040)
         sunk = 0.1 * 9.80665 / 2e5
         assert hand.object_pose[1] == pytest.approx(0.01 + half - sunk, abs=5e-7)
         assert np.abs(hand.object_velocity[1:]).max() < 1e-6
-    assert highest > 0.01  # the tilted object rocked before it came to rest
+    assert highest > 0.01  # The tilted object rocked before it came to rest.
 
 
 def test_a_collision_conserves_momentum_and_energy():
@@ -181,7 +183,7 @@ def test_position_moves_are_well_damped_and_bounded_by_the_goal_current():
         if hand.t < 0.02:
             continue
         highest = max(highest, hand.q.max())
-    assert highest < 0.1 + 0.01 * 0.3  # less than 1 % overshoot
+    assert highest < 0.1 + 0.01 * 0.3  # The overshoot is less than 1 %.
     np.testing.assert_allclose(hand.q, 0.1, atol=0.01)
 
 
@@ -214,7 +216,7 @@ def test_end_stops_and_no_load_speed_limit_the_joints():
         run(hand, 0.002)
         fastest = max(fastest, np.abs(hand.dq).max())
     assert fastest < hand.plant.parameters.no_load_speed
-    # 5.4 N·m on 500 N·m/rad, after the clearance of 0.05 rad.
+    # The stop yields to 5.4 N·m with 500 N·m/rad, after the clearance of 0.05 rad.
     assert 1.05 < hand.q[0] < 1.07
     assert -0.57 < hand.q[1] < -0.55
 
@@ -284,8 +286,8 @@ def test_samples_are_interpolated_at_the_frame_times():
     for number in range(hand.sample_count - 5, hand.sample_count):
         sample, exact = hand.sample(number), finer.sample(number)
         assert sample.t == number / 130.0
-        # A tick's motion is 1e-4 rad and 4e-6 m. This is the error of a sample without
-        # interpolation.
+        # The motion of a tick is 1e-4 rad and 4e-6 m. A sample without interpolation would have
+        # this error.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):

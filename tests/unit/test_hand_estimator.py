@@ -76,7 +76,8 @@ def test_channel_consistency_is_one_for_modelled_noise_and_four_for_doubled_nois
             hand.covariance[:], hand.slopes[:] = covariance, slopes
             corrected(hand.array, factor * std * rng.normal(), 1e-4, math.inf)
             found.append(hand.grasp.nis[0])
-        # The mean of 4000 squares has a standard error of 0.022; the first 500 are transient.
+        # The mean of 4000 squares has a standard error of 0.022. The first 500 values are
+        # transient.
         assert np.mean(found[500:]) == pytest.approx(factor**2, rel=0.15)
         assert not hand.grasp.nis[1:].any()
 
@@ -198,7 +199,8 @@ def test_joint_motion_compensates_for_slow_cells(response):
     estimator = HandEstimator(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     d, q = 0.003, 0.15
-    below = np.linspace(0.0, 0.01, 400)  # m below the tip's apex, in equal steps of area
+    # Distances below the tip's apex [m], in equal steps of area.
+    below = np.linspace(0.0, 0.01, 400)
     pressure, shown, fitted = np.maximum(d - below, 0.0), q, (d, 1.0)
     follows = -math.expm1(-0.002 / response)
     off = []

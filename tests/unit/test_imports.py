@@ -11,7 +11,8 @@ from pathlib import Path
 import softfinger
 
 ROOT = Path(softfinger.__file__).parents[1]
-ORDER = ("kinematics", "daemon", "tools")  # each may import itself and the packages before it
+# Each package may import itself and the packages before it.
+ORDER = ("kinematics", "daemon", "tools")
 PAGE = ROOT / "docs" / "architecture.md"
 BUILT_IN = {"Exception", "ValueError", "RuntimeError", "OSError", "TimeoutError"}
 

@@ -10,11 +10,11 @@ from scipy.integrate import solve_ivp
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, POSITION, hold_with, make, place, run
 
-FRICTION = 0.05  # N·m, default value
-PRESLIDING = 0.0005  # rad, default value
-INERTIA, DAMPING = 0.010, 0.02  # kg·m², N·m·s/rad, default values
-STRIBECK_SPEED = 0.12  # rad/s, default value
-COUNT = 2.0 * math.pi / 4096  # rad, one encoder count
+FRICTION = 0.05  # default value [N·m]
+PRESLIDING = 0.0005  # default value [rad]
+INERTIA, DAMPING = 0.010, 0.02  # default values [kg·m², N·m·s/rad]
+STRIBECK_SPEED = 0.12  # default value [rad/s]
+COUNT = 2.0 * math.pi / 4096  # one encoder count [rad]
 
 
 def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
@@ -51,7 +51,7 @@ def test_a_constant_load_below_static_friction_causes_no_creep(share):
 
 
 def test_an_oscillating_load_below_static_friction_causes_no_drift():
-    # A LuGre joint creeps in each period here (Dupont et al., 2002).
+    # In this case, a LuGre joint would creep in each period (Dupont et al., 2002).
     hand = joint()
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
     phases = np.arange(0.0, 60.0, 0.02) * 2.0 * math.pi
@@ -61,11 +61,12 @@ def test_an_oscillating_load_below_static_friction_causes_no_drift():
 
 
 def test_very_stiff_bristles_also_stick():
-    presliding, inertia = 1e-6, 1e-4  # rad, kg·m²: a period of 0.3 ms with steps of 0.25 ms
+    # Presliding [rad] and inertia [kg·m²], with a period of 0.3 ms and steps of 0.25 ms.
+    presliding, inertia = 1e-6, 1e-4
     hand = joint(2.5e-4, joint_presliding=presliding, joint_inertia=inertia)
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
     run(hand, 1.0)
-    # The joint may slip initially.
+    # The joint may slip at first.
     assert hand.q[0] == pytest.approx(0.6 * presliding, abs=presliding)
     assert abs(hand.dq[0]) < 1e-9
     assert hand.plant.state.bristles[0] == pytest.approx(0.6 * presliding, rel=1e-6)
@@ -89,8 +90,9 @@ def test_break_away_is_at_the_static_friction_torque():
 def test_friction_reverses_over_twice_the_presliding_distance():
     hand = joint(joint_damping=0.0)
     p = hand.plant.parameters
-    p.position_gain, p.rate_gain = 200.0, 2.0  # A/rad, A·s/rad: the joint follows its goal
-    speed, each = 0.01, 0.001  # rad/s, s
+    # Gains [A/rad, A·s/rad] with which the joint follows its goal.
+    p.position_gain, p.rate_gain = 200.0, 2.0
+    speed, each = 0.01, 0.001  # speed [rad/s] and time step [s]
     way = np.concatenate((np.arange(0.0, 0.02, speed * each), np.arange(0.02, 0.0, -speed * each)))
     torques, angles = [], []
     for goal in way:
@@ -103,7 +105,7 @@ def test_friction_reverses_over_twice_the_presliding_distance():
     closing, opening = torque[turn - 200 : turn].mean(), torque[-200:].mean()
     assert closing == pytest.approx(FRICTION, rel=0.01)
     assert closing - opening == pytest.approx(2.0 * FRICTION, rel=0.01)
-    # The transition is a straight line, whose slope would reveal a presliding distance that is off
+    # The transition is a straight line. Its slope would reveal a presliding distance that is wrong
     # by a factor of two.
     within = slice(turn + 20, turn + 80)
     slope, _ = np.polyfit(angle[within], torque[within], 1)
@@ -133,7 +135,7 @@ def test_a_friction_level_that_changes_at_standstill_adds_no_torque():
     hand.plant.state.bristles[0] = 0.6 * PRESLIDING
 
     def torque(motor: float) -> float:
-        load(hand, [motor], 0.02)  # longer than the motor's time constant
+        load(hand, [motor], 0.02)  # This time is longer than the motor's time constant.
         gears = hand.plant.gears[0]
         assert gears.friction == pytest.approx(FRICTION + share * motor, rel=1e-6)
         return gears.friction * gears.limited_deflection / PRESLIDING

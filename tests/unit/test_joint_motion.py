@@ -14,7 +14,7 @@ from tests.harness.loop import advance_to, command, grasped, refusal
 
 TICK = 0.002
 COUNT = 2.0 * math.pi / 4096
-RATE = 0.229 * 2.0 * math.pi / 60.0  # rad/s, one velocity count
+RATE = 0.229 * 2.0 * math.pi / 60.0  # one velocity count [rad/s]
 
 
 class Joint:
@@ -36,7 +36,7 @@ class Joint:
         self.dq += (dq - self.dq) * min(TICK / lag, 1.0)
         reading = self.reading
         if self.random.random() < 0.01:
-            held += 0.015  # the process was suspended
+            held += 0.015  # The process was suspended here.
         reading.t = max(reading.t, self.t + self.random.uniform(0.0003, 0.004) + held)
         reading.q[0] = COUNT * round(self.q / COUNT)
         reading.dq[0] = RATE * round(self.dq / RATE)
@@ -179,6 +179,6 @@ def test_position_mode_moves_without_current_checks(make):
     command(daemon, "move", left=0.05, right=-0.1)
     daemon.loop.advance(1.0)
     assert daemon.loop.state.reading.q == pytest.approx([0.05, -0.1], abs=0.01)
-    command(daemon, "move", left=0.3, right=0.3)  # moves onto the object
+    command(daemon, "move", left=0.3, right=0.3)  # The joints move onto the object.
     daemon.loop.advance(2.0)
     assert daemon.loop.state.fault_name == ""

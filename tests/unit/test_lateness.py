@@ -58,7 +58,7 @@ def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
     return {key: value for key, value in message.items() if key not in MOMENT}
 
 
-TICKS = 1600  # long enough for the demo to hold and turn the object
+TICKS = 1600  # number of ticks in which the demo holds and turns the object
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_a_simulated_hand_waits_for_the_machine_and_reports_it_occasionally(
 ):
     monkeypatch.setattr(timing, "REPORT_INTERVAL", 5.0)
     daemon, machine, events = on_late_machine("auto", task={"name": "demo"})
-    machine.work(60.0)  # the construction time does not count as a delay
+    machine.work(60.0)  # The construction time does not count as a delay.
     machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.5]
     daemon.loop.advance(4.0)
     state = daemon.loop.state
@@ -148,10 +148,10 @@ def test_long_work_is_also_named_except_for_commands(on_late_machine):
 
     def slowly() -> None:
         really()
-        machine.work(0.3)  # a slow bus
+        machine.work(0.3)  # This delay represents a slow bus.
 
     servos.torque_on = slowly
-    advance_to(daemon, "fault", 2.0)  # the task arms
+    advance_to(daemon, "fault", 2.0)  # The task arms the hand.
     assert (state.fault_name, state.timing.busy_s) == ("servos.bus", 0.0)
     assert state.fault.startswith("the bus watchdog")
     servos.torque_on = really
@@ -183,7 +183,7 @@ def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
 
 def test_a_delay_is_reported_again_after_doubling_intervals():
     told = [event for event in looked(0.06, 17.0 * REPORT_INTERVAL) if event[1] == "late"]
-    assert len(told) == 6  # reports after 0, 1, 2, 4, 8 and 16 times REPORT_INTERVAL
+    assert len(told) == 6  # The reports come after 0, 1, 2, 4, 8 and 16 times REPORT_INTERVAL.
 
 
 def test_virtual_time_advances_only_by_waiting_and_never_decreases():
@@ -204,7 +204,7 @@ def test_the_time_of_a_hand_is_constant_between_sleeps_and_ends_them_on_time():
     assert clock.sleep_until(100.002) == pytest.approx(0.0015)
     assert clock.now() == 100.002
     assert clock.host() == pytest.approx(100.0035)
-    clock.sleep_until(100.004)  # the rest of the period makes up for the delay
+    clock.sleep_until(100.004)  # The rest of the period compensates the delay.
     assert (clock.now(), clock.host()) == (100.004, 100.004)
     assert clock.behind == 0.0
 
@@ -212,7 +212,7 @@ def test_the_time_of_a_hand_is_constant_between_sleeps_and_ends_them_on_time():
 def test_the_time_of_a_hand_excludes_stalls_of_the_machine():
     machine = LateMachine(100.0)
     clock = HandClock(machine)
-    machine.late_by = [5.0]  # the machine was suspended
+    machine.late_by = [5.0]  # The machine was suspended.
     assert clock.sleep_until(100.002) == pytest.approx(5.0)
     assert clock.sleep_until(100.004) == 0.0, "a missed deadline must not cause a sleep"
     assert clock.now() == 100.004

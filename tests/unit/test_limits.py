@@ -25,7 +25,7 @@ from tests.harness.safety import (
     sound,
 )
 
-Changes = dict[str, Any]  # values by path: "reading.q.0" is the left joint's angle
+Changes = dict[str, Any]  # Maps paths to values; "reading.q.0" is the left joint's angle.
 OLD = 5.0 - 11.0 / SETTINGS.tactile.rate  # s
 STALLED = {"goal.q": [0.0, 0.3], "goal.current": [0.4] * 2, "reading.current": [0.0, 0.39]}
 TOWARDS = {"goal.q": [0.3, 0.0], "goal.current": [0.4] * 2}
@@ -152,7 +152,7 @@ def felt(finger: int, theta: float) -> Sensor:
 
 
 def test_fingers_that_disagree_on_the_object_angle_warn_and_then_fault() -> None:
-    # θ1 = φ + q1, θ2 = φ − q2: both give the same φ of 0.1 rad
+    # θ1 = φ + q1 and θ2 = φ − q2 both give φ = 0.1 rad.
     left, right = felt(0, 0.1 + 0.3), felt(1, 0.1 - 0.25)
     judge, state = safety(sensors=[left, right]), sound()
     state.reading.q = [0.3, 0.25]
@@ -165,7 +165,7 @@ def test_fingers_that_disagree_on_the_object_angle_warn_and_then_fault() -> None
     name, text = judged(judge, state, 0.5)
     assert name == "hand.angle"
     assert "differ by 12.0°: check the joints' zeros" in text
-    right.estimate.covariance[1, 1] = 0.06**2  # too uncertain for a fault
+    right.estimate.covariance[1, 1] = 0.06**2  # This estimate is too uncertain for a fault.
     assert judged(judge, state, 0.5) == ("", "")
 
 
@@ -176,7 +176,7 @@ def test_a_change_of_width_of_a_held_object_is_a_fault():
     name, text = judged(judge, state, 0.5)
     assert name == "hand.width"
     assert "changed by -4.5 mm" in text
-    state.mode = Mode.ARMED  # the object is released; the next object may have any width
+    state.mode = Mode.ARMED  # The object is released, and the next object may have any width.
     assert judged(judge, state) == ("", "")
     state.mode = Mode.HOLDING
     assert judged(judge, state, 0.5) == ("", "")
@@ -309,7 +309,7 @@ def test_a_frozen_sensor_is_a_fault_during_contact():
         assert (found is not None) is fault
     assert found.name == "tactile.frozen"
     assert "right sensor is frozen" in found.text
-    state.contacts[1].contact = False  # without contact, repeated frames are normal
+    state.contacts[1].contact = False  # Without contact, repeated frames are normal.
     assert judged(judge, state) == ("", "")
 
 
@@ -323,7 +323,7 @@ def test_saturated_cells_are_reported():
     ]
 
 
-# Values that may reach a fraction of their limit; ages are relative to the current time.
+# Values that may reach a fraction of their limit. Ages are relative to the current time.
 PUSHES: dict[str, tuple[str, float]] = {
     "joint.angle": ("reading.q.{}", SETTINGS.hand.q_max[0] + 0.1),
     "joint.velocity": ("reading.dq.{}", BOUNDS.velocity_max),

@@ -178,7 +178,7 @@ def test_the_state_contains_the_goals_of_the_grip(make):
     daemon.loop.advance(0.01)
     message = state_message(daemon.loop.state, parts(daemon.settings))
     assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
-    # The force exceeds the requested one, because the load would make the tips slip.
+    # The force exceeds the requested force, because the load would otherwise make the tips slip.
     for k in range(1, 101):
         daemon.hand.apply_load(0.0, 0.12 * k, 0.0)
         daemon.loop.advance(0.02)
@@ -206,7 +206,7 @@ def test_an_unreachable_angle_is_refused(make):
 
 def test_tare_removes_a_constant_offset(make):
     daemon = make()
-    for finger in (0, 1):  # 1.2 kPa on all cells
+    for finger in (0, 1):  # Add 1.2 kPa to all cells.
         change_frames(daemon, finger, lambda frame: replace(frame, data=frame.data + 300))
     command(daemon, "tare")
     daemon.loop.advance(0.5)
@@ -242,7 +242,7 @@ def test_a_tare_reports_the_change_of_the_zero(make):
         f"left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa), "
         "in one cell by +80.0 counts"
     )
-    # The warning compares with the last zero offset, not with the first.
+    # The warning compares with the last zero offset, not with the first one.
     assert tared(-10, -60).endswith("one cell by -150.0 counts")
 
 
@@ -296,7 +296,7 @@ def test_a_frozen_sensor_is_a_fault_until_it_recovers(make):
     assert daemon.loop.state.fault_name == "tactile.frozen"
     assert "left sensor is frozen" in daemon.loop.state.fault
     assert "clear: tactile: left sensor is frozen" in refusal(daemon, "clear")
-    del left.sensor.latest  # restores the class's method
+    del left.sensor.latest  # This line restores the method of the class.
     daemon.loop.advance(0.2)
     command(daemon, "clear")
     command(daemon, "arm")
@@ -328,7 +328,7 @@ def test_stopping_the_opening_hand_leaves_no_later_fault(make):
 def test_a_blocked_joint_is_a_fault_that_can_be_cleared(make):
     daemon = make(tactile={"backend": "none"})
     command(daemon, "arm")
-    command(daemon, "move", left=0.9, right=0.9)  # moves onto the object
+    command(daemon, "move", left=0.9, right=0.9)  # The joints move onto the object.
     advance_to(daemon, "fault", 8.0)
     assert daemon.loop.state.fault_name == "joint.stall"
     assert "joint has stalled" in daemon.loop.state.fault

@@ -50,9 +50,9 @@ def test_table_i_has_the_slopes_of_the_paper():
     for tenths, modulus in zip(range(0, 12, 2), TABLE_I_MODULUS, strict=True):
         terms = enumerate(material.coefficients)
         assert sum((j + 1) * c * Fraction(tenths, 10) ** j for j, c in terms) == modulus
-    assert material.coefficients[1] == 0  # no linear term
+    assert material.coefficients[1] == 0  # The law has no linear term.
     slope = np.gradient(material.stress(STRAIN), STRAIN)
-    assert np.all(np.diff(slope) > -1e-6 * slope[0])  # the tangent modulus never decreases
+    assert np.all(np.diff(slope) > -1e-6 * slope[0])  # The tangent modulus never decreases.
     assert slope.min() * (1 + 1e-12) >= 0.135e6
     assert slope.max() < 0.304e6
 
@@ -68,7 +68,7 @@ def test_a_law_is_smooth_increasing_and_consistent(index):
     inner = STRAIN[:-1, None] + 0.5 * (points + 1) * np.diff(STRAIN)[:, None]
     parts = 0.5 * np.diff(STRAIN) * (material.stress(inner) * weights).sum(axis=1)
     np.testing.assert_allclose(energy[1:], np.cumsum(parts), rtol=1e-12)
-    # The exact polynomial in plain arithmetic.
+    # Evaluate the exact polynomial in plain arithmetic.
     powers = [float(c) for c in material.coefficients]
     for strain in (1e-9, 0.124999, 0.125, 0.3, 0.75, 1.0 - 1e-12):
         exact = math.fsum(c * strain**j for j, c in enumerate(powers, 1))

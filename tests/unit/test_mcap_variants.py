@@ -50,7 +50,7 @@ def rewritten(
         for k, (kind, channel, message) in enumerate(golden()):
             times = message.log_time + 10**13, message.publish_time
             if others and k % 10 == 0:
-                # A camera that started an hour earlier.
+                # This camera started an hour earlier.
                 early = times[0] if k else times[0] - 3600 * 10**9
                 writer.add_message(camera, early, b"\0\1" * 500, early)
                 writer.add_message(pose, times[0], json.dumps({"pose": [1, [2]]}).encode(), 0)
@@ -96,7 +96,8 @@ def test_all_variants_of_the_format_give_the_same_recording(tmp_path, options):
     assert recording.total == SHORT
     assert recording.count(schema.STATE) == sum(topic == schema.STATE for topic, _ in wanted)
     times = [message.log_time * 1e-9 for _, _, message in golden()]
-    assert recording.start == pytest.approx(min(times) + 1e4)  # the camera's start does not count
+    # The start of the camera does not count.
+    assert recording.start == pytest.approx(min(times) + 1e4)
     assert recording.duration == pytest.approx(max(times) - min(times))
     late = list(recording.messages([schema.STATE], start=0.1))
     assert 0 < len(late) < recording.count(schema.STATE)

@@ -36,7 +36,7 @@ TRUE = replace(GRID, centre=(0.7e-3, -0.4e-3), rotation=0.2)  # true position of
 NOISE = 600.0
 D = 1e-3 * np.array([0.7, 1.5, 3, 5, 6, 2, 4, 5, 3, 6, 4])
 THETA = np.radians([0, 0, 0, 0, 0, 10, -10, 10, 20, -25, 25])
-WEIRD = 1e6  # N/m²; no model predicts this force: F = WEIRD d^1.8 A^0.2 cos θ
+WEIRD = 1e6  # stiffness [N/m²] of a force that no model predicts: F = WEIRD d^1.8 A^0.2 cos θ
 
 
 def weird(d: float, theta: float) -> np.ndarray:
@@ -93,7 +93,7 @@ def test_declared_cell_uncertainties_are_part_of_the_errors(law, name, d):
         assert found.valid
         off = np.array([found.d - d, found.tilt_x - theta, found.tilt_y])
         off_by.append(np.abs(off) / np.sqrt(found.covariance.diagonal()[:3]))
-    # Curves fitted with other noise give 1.1 to 1.65 at the smallest depths.
+    # Curves that were fitted with other noise give 1.1 to 1.65 at the smallest depths.
     assert 0.5 < np.max(off_by) < 2.0
 
 

@@ -92,7 +92,7 @@ def test_faults_develop_linearly_over_their_duration_and_end():
     assert [faults("gain", t) for t in (0.0, 3.0, 4.0, 4.5, 5.0, 9.0)] == [
         *(1.0, 1.0, 0.75, 0.625, 0.5, 0.5)
     ]
-    faults.begin("gain", 2.625, 4.5, 4.0)  # the ramp starts from the current value
+    faults.begin("gain", 2.625, 4.5, 4.0)  # The ramp starts from the current value.
     assert [faults("gain", t) for t in (4.5, 6.5, 8.5)] == [0.625, 1.625, 2.625]
     faults.begin("drift", 0.1, 7.0)
     assert [faults("drift", t) for t in (6.999, 7.0)] == [0.0, 0.1]
@@ -160,7 +160,7 @@ def test_a_servo_reports_a_current_other_than_the_actual_one():
         for servo, sign in zip((1, 2), signs, strict=True)
     ]
     assert counts == [round(hand.current[0] / unit), round(0.5 * hand.current[1] / unit)]
-    # The goal is reached despite the fault.
+    # The hand reaches the goal despite the fault.
     np.testing.assert_allclose(hand.current, flows, rtol=0.02)
 
 

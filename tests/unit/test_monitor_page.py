@@ -112,7 +112,7 @@ def test_stream_status_follows_the_age_of_data():
     assert [feed.status(now) for now in (0.4, 0.6, 1.9, 2.1)] == ["live", "stale", "stale", "lost"]
     assert "◐ stale" in shown(feed, 0.6)
     slow = StreamState()
-    for k in range(100):  # at one state per second, a pause of 2 s is not a loss
+    for k in range(100):  # At one state per second, a pause of 2 s is not a loss.
         give(slow, b"hand/state", fake_daemon.state(k, k) | {"mono_ns": k * 10**9}, float(k))
     assert [slow.status(99 + age) for age in (2.0, 4.0, 11.0)] == ["live", "stale", "lost"]
 
@@ -187,7 +187,7 @@ def test_repeated_events_are_shown_once_and_in_order():
     assert [event.text for event in feed.events] == TEXTS
     assert [event.text for event in feed.news()] == ["third", "first", "second"]
     assert feed.news() == []
-    for seq in (1, 2):  # a restarted daemon counts from 1 again
+    for seq in (1, 2):  # A restarted daemon counts from 1 again.
         give(feed, b"hand/event", told(seq, 200.0 + seq, f"anew {seq}", True))
         give(feed, b"hand/event", told(seq, 200.0 + seq, f"anew {seq}", True))
     assert [event.text for event in feed.events][3:] == ["anew 1", "anew 2"]
@@ -200,11 +200,12 @@ def test_the_commander_is_shown_during_its_lease():
     give(feed, b"hand/command", carried_out, 0.0)
     assert "note book commands the hand" in shown(feed, 4.9)
     assert "commands the hand" not in shown(feed, 5.1)
-    # A stop neither requires nor takes a lease.
+    # A stop neither requires a lease nor takes one.
     give(feed, b"hand/command", carried_out | {"command": "stop"}, 6.0)
     assert "commands the hand" not in shown(feed, 6.1)
     give(feed, b"hand/command", carried_out | {"client": ""}, 7.0)
-    assert "commands the hand" not in shown(feed, 7.1)  # the unnamed client may be this page
+    # The client without a name may be this page.
+    assert "commands the hand" not in shown(feed, 7.1)
     refused = carried_out | {"ok": False, "error": "grasp: arm first", "timestamp": 5.0}
     give(feed, b"hand/command", refused, 8.0)
     assert "refused   grasp: arm first (to note book)" in shown(feed, 8.0)
@@ -285,10 +286,10 @@ def test_key_sequences():
     ]
     assert keys.decode(b"\x1b") == []
     assert keys.decode(b"[") == []
-    assert keys.decode(b"D") == ["left"]  # three reads complete one sequence
+    assert keys.decode(b"D") == ["left"]  # Three reads complete one sequence.
     keys.decode(b"\x1b")
     keys.settle()
-    assert keys.decode(b"g") == ["g"]  # a lone Escape does not affect the next key
+    assert keys.decode(b"g") == ["g"]  # A single Escape does not affect the next key.
     assert keys.decode(b"a\x1b[200~go") == ["a"]
     assert keys.decode(b"go\x1b[20") == []
     assert keys.decode(b"1~q") == ["q"]

@@ -153,7 +153,8 @@ def test_a_runtime_folder_writable_by_others_is_refused_with_a_remedy(
 
 
 def test_the_local_stop_falls_back_to_the_home_folder_and_reports_it(shared, monkeypatch, request):
-    home = TemporaryDirectory(prefix="softfinger-")  # short enough for a socket address
+    # The path is short enough for a socket address.
+    home = TemporaryDirectory(prefix="softfinger-")
     request.addfinalizer(home.cleanup)
     for name in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY"):
         monkeypatch.delenv(name, raising=False)

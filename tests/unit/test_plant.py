@@ -117,7 +117,7 @@ def test_bristles_carry_shear_at_any_tilt_with_the_normal_force_of_the_springs(t
 @pytest.mark.parametrize("trial", range(24))
 def test_energy_never_increases_without_input(trial):
     # The test uses random scenes, masses, moduli and friction, with fingers thrown at the object,
-    # also beyond the rim. One trial in three uses a step ten times too long.
+    # even beyond the rim. One trial in three uses a step that is ten times too long.
     generator = np.random.default_rng(trial)
     hand = random_hand(generator, trial % 3 == 0)
     held = hand.plant.parameters.object_held
@@ -145,7 +145,8 @@ def test_energy_never_increases_without_input(trial):
 
 @pytest.mark.extended
 def test_the_state_stays_finite_for_random_commands_and_extreme_parameters():
-    # The steps are the plant's own two times in three, and otherwise ten times too long.
+    # Two in three trials use the plant's own step, and the others a step that is ten times too
+    # long.
     assert [wrong for wrong in map(abuse, range(12)) if wrong] == []
 
 
@@ -186,9 +187,9 @@ def test_creep_relaxes_a_stuck_shear_exponentially():
 
 
 def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
-    # The expected values are integrals of the springs' own friction. They follow 1 − (1 − u/μd)²
-    # initially, and twice this for half the distance after each reversal. Around a closed path, the
-    # value returns to where it started.
+    # The expected values are integrals of the springs' own friction. At first, they follow 1 − (1 −
+    # u/μd)². After each reversal, they follow twice this value for half the distance. Around a
+    # closed path, the value returns to its start.
     def virgin(u: float) -> float:
         return 1.0 - (1.0 - min(u / (MU * DEPTH), 1.0)) ** 2
 

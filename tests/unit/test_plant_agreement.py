@@ -44,15 +44,15 @@ class Contact:
     """One tip's contact: vector to the nearest point, κ, and the two bodies in contact."""
 
     finger: int
-    way: Callable  # x → vector from the tip's centre to the point
-    normal: Callable  # x → unit vector into the touched body
+    way: Callable  # maps x to the vector from the tip's centre to the point
+    normal: Callable  # maps x to the unit vector into the touched body
     share: float = 1.0
     mutual: bool = False
 
     def variables(self, x):
         m = self.normal(x)
         d = HAND.tip_radius - (self.way(x) @ m)
-        # The tips' axes point at −q1 and π + q2.
+        # The axes of the tips point at −q1 and π + q2.
         return np.array([d, np.arctan(m[1] / m[0]) + (x[0] if self.finger == 0 else -x[1])])
 
     def jacobian(self, x):
@@ -148,9 +148,10 @@ class Equations:
     currents: np.ndarray
     loss: float
     weight: np.ndarray
-    corners: np.ndarray | None = None  # in the object's frame, resting on a palm at y = ``palm``
+    # Corners in the object's frame, resting on a palm at y = ``palm``.
+    corners: np.ndarray | None = None
     palm: float = 0.0
-    coupling: float = 1.0  # coupling of a shear with d and θ; 0 for bristles
+    coupling: float = 1.0  # coupling of a shear with d and θ, 0 for bristles
 
     def __call__(self, _t, y):
         x, v = y[:5], y[5:10]
@@ -277,7 +278,8 @@ def test_second_order_agreement_with_an_adaptive_solver(name, loss):
         hand = start(scene, loss, count)
         hand.advance(hand.t + SECONDS)
         errors.append(np.abs((compared(hand, scene) - exact) / scale).max())
-        assert hand.plant.limited_step_count == 0  # smooth, so that only the method matters
+        # The motion is smooth, so only the method matters.
+        assert hand.plant.limited_step_count == 0
         assert hand.d.min() > 0.001
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     assert errors[2] < 1e-6

@@ -36,7 +36,7 @@ def shape(**simulation):
 def test_radius_of_gyration_and_mean_radius_of_the_shapes():
     square = shape(object_width=0.04, object_height=0.04)
     assert square.gyration == pytest.approx(0.04 / math.sqrt(6))
-    # (√2 + asinh 1)/6 times the side.
+    # The mean radius is (√2 + asinh 1)/6 times the side.
     assert square.mean_radius == pytest.approx(0.04 * (math.sqrt(2) + math.asinh(1)) / 6, rel=1e-4)
     disc = shape(object_shape="disc", object_radius=0.03)
     assert (disc.gyration, disc.mean_radius) == pytest.approx((0.03 / math.sqrt(2), 0.02))
@@ -53,7 +53,7 @@ def test_a_wedge_has_its_origin_at_the_centre_of_mass():
     np.testing.assert_allclose(normals[1], [math.cos(0.3), math.sin(0.3)])
     sides = wedge.corners[[0, 3]].mean(axis=0), wedge.corners[[1, 2]].mean(axis=0)
     assert sides[1][0] - sides[0][0] == pytest.approx(0.04)
-    # Random points in the bounding box; those inside are used.
+    # Draw random points in the bounding box, and keep those inside the shape.
     generator = np.random.default_rng(1)
     low, high = wedge.corners.min(axis=0), wedge.corners.max(axis=0)
     points = generator.uniform(low, high, (400_000, 2))
@@ -197,13 +197,14 @@ def test_an_object_slides_on_the_palm_with_coulomb_friction(scene):
     assert hand.object_velocity[0] == pytest.approx(0.3 - friction * GRAVITY * 0.03, rel=0.02)
     assert hand.object_velocity[2] == pytest.approx(spin, rel=0.05, abs=0.3)
     run(hand, 0.17)
-    # The rectangle stops after v²/2μg; the disc rolls at two thirds of the velocity.
+    # The rectangle stops after v²/2μg, and the disc rolls at two thirds of the velocity.
     rolling = 0.0 if scene == "rectangle" else 0.3 * 2 / 3
     assert hand.object_velocity[0] == pytest.approx(rolling, abs=2e-3)
     assert hand.object_velocity[2] * 0.03 == pytest.approx(-rolling, abs=2e-3)
     if scene == "rectangle":
         way = 0.3**2 / (2 * friction * GRAVITY)
-        assert hand.object_pose[0] + 0.02 == pytest.approx(way, rel=0.06)  # it rocks slightly
+        # The object rocks slightly.
+        assert hand.object_pose[0] + 0.02 == pytest.approx(way, rel=0.06)
 
 
 def test_an_object_sticks_to_the_palm_below_friction_and_slides_above():

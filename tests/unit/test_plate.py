@@ -10,7 +10,7 @@ from softfinger.daemon.simulation.sensor.simulated_tactile import StageTouch
 from tests.harness.paper_tip import TIP
 
 TABLE = ContactTable.build(TIP, Material.constant(0.3e6))
-FORCE = math.pi * 0.3e6 * 0.004**2  # N, force at 4 mm
+FORCE = math.pi * 0.3e6 * 0.004**2  # force at 4 mm [N]
 
 
 def test_presses_are_parsed():
@@ -35,14 +35,14 @@ def test_a_plate_descends_holds_and_lifts_off():
     plate = Plate()
     assert plate(5.0) == (-0.001, 0.0, 0.0)
     plate.go(parse_presses("depth=4mm tilt=-10deg speed=5mm/s hold=1s", TABLE, 1.0)["left"], 10.0)
-    assert plate.arrives == pytest.approx(11.0)  # starts 1 mm above the tip
+    assert plate.arrives == pytest.approx(11.0)  # The plate starts 1 mm above the tip.
     tilt = -math.radians(10.0)
     assert plate(10.5) == pytest.approx((0.0015, tilt, 0.0))
     assert plate.reached(10.99) is None
     assert plate(11.5) == pytest.approx((0.004, tilt, 0.0))
     reached = plate.reached(11.5)
     assert reached.d == 0.004
-    assert plate.reached(11.9) is None  # the plate has already returned
+    assert plate.reached(11.9) is None  # The plate has already returned.
     assert plate(12.125) == pytest.approx((0.0015, tilt, 0.0))
     assert plate(12.5).d == -0.001
     assert plate(1e4) == (-0.001, 0.0, 0.0)

@@ -19,7 +19,7 @@ STICKING = Fingertip(0.020, "solid", 0.48, face="sticking")
 D = np.array([1e-3, 2e-3, 3e-3, 3e-3, 4e-3])
 THETA = np.radians([0.0, 0.0, -10.0, 20.0, 15.0])
 NOISE = 600.0
-LATE = 2e-4  # m, zero offset of the recorded d
+LATE = 2e-4  # zero offset of the recorded d [m]
 
 
 def frames(tip: Fingertip, grid: SensorGrid = GRID) -> np.ndarray:
@@ -47,7 +47,7 @@ def test_the_true_tip_model_fits_best(tip):
     assert best.valid == 1.0
     assert best.d_error < 1e-4
     assert best.theta_error < math.radians(1.5)
-    assert best.force_error < 0.12  # mostly the noise of the sum
+    assert best.force_error < 0.12  # This error is mostly the noise of the sum.
     if tip.physics == "solid":
         assert (best.tip.base, best.tip.face) == ("bonded", "sticking")
         assert best.tip.poisson == pytest.approx(0.48, abs=0.01)
@@ -57,7 +57,7 @@ def test_the_true_tip_model_fits_best(tip):
 def test_position_and_rotation_of_a_solid_tip_are_found_from_complete_frames():
     true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=-2.0)
     found = fit_centre(frames(TIP, true), THETA, TIP, RUBBER, GRID, NOISE)
-    assert found.centre == pytest.approx(true.centre, abs=6e-5)  # noise: about 2e-5
+    assert found.centre == pytest.approx(true.centre, abs=6e-5)  # The noise is about 2e-5.
     assert 2e-5 < found.std < 1e-4
     assert found.rotation == pytest.approx(-2.0, abs=0.03)
 

@@ -42,12 +42,12 @@ def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
 @pytest.mark.parametrize(
     ("d", "degrees", "azimuth"),
     [
-        (1e-5, 0.0, 0.0),  # the footprint is smaller than a cell
+        (1e-5, 0.0, 0.0),  # The footprint is smaller than a cell.
         (2e-4, 5.0, 1.0),
         (1e-3, 10.0, 0.3),
         (4e-3, 30.0, 0.7),
         (8e-3, 30.0, 2.2),
-        (8e-3, 36.0, 0.4),  # almost at the rim
+        (8e-3, 36.0, 0.4),  # The footprint almost reaches the rim.
     ],
 )
 def test_cell_averages_for_all_kinds_of_cells(material, d, degrees, azimuth):
@@ -57,7 +57,7 @@ def test_cell_averages_for_all_kinds_of_cells(material, d, degrees, azimuth):
     touched = np.argwhere(p > 0.0)
     order = np.argsort(p[p > 0.0])
     allowed = 1e-5 if degrees < 30.0 else 1e-4 if degrees < 36.0 else 1e-3
-    # Use the weakest cells, which the outline cuts, and some of the others.
+    # Use the weakest cells, which the outline cuts, and some other cells.
     chosen = np.unique(np.concatenate([order[:25], order[:: max(1, len(order) // 15)]]))
     for row, col in touched[chosen]:
         expected = cell_mean(grid, material, d, tilt_x, tilt_y, row, col)
@@ -90,7 +90,7 @@ def test_beyond_the_limit_the_strain_is_cut_off_at_the_rim(d, degrees, force, az
 def test_a_rotated_sensor_sees_the_tilt_rotated_back():
     plain = SensorGrid(44, 44, PITCH)
     turned = SensorGrid(44, 44, PITCH, rotation=math.pi / 2)
-    # The sensor's x axis lies along the finger's y axis.
+    # The sensor's x axis is parallel to the finger's y axis.
     np.testing.assert_allclose(
         turned.pressure(TIP, LINEAR, 0.003, 0.0, 0.25),
         plain.pressure(TIP, LINEAR, 0.003, 0.25, 0.0),

@@ -50,18 +50,18 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         # Both servos are configured.
         (BOTH, [servo(1), servo(2)], []),
         (BOTH, [servo(1), servo(2), servo(9)], ["stranger 9@2000000"]),
-        # A correct ID at another rate identifies the expected servo.
+        # A correct ID at another baud rate identifies the expected servo.
         (
             BOTH,
             [servo(1, 57600), servo(2, 57600)],
             ["0: 57600 → 2000000 baud", "1: 57600 → 2000000 baud"],
         ),
-        # If one servo is missing and one is unexpected, they are the same servo.
+        # If one servo is missing and one servo is unexpected, both are the same servo.
         (BOTH, [servo(1), servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
         (BOTH, [servo(1), servo(7)], ["1: ID 7 → 2"]),
         (OTHER_IDS, [servo(1, 57600)], ["0: ID 1 → 11, 57600 → 2000000 baud"]),
-        # A servo whose finger is not in the scene cannot be the missing one. With factory settings
-        # at another rate, it cannot be assigned.
+        # A servo whose finger is not in the scene cannot be the missing servo. With factory
+        # settings at another baud rate, it cannot be assigned.
         (ONLY_LEFT, [servo(2)], ["missing 0", "stranger 2@2000000"]),
         (ONLY_RIGHT, [servo(1)], ["missing 1", "stranger 1@2000000"]),
         (ONLY_RIGHT, [servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
@@ -78,7 +78,7 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
             [servo(1, 57600), servo(1, 1_000_000), servo(2)],
             ["missing 0", "stranger 1@57600", "stranger 1@1000000"],
         ),
-        # An unpaced emulator replies at every rate.
+        # An emulator without line timing replies at every baud rate.
         (BOTH, [servo(servo_id, rate) for servo_id in (1, 2) for rate in RATES], []),
         # Servos with garbled replies are not configured, and their IDs are not assigned.
         (BOTH, [servo(1, 57600), Garbled(1, 57600)], ["missing 0", "missing 1"]),

@@ -61,7 +61,8 @@ def test_each_topic_is_published_on_every_nth_tick_or_frame():
     assert ticks["state"] == list(range(5, 2001, 5))
     assert ticks["stats"] == [3, 503, 1003, 1503]
     assert not set(ticks["state"]) & set(ticks["stats"])
-    for frames in listener.frames:  # every fourth frame of 100 Hz, i.e. 25 Hz
+    # The publisher sends every fourth frame of 100 Hz, which gives 25 Hz.
+    for frames in listener.frames:
         assert [seq // 4 for seq in frames] == list(range(len(frames)))
         assert len(frames) == pytest.approx(100, abs=1)
 
@@ -74,7 +75,7 @@ def test_rates_are_measured_over_the_last_second():
     assert rates.left == pytest.approx(80.0, abs=1.01)
     assert rates.right == pytest.approx(80.0, abs=1.01)
     assert rates.state == pytest.approx(50.0, abs=0.1)
-    assert rates.tactile == pytest.approx(40.0, abs=2.01)  # 20 Hz per finger
+    assert rates.tactile == pytest.approx(40.0, abs=2.01)  # Each finger has 20 Hz.
 
 
 @pytest.mark.parametrize(
@@ -100,7 +101,7 @@ def test_quantiles_match_the_samples_within_one_bin(count):
     for j, name in enumerate(TIMES):
         for share, told in zip(QUANTILES, spreads[name], strict=False):
             true = np.quantile(rows[:, j], share, method="inverted_cdf")
-            if true < 2.0**-30:  # all times below a nanosecond share one bin
+            if true < 2.0**-30:  # All times below a nanosecond share one bin.
                 assert told <= 2.0**-29, (name, share)
             else:
                 assert true * (1 - 1e-12) <= told <= true * (1 + 1 / 31), (name, share)

@@ -91,7 +91,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
         usual, finer = np.empty((2, 5, 1))
         ratios_at(gauss_rule(), circle_rule(material.degree), parts, *place, usual)
         ratios_at(gauss_rule(40), circle_rule(40), parts, *place, finer)
-        # Scaled by F tan θ, because ∂F/∂θ may pass through zero.
+        # Scale by F tan θ, because ∂F/∂θ may pass through zero.
         scale = np.abs(finer)
         scale[3] = max(scale[3], scale[0])
         assert np.all(np.abs(np.subtract(usual, finer)) <= tolerance * scale)
@@ -134,7 +134,7 @@ def test_values_outside_the_domain():
 radii = st.floats(1e-4, 1.0)
 moduli = st.floats(1.0, 1e9)
 fractions = st.floats(5e-8, 0.9999)  # fraction of the radius
-# Fraction of θ's limit; tilts close to denormal numbers have no relative precision.
+# Fraction of θ's limit. Tilts close to denormal numbers have no relative precision.
 shares = st.floats(-1.0, 1.0).map(lambda share: share if abs(share) > 1e-150 else 0.0)
 
 
@@ -152,8 +152,8 @@ def test_tilt_limit():
     assert TIP.theta_limit(0.02) == TIP.theta_limit(1.0) == 0.0
     assert math.isnan(TIP.theta_limit(math.nan))
     assert all(isinstance(TIP.theta_limit(d), float) for d in (0, 0.004, np.array(0.03)))
-    # The cosine of the limit is √(2ad − d²)/a, accurate in all digits even if asin((a − d)/a) is
-    # not.
+    # The cosine of the limit is √(2ad − d²)/a. This form is accurate in all digits, even where
+    # asin((a − d)/a) is not.
     d = 10.0 ** np.arange(-17.0, -2.0)
     np.testing.assert_allclose(
         np.pi / 2 - Fingertip(1.0).theta_limit(d),

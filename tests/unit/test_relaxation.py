@@ -53,7 +53,8 @@ def test_pressing_and_releasing_follow_the_prony_terms():
         lasting = float(hand.table(max(d, 0.0), float(hand.theta[0])).force) if d > 0.0 else 0.0
         rows.append((hand.t, lasting, float(hand.force[0])))
     t, lasting, force = np.array(rows).T
-    assert np.count_nonzero(np.diff((lasting > 0.0).astype(int))) >= 3  # pressed and released
+    # The tip is pressed and released.
+    assert np.count_nonzero(np.diff((lasting > 0.0).astype(int))) >= 3
 
     def followed(now: float, h: np.ndarray) -> np.ndarray:
         return (np.interp(now, t, lasting) - h) / np.array(TIMES)

@@ -67,7 +67,7 @@ def test_without_repetition_the_replay_ends_with_an_invalid_frame(tmp_path):
 
 def test_a_folder_of_frames_is_read_in_numerical_order(tmp_path):
     for k in range(5):
-        np.save(tmp_path / f"frame{k * 3}.npy", FRAMES[k])  # frame12 follows frame9
+        np.save(tmp_path / f"frame{k * 3}.npy", FRAMES[k])  # frame12 must follow frame9.
     recording = load_recording(tmp_path, 1.0, 50.0)
     assert np.array_equal(recording.counts, FRAMES)
     assert recording.t.tolist() == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])

@@ -66,7 +66,7 @@ def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
 def test_a_demo_with_an_endless_step_restarts(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
-    daemon.loop._task._end_mode = "moving"  # the task never reaches this mode
+    daemon.loop._task._end_mode = "moving"  # The task never reaches this mode.
     advance_to(daemon, "disarmed", 13.0)
     assert events[0][2].startswith("still holding after 10 s; the simulated hand's task stops")
     advance_to(daemon, "holding", 6.0)

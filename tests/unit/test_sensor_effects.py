@@ -40,12 +40,13 @@ def test_noise_has_the_configured_deviation_and_is_clipped_at_zero():
     clean = 0.2 * model.grid.pressure(TIP, LINEAR, *CONTACTS[2])
     strong = clean > 4000.0
     rest = np.concatenate([(counts(model, CONTACTS[2]) - clean)[strong] for _ in range(20)])
-    # Standard deviations of n numbers scatter by 1/√2n, means by 1/√n of the deviation.
+    # For n numbers, the standard deviation scatters by a fraction of 1/√2n, and the mean by 1/√n
+    # standard deviations.
     assert rest.std() == pytest.approx(600.0, rel=4.5 / np.sqrt(2 * rest.size))
     assert abs(rest.mean()) < 4.0 * 600.0 / np.sqrt(rest.size)
     free = counts(model, (0.0, 0.0, 0.0))
     assert (free == 0.0).mean() == pytest.approx(0.5, abs=0.05)
-    # A clipped normal distribution has the mean σ/√2π; with 1936 cells, 1 ± 0.033.
+    # A clipped normal distribution has the mean σ/√2π. With 1936 cells, the ratio is 1 ± 0.033.
     assert free.mean() == pytest.approx(600.0 / np.sqrt(2 * np.pi), rel=0.15)
 
 
@@ -64,7 +65,8 @@ def test_each_cell_has_its_own_gain_and_dead_cells_read_zero():
 
 @pytest.mark.parametrize("width", [1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
 def test_blur_is_the_continuous_convolution(width):
-    # The grid is smaller than the footprint: pressure beyond the grid's edge also spreads onto it.
+    # The grid is smaller than the footprint. Pressure beyond the edge of the grid also spreads onto
+    # the grid.
     blurred = SensorGrid(16, 20, PITCH, (3e-4, 5.3e-3), blur=width)
     model = sensor(replace(blurred, blur=0.0), blur=width)
     for contact in CONTACTS:
@@ -88,8 +90,8 @@ def test_hysteresis_affects_only_unloading_and_loops_close():
     assert force(0.004) == pytest.approx(1.0, abs=1e-9)
     assert force(0.0038) > 1.03
     assert force(0.002) == pytest.approx(1.1, abs=0.005)
-    assert 1.0 < force(0.0021) < 1.07  # reloading within the loop
-    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # the hysteresis loop is closed
+    assert 1.0 < force(0.0021) < 1.07  # The sensor is loaded again within the loop.
+    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # The hysteresis loop is closed.
     assert force(0.006) == pytest.approx(1.0, abs=1e-9)
     assert not counts(model, (0.0, 0.0, 0.0)).any()
 
@@ -201,14 +203,14 @@ def test_offset_drift_has_the_configured_deviation_and_time_constant():
     offset = np.zeros((60, 60))
     rng = np.random.default_rng(2)
     sensor_model.drift(offset, 50.0, 60.0, 0.01, rng.standard_normal(offset.shape))
-    # The drift is initially a random walk with deviation · √(2 t / time).
+    # At first, the drift is a random walk with deviation · √(2 t / time).
     assert offset.std() == pytest.approx(50.0 * math.sqrt(2 * 0.01 / 60.0), rel=0.05)
     for _ in range(40):
         sensor_model.drift(offset, 50.0, 60.0, 20.0, rng.standard_normal(offset.shape))
     assert offset.std() == pytest.approx(50.0, rel=0.05)
     earlier = offset.copy()
     sensor_model.drift(offset, 50.0, 60.0, 60.0, rng.standard_normal(offset.shape))
-    # With 3600 cells the scatter is 0.018.
+    # With 3600 cells, the scatter is 0.018.
     assert np.mean(offset * earlier) / 50.0**2 == pytest.approx(math.exp(-1), abs=0.08)
 
 
@@ -217,7 +219,7 @@ def test_crosstalk_is_a_fraction_of_both_line_means():
     signal = counts(sensor(), CONTACTS[1])
     expected = signal + 0.3 * (signal.mean(axis=0) + signal.mean(axis=1)[:, None])
     np.testing.assert_allclose(counts(model, CONTACTS[1]), expected, atol=1.01)
-    assert expected[0].max() > 100.0  # the ghost image away from the contact
+    assert expected[0].max() > 100.0  # This cell belongs to the ghost image away from the contact.
 
 
 @pytest.mark.parametrize("least", [0, 3])

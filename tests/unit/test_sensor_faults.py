@@ -15,10 +15,10 @@ from tests.unit.test_control import grasped
 FORCE = 6.0
 BOTH = {"consistency.left_sensor", "consistency.right_sensor"}
 
-# Faults: (kind, value, duration [s], fingers, expected events, expected mode afterwards). A falling
-# zero offset hides a light touch completely; the joints then hold their position, or, if only one
-# tip seems to let go, its frames are rejected. A rising zero offset is visible next to the
-# footprint.
+# Each fault has its kind, value, duration [s], fingers, expected events and expected mode
+# afterwards. A falling zero offset hides a light touch completely. The joints then hold their
+# position. If only one tip seems to let go, its frames are rejected instead. A rising zero offset
+# is visible next to the footprint.
 LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
     "one zero sinks": ("drift", -0.1, 1.0, (0,), {"consistency.left_sensor"}, "armed"),
     "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, "armed"),
@@ -56,7 +56,7 @@ def test_a_measurement_fault_is_named_and_has_no_effect(lie: str) -> None:
         assert hand.mode == mode
         if mode == "holding":
             assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.1)
-        if mode == "fault":  # as for missing frames, because no sensor is valid
+        if mode == "fault":  # As with missing frames, no sensor is valid.
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 
@@ -195,7 +195,7 @@ def test_real_loads_and_turns_are_not_measurement_faults(load: tuple[float, floa
 
 
 def given(repeats: RepeatDetector, frames: list[float]) -> bool:
-    for number in frames:  # an increase by a tenth affects only one cell
+    for number in frames:  # An increase by a tenth affects only one cell.
         repeats.update(np.array([number, number, number, 10.0 * number]).astype(np.uint16))
     return repeats.is_fault
 

@@ -134,7 +134,7 @@ def test_connect_leaves_torque_off_and_reads(make, mode):
     rig.servos.connect()
     assert rig.torque() == [False, False]
     first, second = ticks(rig, Goal(q=[0.3, 0.3], current=[1.0, 1.0]), 0.004)[:2]
-    assert first.q == second.q == [0.0, 0.0]  # a goal has no effect while torque is off
+    assert first.q == second.q == [0.0, 0.0]  # A goal has no effect while torque is off.
     assert first.current == [0.0, 0.0]
     assert second.t >= first.t
     assert first.alert == 0
@@ -213,7 +213,7 @@ def test_torque_off_and_close_release_the_joints(make, mode):
 def test_a_finger_outside_the_scene_stays_zero(make, mode):
     rig = make(mode, scene={"fingers": ("right",)})
     if isinstance(rig, DynamixelRig):
-        put_fault(rig.bus, "silent=1", 0.0)  # the test does not address this servo
+        put_fault(rig.bus, "silent=1", 0.0)  # The test does not address this servo.
     armed(rig)
     reading = ticks(rig, Goal(q=[0.1, -0.1], current=[0.4, 0.4]), 0.4)[-1]
     assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0

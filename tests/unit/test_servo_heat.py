@@ -141,7 +141,7 @@ def test_servo_constants_are_identified_from_a_hold(tmp_path, monkeypatch, capsy
     assert told == pytest.approx(t, rel=0.05)
     follow(law(state).array, 1.0, 0.5, 25.0)
     state.x[:3] = 25.0
-    # This prediction uses the model's constants.
+    # This prediction uses the constants of the model.
     assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2
 
 
@@ -179,7 +179,7 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
         assert {level for level, _ in told} == {"warning"}
         eased = hand.state.goal.force
         assert eased < 22.0
-        hand.command("grasp", force=24.0)  # requested again while hot
+        hand.command("grasp", force=24.0)  # The force is requested again while the servos are hot.
         hand.run(1.0)
         assert hand.state.goal.force == pytest.approx(eased)
 

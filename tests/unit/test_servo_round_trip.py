@@ -13,9 +13,10 @@ from tests.harness.servos import RADIAN, DirectPort, make_bus
 ADDRESSES = st.one_of(
     st.sampled_from([7, 11, 64, 65, 98, 100, 102, 104, 108, 116, 126, 132, 168, 224, 578, 634]),
     st.integers(0, 663),
-    st.integers(640, 663),  # reads extend beyond the end here
+    st.integers(640, 663),  # Some of these reads extend beyond the end of the table.
 )
-# FF and FD are frequent so that stuffing is needed, and small numbers because they are valid.
+# FF and FD are frequent so that stuffing is needed, and small numbers are frequent because they are
+# valid.
 DATA = st.one_of(
     st.lists(st.sampled_from([0xFF, 0xFD, 0, 1, 5, 100]), min_size=1, max_size=20).map(bytes),
     st.binary(min_size=1, max_size=20),
@@ -33,7 +34,7 @@ STEPS = st.one_of(
 
 
 def placed(angles: tuple[float, float]) -> ServoBus:
-    # The check below protects the status and ID registers, so the servos stay reachable.
+    # The check below protects the status and ID registers, so that the servos stay reachable.
     return make_bus("XM430-W210", for_daemon=True, counts=[angle / RADIAN for angle in angles])
 
 
@@ -62,7 +63,7 @@ def test_any_instruction_equals_direct_access(steps, angles):
                 continue
             if kind == "write":
                 result, error = handler.writeTxRx(port, servo_id, address, len(what), list(what))
-                error &= 0x7F  # bit 7 reports a hardware error, which limits may cause
+                error &= 0x7F  # Bit 7 reports a hardware error, which limits may cause.
                 assert (result, error) == (
                     sdk.COMM_SUCCESS,
                     servos[servo_id].write(address, what, t),

@@ -80,7 +80,8 @@ def test_every_profile_is_valid_and_refers_to_the_schema(path, tmp_path):
 def test_a_bare_name_is_a_packaged_profile_in_any_folder(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert load(Path(name), tmp_path) == load(CONFIG / f"{name}.toml", tmp_path)
-    (tmp_path / name).write_text("loop.rate = 123.0\n")  # a local file takes precedence
+    # A local file takes precedence over a built-in profile.
+    (tmp_path / name).write_text("loop.rate = 123.0\n")
     assert load(Path(name)).loop.rate == 123.0
 
 
@@ -159,7 +160,7 @@ def test_wrong_values_do_not_hide_contradictions_between_other_keys(tmp_path):
         "hand.open_angle.1",
         "tip.radius",
         "hand.q_max",
-        "servos.ids",  # without safety.d_max, which was compared with another radius
+        "servos.ids",  # safety.d_max is missing here, because it was compared with another radius.
     ]
 
 

@@ -63,7 +63,7 @@ def test_goals_are_whole_counts():
 
     goal_q, bound = bench.hand.plant.goals.q, bench.hand.plant.goals.current
     np.testing.assert_allclose(goal_q / COUNT, np.round(0.1003 / COUNT), rtol=1e-12)
-    # A limit is rounded down, so that the servo never exceeds it.
+    # The limit is rounded down, so that the servo never exceeds it.
     np.testing.assert_allclose(bound / CURRENT_UNIT, math.floor(0.3 / CURRENT_UNIT), rtol=1e-12)
 
 
@@ -112,7 +112,7 @@ def test_a_tip_softer_than_the_settings_gives_less_pressure():
         )
         sensor = bench.sensors[0]
         sensor.open()
-        # The object moves 18 mm onto the left tip at 20 mm/s.
+        # The object moves by 18 mm at 20 mm/s onto the left tip.
         bench.clock.sleep_until(0.8)
         frame = sensor.latest()
         sums.append(float(frame.data.sum()) * 4.0 * bench.settings.tactile.pitch**2)
@@ -156,7 +156,8 @@ def test_dropped_frames_count_as_missed_once_a_later_one_arrives():
     numbers = np.array([number for number, _ in found])
     assert len(numbers) == arrivals.arrived
     assert arrivals.arrived + arrivals.missed == numbers[-1] + 1
-    assert arrivals.missed / 5000 == pytest.approx(0.2, abs=0.025)  # ± 0.0057
+    # The standard deviation is 0.0057.
+    assert arrivals.missed / 5000 == pytest.approx(0.2, abs=0.025)
     assert np.diff(numbers).max() > 2
 
 

@@ -14,8 +14,8 @@ from tests.harness.plant import push_along
 from tests.unit.test_control import KNOWN, PAPER, grasped
 
 FORCE = 10.0
-BORNE = 2.0 * 0.6 * FORCE  # N, load that the friction of both tips can carry at this grip force
-FRICTION = 0.05 / 0.03  # N, load that joint friction can hide at a moment arm of 30 mm
+BORNE = 2.0 * 0.6 * FORCE  # load that the friction of both tips can carry at this grip force [N]
+FRICTION = 0.05 / 0.03  # load that joint friction can hide at a moment arm of 30 mm [N]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_an_object_that_twists_in_the_grip_is_gripped_with_more_force():
         with Hand({"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             start = hand.plant.object_pose[2]
-            # The friction of both tips resists about 0.25 N·m over the object's width.
+            # Over the object's width, the friction of both tips resists about 0.25 N·m.
             for k in range(1, 76):
                 hand.plant.apply_load(0.0, 0.0, 0.4 * k / 75)
                 hand.watch(0.02)
@@ -124,7 +124,7 @@ class GripUnderLoad:
 
 
 def test_a_load_is_detected_only_beyond_joint_friction():
-    watched = GripUnderLoad(friction_speed=1e6)  # no correction for friction while closing
+    watched = GripUnderLoad(friction_speed=1e6)  # Friction is not compensated while closing.
     watched.run(1.5, 500, holding=False)
     watched.grip.begin_holding()
     assert watched.run(1.5, 500) == FORCE
@@ -146,12 +146,12 @@ def at_rest(asked: float = FORCE) -> GripUnderLoad:
     return watched
 
 
-GIVES_WAY = -0.024  # rad/s, one count
+GIVES_WAY = -0.024  # one velocity count [rad/s]
 
 
 def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     watched = at_rest()
-    # Without joint motion, a jump is a frame error, and a load within the friction is harmless.
+    # Without joint motion, a jump is a frame error. A load within the friction is harmless.
     assert watched.run(3.0 * FRICTION, 1) == FORCE
     watched = at_rest()
     assert watched.run(0.8 * FRICTION, 1, speed=GIVES_WAY) == FORCE
@@ -159,10 +159,10 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
     assert state.grip_force > 1.15 * (FORCE + 10.0), "must take effect on the same tick"
-    # The limit is the sum of torque constant error, friction and load.
+    # The limit adds torque constant error, friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9
-    # The measured force rises, so the controller now holds the force set by the reflex.
+    # The measured force rises, so the controller now holds the force that the reflex has set.
     watched.held.force = [FORCE + 10.0] * 2
     watched.run(2.0 * FRICTION, 1)
     assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
@@ -190,7 +190,7 @@ def test_shear_of_solid_tips_reveals_a_load(kind):
     watched = at_rest()
     setattr(watched.held, kind, -1.0)
     assert watched.run(0.0, 500) == FORCE
-    setattr(watched.held, kind, -3.5)  # a sudden load of this size exceeds half of the capacity
+    setattr(watched.held, kind, -3.5)  # A sudden load of this size exceeds half of the capacity.
     assert watched.run(0.0, 1) == FORCE + 10.0
 
 

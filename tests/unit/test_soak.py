@@ -71,7 +71,7 @@ def test_torque_after_a_stop_is_detected(soak):
     control = soak.daemon.loop._control
     before = control.state
     soak.daemon.loop.command({"command": "stop"})
-    control.state = before  # simulates a missed stop
+    control.state = before  # This line simulates a missed stop.
     soak._carried_out({"command": "stop"}, "holding")
     with pytest.raises(AssertionError, match="after a stop while holding: a motor is driven"):
         soak.run(3)
@@ -104,7 +104,7 @@ def test_reported_channels_are_compared_with_the_actual_faults(soak):
     soak._hear("warning", "consistency.left_sensor", "")
     with pytest.raises(AssertionError, match="right_sensor named"):
         soak._hear("warning", "consistency.right_sensor", "")
-    soak.hand.object_pose[1] += 0.02  # the object's edge is now at the tips
+    soak.hand.object_pose[1] += 0.02  # The edge of the object is now at the tips.
     soak.hand.refresh()
     soak._judge_sensor_faults("holding")
     soak._hear("warning", "consistency.right_sensor", "")

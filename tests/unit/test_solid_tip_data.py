@@ -13,7 +13,8 @@ from research.solid_tip.green import Meridian
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
 REFERENCE = Path(__file__).parents[1] / "golden" / "solid_frames.npz"
 BASES = ("bonded", "lying", "bonded-sticking", "lying-sticking")
-PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0  # in tip radii
+# Pitch, number of cells, and a millimetre, in tip radii.
+PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0
 
 
 def centroid_and_extent(frame: NDArray[np.float64], pitch: float) -> tuple[float, float, float]:
@@ -34,9 +35,9 @@ def tips(arrays: dict[str, np.ndarray]) -> list[SolidTip]:
     return [SolidTip(arrays, base, poisson) for base in BASES for poisson in (*NU, 0.49)]
 
 
-# From a different method: triangles and tetrahedra with quadratic displacements and linear
-# pressures (Taylor-Hood), and a plane with a penalty at points within the faces. Neo-Hookean,
-# bonded, ν = 0.49, a = 20 mm, E = 0.304 MPa.
+# Values from a different method: triangles and tetrahedra with quadratic displacements and linear
+# pressures (Taylor-Hood), and a plane with a penalty at points within the faces. The tip is
+# Neo-Hookean and bonded, with ν = 0.49, a = 20 mm and E = 0.304 MPa.
 TAYLOR_HOOD = [  # d [mm], θ [°], N [N], tolerance
     (0.9985, 0, 2.8482, 3e-3),
     (1.9979, 0, 8.9695, 3e-3),
@@ -73,7 +74,7 @@ def test_frames_match_three_dimensional_elements(arrays):
         rows = list(zip(*(data[name] for name in names), strict=True))
     areas = np.pi * np.diff(arrays["ring_edges"] ** 2)
     place = (np.arange(CELLS) - (CELLS - 1) / 2) * PITCH
-    inner = np.hypot(*np.meshgrid(place, place)) < 0.94  # the stress at the rim is singular
+    inner = np.hypot(*np.meshgrid(place, place)) < 0.94  # The stress at the rim is singular.
     assert {str(row[0]) for row in rows} == set(BASES)
     assert max(row[3] for row in rows) > 0.2
     for base, poisson, d, theta, push, energy, force, frame in rows:

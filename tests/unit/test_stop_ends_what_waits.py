@@ -38,11 +38,12 @@ class Scene:
         self.arrived: deque[list[zmq.Frame]] = deque()
         self.replies: list[dict[str, Any]] = []
         self.served = Served(commands=f"ipc://{folder}/c", per_second=1e6, clock=self.clock)
-        self.reading = 0.4 * bounds.TURN_TIME  # s per message read, so few are read per step
+        # Time per message read [s], with which a step reads few messages.
+        self.reading = 0.4 * bounds.TURN_TIME
         self.now = 0
         self.stopped_at = 0
         self.asked = 0
-        self.last: dict[int, float] = {}  # last arm of each client, which may be sent again
+        self.last: dict[int, float] = {}  # last arm request of each client, which may be sent again
         self.carried_out: set[float] = set()
         self.busy = False
 
@@ -114,12 +115,12 @@ def test_no_request_from_before_a_stop_is_executed(actions):
     with played() as scene:
         for what, client in actions:
             scene.act(what, client)
-        for _ in range(100):  # everything sent has been read, including stops
+        for _ in range(100):  # The loop reads everything that was sent, including stops.
             scene.act("gateway")
             scene.act("loop")
         asked = scene.asked
         assert len(scene.replies) == asked, "each request must have exactly one reply"
-        # Later requests are executed.
+        # Requests that are sent later are executed.
         scene.ask(0, command="arm", force=1e9)
         for _ in range(3):
             scene.act("gateway")

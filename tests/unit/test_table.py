@@ -30,7 +30,7 @@ HARD = {
     "s-shaped": Material.from_points(Y, 1e5 * (Y + 0.12 * np.sin(6.0 * Y))),
     "root": Material.from_points(Y, 1e5 * Y**0.7),
 }
-# In a loop, the compiler may fuse different products with their sums than in a function call.
+# A loop and a function call may fuse different products with their sums.
 FUSED = 1e-12
 OUTPUTS = ("force", "energy", "force_d", "force_theta", "energy_d", "energy_theta")
 
@@ -179,7 +179,7 @@ def test_lookups_outside_the_domain_cause_a_warning(table):
         table(d, theta)
     assert [each.filename for each in caught] == [__file__]
     assert table(d, theta, edge=True).inside.sum() == 3
-    table(d[:3], theta[:3])  # a warning would raise an error
+    table(d[:3], theta[:3])  # A warning would raise an error.
     table(0.008, -float(TIP.theta_limit(0.008)) * (1.0 + 1e-15))
 
 

@@ -133,7 +133,7 @@ def test_failed_arming_is_a_fault_with_torque_off(make):
 
 def test_a_stall_that_trips_the_servo_watchdog_is_a_fault(make):
     daemon = grasped(make(), 6.0)
-    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # the process was suspended
+    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # The process was suspended here.
     advance_to(daemon, "fault", 0.1)
     assert "watchdog" in daemon.loop.state.fault
     daemon.loop.advance(0.2)
@@ -147,7 +147,7 @@ def test_a_stall_that_trips_the_servo_watchdog_is_a_fault(make):
 def test_stop_and_disarm_always_turn_torque_off(make):
     daemon = make()
     for name, more in (("stop", {}), ("disarm", {}), ("stop", {"client": 5, "why": "smoke"})):
-        daemon.loop.torque.servos.torque_on()  # another program might do this
+        daemon.loop.torque.servos.torque_on()  # Another program might switch torque on.
         assert command(daemon, name, **more)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
         assert not torque_of(daemon).any()

@@ -26,7 +26,7 @@ from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
 
-ROOM = 200e6  # bytes in addition to those already mapped
+ROOM = 200e6  # number of bytes in addition to those already mapped
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +64,7 @@ def comments(path: Path) -> None:
     path.write_text("# nothing\n" * 3_000_000)
 
 
-@pytest.mark.timeout(120)  # s, on a busy machine
+@pytest.mark.timeout(120)  # timeout on a busy machine [s]
 @pytest.mark.parametrize("make", [fifo, zeros, comments])
 @pytest.mark.parametrize("read", READERS.values(), ids=READERS)
 def test_special_files_are_reported(tmp_path, make, read):
@@ -86,7 +86,7 @@ PROFILES = {
 }
 
 
-@pytest.mark.timeout(120)  # s, on a busy machine
+@pytest.mark.timeout(120)  # timeout on a busy machine [s]
 @pytest.mark.parametrize("text", PROFILES.values(), ids=PROFILES)
 def test_a_malformed_profile_is_reported_quickly_and_briefly(tmp_path, text):
     path = tmp_path / "my.toml"
@@ -138,7 +138,7 @@ FRAMES: dict[str, tuple[str, Callable[[Path], object]]] = {
 }
 
 
-@pytest.mark.timeout(120)  # s, on a busy machine
+@pytest.mark.timeout(120)  # timeout on a busy machine [s]
 @pytest.mark.parametrize(("name", "make"), FRAMES.values(), ids=FRAMES)
 def test_frames_beyond_the_end_of_the_file_are_reported(tmp_path, name, make):
     make(tmp_path / name)
@@ -200,7 +200,7 @@ def chunks_of_holes(path: Path) -> None:
     with path.open("wb") as file:
         file.write(head())
         for _ in range(256):
-            empty = record(7, bytes(9 << 20))  # readers skip this record
+            empty = record(7, bytes(9 << 20))  # Readers skip this record.
             packed = chunk("", empty, len(empty))
             file.write(packed[:100])
             file.seek(len(packed) - 100, os.SEEK_CUR)

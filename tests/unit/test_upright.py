@@ -15,7 +15,7 @@ from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_alon
 # Half the distance between the pivots, finger length, finger offset and tip radius.
 LENGTHS = (0.05, 0.08, 0.0, 0.02)
 START = math.radians(5.0)
-DEPTH, FORCE = 0.0032, 10.0  # the paper's tip has this force at this depth
+DEPTH, FORCE = 0.0032, 10.0  # The paper's tip has this force at this depth.
 spring_of = upright_spring.py_func
 
 
@@ -95,8 +95,8 @@ def test_the_upright_law_does_not_use_the_angle(sense, angle_known, simulation):
 
 
 def test_solid_tips_bring_the_object_upright() -> None:
-    # Bonded rubber has no local minimum; the control law uses a different spring, from the tips'
-    # own table.
+    # Bonded rubber has no local minimum. The control law therefore uses a different spring, from
+    # the tips' own table.
     sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
     simulation = {"object_angle": START}
     with SimulatedDaemon(
@@ -133,7 +133,7 @@ def test_a_decreasing_grip_force_does_not_hold_the_dither_on_one_side():
         assert goal.force > 1.1 * FORCE
         hand.plant.apply_load(0.0, 0.0)
         hand.run(0.1)
-        hand.command("grasp", force=FORCE)  # the force decreases a second later, during the dither
+        hand.command("grasp", force=FORCE)  # The force decreases a second later, during the dither.
         turned = np.abs(hand.watch(3.5).angle).max()
         assert hand.mode == "holding"
         assert goal.force == pytest.approx(FORCE, rel=0.01)

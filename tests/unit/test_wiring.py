@@ -88,7 +88,7 @@ def greatest_force(daemon: Daemon, seconds: float) -> float:
     return greatest
 
 
-OFF = [0.004, -0.006]  # m, offset of the object from the middle
+OFF = [0.004, -0.006]  # offset of the object from the middle [m]
 HEAVY = {"object_mass": 0.5, "table_friction": 0.5}
 
 
@@ -104,7 +104,8 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
 
 
 def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
-    daemon = make("swapped")  # the approach of a centred object is the same for both
+    # The approach of a centred object is the same with and without a swap.
+    daemon = make("swapped")
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 2.0)
     assert daemon.loop.state.mode == "holding"
@@ -136,7 +137,7 @@ def texts(events: list[tuple[str, str, str]], kind: str) -> list[str]:
     return [text for _, found, text in events if found == kind]
 
 
-EMPTY = {"object_position": (0.0, 0.3)}  # out of reach
+EMPTY = {"object_position": (0.0, 0.3)}  # The object is out of reach.
 
 
 @pytest.mark.parametrize(
@@ -146,7 +147,7 @@ def test_fingers_that_open_are_reported_before_they_reach_their_stop(make, wirin
     daemon = make(wiring, **simulation)
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q.min() > -0.54:  # the joint's stop is at -0.55
+    while daemon.hand.q.min() > -0.54:  # The joint's stop is at -0.55 rad.
         daemon.loop.advance(0.02)
     (text,) = texts(events, "joint.opens")
     assert "neither tip has contact: if a finger opens" in text
@@ -175,7 +176,7 @@ def test_fingers_that_stand_in_the_approach_are_reported(make):
     daemon = make("reversed")
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q[0] > -0.54:  # until the joint reaches its stop
+    while daemon.hand.q[0] > -0.54:  # Wait until the joint reaches its stop.
         daemon.loop.advance(0.02)
     daemon.loop.advance(1.0)
     (told,) = [text for level, kind, text in events if kind == "joint.blocked"]

@@ -86,7 +86,7 @@ def _one_of_many(arguments: argparse.Namespace, settings: Settings, path: Path) 
 
 
 def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> str:
-    path = path if path.name else path.resolve()  # "." has no name
+    path = path if path.name else path.resolve()  # The path "." has no name.
     table = arguments.csv or path.with_name(path.name + ".contacts.csv")
     own = arguments.config is None and not arguments.set
     source = open_source(path, settings, own)
@@ -281,7 +281,7 @@ class Contacts:
 
     finger: str
     t: FloatArray
-    invalid: NDArray[np.int64]  # one `Invalid` per frame
+    invalid: NDArray[np.int64]  # one `Invalid` value per frame
     contact: NDArray[np.bool_]
     values: dict[str, FloatArray]
     truths: dict[str, FloatArray]

@@ -53,7 +53,7 @@ LINES: dict[str, dict[str, Any]] = {
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
 _POINTS = 700  # maximum number of points per finger and panel; more points would overlap
-# label, factor, field of the fingers or the object, field of the goal
+# Label, factor, field of the fingers or the object, and field of the goal.
 _AGAINST_TIME = (
     ("force F [N]", 1.0, "force", "goal_force"),
     ("object angle [°]", DEGREES, "angle", "goal_angle"),
@@ -61,7 +61,7 @@ _AGAINST_TIME = (
     ("tilt θ [°]", DEGREES, "theta", ""),
 )
 _CURVES = 5
-_GRID = 241  # landscape nodes per axis
+_GRID = 241  # number of landscape nodes per axis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Plot a recording; may raise RecordingError, Missing, MissingExtra or OSError."""
-    require("plot")  # fail early, before reading a long recording
+    require("plot")  # Fail early, before reading a long recording.
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
     # Reject files that are not recordings before loading the kernels.
@@ -119,7 +119,7 @@ class RecordedRun:
     models: tuple[FingerModel, FingerModel] | None
     why_no_model: str
     states: dict[str, NDArray[Any]]
-    zero: int  # ns, daemon clock at t = 0
+    zero: int  # daemon clock at t = 0 [ns]
 
     @cached_property
     def t(self) -> FloatArray:
@@ -248,7 +248,7 @@ def _against_angle(
 
     depths = _depths(seen["d"])
     widest = max(1.1 * float(np.abs(seen["theta"]).max()), 5.0 / DEGREES)
-    # Omit the yellow end of the colour map, which is too faint in print.
+    # Omit the yellow end of the colour map, because it is too faint in print.
     scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)
     for depth in depths:
         limit = float(table.tip.theta_limit(depth))

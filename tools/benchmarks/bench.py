@@ -39,7 +39,7 @@ _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d
 _CASES = ("faults", "robustness")
 # Options that apply only to some measurements.
 _OWN = {"full": ("reflex",), "trials": _CASES, "only": _CASES}
-FAILED = 1  # exit status; 2 is for invalid arguments
+FAILED = 1  # exit status of a failed benchmark; 2 is for invalid arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -132,7 +132,7 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
         more["sweep"] = sweep
     try:
         tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
-    # For example, because a grip was lost on a busy machine.
+    # A benchmark may fail, for example because a grip was lost on a busy machine.
     except (RuntimeError, SoftfingerError) as error:
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:

@@ -32,11 +32,11 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 _FORCE = 10.0  # N
 _ANGLE_STD = math.radians(5.0)
 _DRAW_COUNT = 12
-_READ_TIME = 5.0  # s, from the grasp command to the final angle measurement
-_STEERING_TIME = 2.0  # s, final part of this time, in which the angle is controlled to 0
+_READ_TIME = 5.0  # time from the grasp command to the final angle measurement [s]
+_STEERING_TIME = 2.0  # final part of the reading time, in which the angle is controlled to 0 [s]
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
-# Hz, bandwidths of the angle integral. The slow bandwidth is stable for all these delays, because ω
-# × delay < π/2. The fast bandwidth is the default of `control.rotate_bandwidth`.
+# Bandwidths of the angle integral [Hz]. The slow bandwidth is stable for all these delays, because
+# ω × delay < π/2. The fast bandwidth is the default of `control.rotate_bandwidth`.
 _SLOW_BANDWIDTH, _FAST_BANDWIDTH = 0.5, 4.0
 
 
@@ -99,10 +99,10 @@ class Way(NamedTuple):
     control: Mapping[str, Any] = _DEFAULT
     tips: Sections = _DEFAULT
     aim: float | None = None
-    is_steered: bool = False  # the measured angle is controlled to 0
+    is_steered: bool = False  # True if the measured angle is controlled to 0
     law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's control law
     force: float = _FORCE
-    # N, load along x and y, applied after the grip is established.
+    # Load along x and y that is applied after the grip is established [N].
     weight: tuple[float, float] = (0.0, 0.0)
 
 
@@ -162,7 +162,7 @@ LATE_LIMITS = {
     for name, (control, law) in _STEERED_LAWS.items()
     for delay in DELAYS
 }
-# Relaxed tips without coupling have four times the curvature of spring tips at the energy minimum.
+# At the energy minimum, relaxed tips without coupling have four times the curvature of spring tips.
 # Tips with less than three quarters of the tangential stiffness have an energy maximum instead.
 _TIPS: dict[str, Sections] = {
     "solid": SOLID,
@@ -234,7 +234,7 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float:
             hand.run(hand.loop.period)
         hand.plant.apply_load(*way.weight)
         hand.run(begun + _READ_TIME - _STEERING_TIME - hand.now)
-        if way.is_steered:  # do not wait for a force, because not every law measures it
+        if way.is_steered:  # Do not wait for a force, because not every control law measures it.
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERING_TIME)
         is_held = min(hand.plant.force) > 0.0

@@ -46,7 +46,7 @@ TIP = Fingertip(radius=0.020)
 SOLID = Fingertip(0.020, "solid")
 MODULUS = 0.304e6  # Pa
 LINEAR = Material.constant(MODULUS)
-SIZE, WIDTH = 44, 0.058  # cells per side; m
+SIZE, WIDTH = 44, 0.058  # cells per side, width [m]
 NOISE = 0.002 * MODULUS
 _PASCAL_PER_COUNT = 4.0
 _FRAME_COUNT = 32
@@ -54,9 +54,9 @@ _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 
 LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
-_D_MAX, _TILT_MAX = 0.008, math.radians(30.0)  # m, rad
-_SINGLE_POINT_COUNT = 16  # points used in turn by calls with floats
-_CALL_AIM_NS = 800.0  # ns, target time of one call
+_D_MAX, _TILT_MAX = 0.008, math.radians(30.0)  # [m], [rad]
+_SINGLE_POINT_COUNT = 16  # number of points used in turn by calls with floats
+_CALL_AIM_NS = 800.0  # target duration of one call [ns]
 
 
 def rms_errors(found: FloatArray, truth: Truth) -> dict[str, float]:
@@ -150,7 +150,7 @@ def frames_to_contacts(rounds: int) -> Report:
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
     times = {name: taken / _FRAME_COUNT for name, taken in interleave(subjects, rounds).items()}
-    # Use the minimum, because other load on the machine affects it least.
+    # Use the minimum, because other load on the machine affects the minimum least.
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
     for name, (run, truth, aim) in cases.items():

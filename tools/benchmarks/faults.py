@@ -26,25 +26,26 @@ from softfinger.tools.benchmarks.rigs import SOLID, Sections
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIAL_COUNT = 20
-_FORCES = (6.0, 12.0)  # N, requested forces
+_FORCES = (6.0, 12.0)  # requested forces [N]
 _EVENT_PREFIX = "consistency."  # prefix of the event kinds that report a faulty measurement
 
-# Criteria: forces relative to the requested force, times in s.
+# Criteria. Forces are relative to the requested force, and times are in seconds.
 SETTLES = "settles at 0.8 to 1.2 without a force increase"
 BOUNDED = "≤ 50 ms above 1.3, reported within 0.3 s"
 _SETTLED_RANGE = (0.8, 1.2)
-_EXCESS_TIME_MAX = 0.05  # s above 1.3
-_REPORT_TIME_MAX = 0.3  # s, time after the error reached half of its final value
+_EXCESS_TIME_MAX = 0.05  # maximum time above 1.3 times the requested force [s]
+_REPORT_TIME_MAX = 0.3  # report time limit, counted from half of the final error [s]
 _SLIDE_MAX = 0.010  # m
 
 # Phases of a trial.
-_GRIP_TIMEOUT = 2.5  # s, time limit for establishing the hold
-_REST_TIME = 1.2  # s, undisturbed hold
-_OBSERVATION_TIME = 5.0  # s, observation after the fault
-_REPEATED_LAG = 1.0  # s, from the fault to the second force request
+_GRIP_TIMEOUT = 2.5  # time limit for establishing the hold [s]
+_REST_TIME = 1.2  # duration of the undisturbed hold [s]
+_OBSERVATION_TIME = 5.0  # observation time after the fault [s]
+_REPEATED_LAG = 1.0  # time from the fault to the second force request [s]
 
 _SENSORS = ("left_sensor", "right_sensor")
-# Full scale of 127.5 kPa, as on real tactile boards. The simulated sensor's default is 262 kPa.
+# Full scale of 127.5 kPa, as on real tactile boards. The default of the simulated sensor is 262
+# kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
@@ -59,12 +60,12 @@ class FaultCase:
 
     name: str
     aim: str
-    force: float  # N, requested
+    force: float  # requested force [N]
     words: str = ""
     false: tuple[str, ...] = ()  # channels that may be reported as faulty
-    comes: float = 0.0  # s, duration of the fault's onset
+    comes: float = 0.0  # time over which the fault develops [s]
     before: bool = False
-    then: float = 0.0  # N, second requested force
+    then: float = 0.0  # second requested force [N]
     settings: Sections = field(default_factory=dict)
 
 
@@ -118,12 +119,12 @@ class GripTrial:
     """Outcome of a trial: relative forces, and times [s] measured from the grasp or the fault."""
 
     false: tuple[str, ...]  # channels that may be reported as faulty
-    held: bool = True  # the hold was established
-    settled: float = math.nan  # final mean over both tips; NaN if the object was released
-    peak: float = 0.0  # maximum over both tips
+    held: bool = True  # True if the hold was established
+    settled: float = math.nan  # final mean force over both tips, or NaN if the object was released
+    peak: float = 0.0  # maximum force over both tips
     above: float = 0.0
     slid: float = 0.0  # m
-    end: str = ""  # final fault or mode
+    end: str = ""  # fault or mode at the end
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:

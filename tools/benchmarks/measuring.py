@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.terminal.text_layout import plain_table, table_text
 
-# Result of one measurement. Each key is a column heading; "name" is the first column.
+# Result of one measurement. Each key is a column heading, and "name" is the first column.
 Row = dict[str, Any]
 
-# s per repetition; short enough to avoid most interruptions, but long compared with the clock
-# resolution.
+# Duration of a repetition [s]. It is short enough to avoid most interruptions, but long compared
+# with the clock resolution.
 _SLICE = 4e-4
 
 

@@ -23,7 +23,7 @@ from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-# Tips with an ideal sensor, then spring tips with sensor defects.
+# Tips with an ideal sensor, followed by spring tips with sensor defects.
 TIPS: dict[str, Sections] = {
     "springs": {},
     "bristles": {"simulation": {"tip_law": "bristles"}},
@@ -32,25 +32,25 @@ TIPS: dict[str, Sections] = {
 }
 MASSES = (0.1, 0.5, 2.0)  # kg
 STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
-OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; in a 10 N grip, friction can hold 12 N
-REDUCED_LOADS = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # N, used without `--full`
+OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # loads [N]; friction can hold 12 N in a 10 N grip
+REDUCED_LOADS = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # loads without `--full` [N]
 _FORCE = 10.0  # N
-_TRIAL_COUNT = 3  # trials per case
+_TRIAL_COUNT = 3  # number of trials per case
 _RESPONSE_AIM, _REPORT_AIM = 22.0, 200.0  # ms
-_GRIP_TIMEOUT = 5.0  # s, time limit for establishing the hold
-# s, duration of the standing load's ramp, and of the constant standing load after the ramp.
+_GRIP_TIMEOUT = 5.0  # time limit for establishing the hold [s]
+# Duration of the standing load's ramp, and of the constant standing load after the ramp [s].
 _LOAD_TIME, _STANDING_TIME = 1.0, 1.5
-_LOAD_STEP_COUNT = 50  # steps in this ramp
-_OBSERVATION_TIME = 1.0  # s, duration of the larger load and time limit for reporting a loss
+_LOAD_STEP_COUNT = 50  # number of steps in the ramp of the standing load
+_OBSERVATION_TIME = 1.0  # duration of the larger load, and time limit for reporting a loss [s]
 
 
 class Overload(NamedTuple):
     """Outcome of one trial."""
 
-    answer: float  # s; NaN without slip, infinity without reaction
-    slid: float  # m, maximum while the object was between the tips
+    answer: float  # response time [s]; NaN without slip, infinity without reaction
+    slid: float  # maximum displacement while the object was between the tips [m]
     lost: bool
-    said: float = math.nan  # s, time from loss to report
+    said: float = math.nan  # time from the loss to its report [s]
 
 
 def measure(

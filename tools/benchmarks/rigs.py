@@ -25,7 +25,7 @@ from softfinger.daemon.types import Frame, Goal, Reading
 Sections = Mapping[str, Mapping[str, Any]]
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
-SOLID: Sections = {  # solid rubber tips
+SOLID: Sections = {  # tips of solid rubber
     "tip": {"physics": "solid"},
     "material": {"law": "constant", "modulus": 0.15e6},
     "safety": {"d_max": 0.008},
@@ -34,7 +34,7 @@ SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor has o
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
 SOFTFINGER = (sys.executable, "-m", "softfinger")
-_FRAME_COUNT = 16  # frames used in turn
+_FRAME_COUNT = 16  # number of frames used in turn
 
 
 class RigError(SoftfingerError):

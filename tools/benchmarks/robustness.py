@@ -24,18 +24,21 @@ from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
-# s, time limit for establishing the hold, duration of the undisturbed hold, observation time.
+# Time limit for establishing the hold, duration of the undisturbed hold, and observation time [s].
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
-_ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01  # 1, 1, m
-_REPORT_TIME_MAX = 2.0  # s, time limit for reporting a force error above `_ERROR_MAX`
-# Without a load: ratio to the requested force, and maximum time above this ratio [s].
+# Relative force errors, and displacement [m].
+_ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01
+_REPORT_TIME_MAX = 2.0  # time limit for reporting a force error above `_ERROR_MAX` [s]
+# Without a load, the maximum ratio to the requested force, and the maximum time above this ratio
+# [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
 _EVENT_PREFIX = "consistency."
-# Logarithm of the gain error above which reporting a sensor as faulty is correct.
+# Logarithm of the gain error above which it is correct to report a sensor as faulty.
 _GAIN_ERROR_MIN = math.log(1.3)
-_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which objects should not be lost
+_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which no object should be lost
 
-# Full scale of 127.5 kPa, as on real tactile boards. The simulated sensor's default is 262 kPa.
+# Full scale of 127.5 kPa, as on real tactile boards. The default of the simulated sensor is 262
+# kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 _LATENCY = Settings().tactile.latency
 
@@ -46,14 +49,14 @@ class HandCase:
 
     name: str
     force: float
-    # Hand settings that differ from the daemon's settings.
+    # Settings of the hand that differ from the daemon's settings.
     hand: Sections = field(default_factory=dict)
     daemon: Sections = field(default_factory=dict)
-    torque: float = 1.0  # true torque constant divided by the one in the settings
-    words: str = ""  # faults in `softfinger emulate --fault` syntax, started in the hold
-    load: float = 0.0  # N, along the faces
-    within: float = 0.0  # s, duration of the load ramp
-    turn: float = 0.0  # rad, commanded object angle
+    torque: float = 1.0  # ratio of the true torque constant to its setting
+    words: str = ""  # faults in `softfinger emulate --fault` syntax, which start during the hold
+    load: float = 0.0  # load along the faces [N]
+    within: float = 0.0  # duration of the load ramp [s]
+    turn: float = 0.0  # commanded object angle [rad]
     false: tuple[str, ...] = ()  # channels that may be reported as faulty
 
 
@@ -158,7 +161,7 @@ def drawn(seed: int) -> HandCase:
         * pushed,
         within=chance.choice((0.0, 0.3, 2.0)),
         turn=span(-0.14, 0.14) * turned,
-        # Drift of the zero offset is also a sensor fault.
+        # A drift of the zero offset is also a sensor fault.
         false=tuple(
             f"{side}_sensor"
             for side, wrong in zip(FINGERS, off, strict=True)
@@ -171,16 +174,16 @@ def drawn(seed: int) -> HandCase:
 class Outcome:
     """Outcome of a grip. Forces are relative to the requested force, times are in s."""
 
-    held: bool = False  # the hold was established
-    settled: float = math.nan  # final mean over both tips; NaN if the object was released
-    peak: float = 0.0  # maximum over both tips, without a load
-    above: float = 0.0  # s, longest time above `_EXCESS_RATIO`, without a load
-    first_off: float = math.inf  # s, first mean error above `_ERROR_MAX`
-    named: float = math.inf  # s, first diagnosis
-    accused: tuple[str, ...] = ()  # wrongly diagnosed channels
-    raised: bool = False  # the force was increased without a load
+    held: bool = False  # True if the hold was established
+    settled: float = math.nan  # final mean force over both tips, or NaN if the object was released
+    peak: float = 0.0  # maximum force over both tips without a load
+    above: float = 0.0  # longest time above `_EXCESS_RATIO` without a load [s]
+    first_off: float = math.inf  # time when the mean error first exceeded `_ERROR_MAX` [s]
+    named: float = math.inf  # time of the first diagnosis [s]
+    accused: tuple[str, ...] = ()  # channels that were wrongly diagnosed
+    raised: bool = False  # True if the force was increased without a load
     lost: bool = False
-    end: str = ""  # final fault or mode
+    end: str = ""  # fault or mode at the end
 
     def well(self) -> bool:
         """Return True if the force error is below `_ERROR_MAX` or was reported in time."""

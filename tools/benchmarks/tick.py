@@ -29,9 +29,9 @@ from softfinger.tools.benchmarks.rigs import HIL, can, hold, must_hold, virtual_
 from softfinger.tools.processes.emulate import emulator_process
 
 _PRIORITY = 40  # SCHED_FIFO priority
-# Bits per cycle: fast sync read of 2 × 10 bytes, its reply, and sync write of 2 × 6 bytes.
+# Bits per cycle for a fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6 bytes.
 _BITS = 10 * (16 + 36 + 28)
-_IN_TURN = 20  # cycles per turn
+_IN_TURN = 20  # number of cycles per turn
 
 
 def measure(brief: bool = False) -> list[Report]:
@@ -65,7 +65,7 @@ def _in_turns(title: str, rounds: int) -> Report:
     SCHED_FIFO is used if permitted.
     """
     samples: dict[str, list[float]] = {}
-    used: dict[str, float] = {}  # 1, processor load averaged over all rounds
+    used: dict[str, float] = {}  # processor load averaged over all rounds
     with virtual_daemon() as quiet, virtual_daemon(schema.STATE, schema.TACTILE) as heard:
         for daemon in (quiet, heard):
             hold(daemon)

@@ -32,11 +32,11 @@ STEPS = (
     "relaxation",
     "scales",
 )
-_OF_PROFILE = STEPS[: STEPS.index("tare")]  # all other steps calibrate a tip
-# Fraction of the prior standard deviation of a sensor's gain. If the standard deviation is above
-# this fraction, the gain has not been measured in a grip.
+_OF_PROFILE = STEPS[: STEPS.index("tare")]  # All other steps calibrate a tip.
+# Fraction of the prior standard deviation of a sensor's gain. A standard deviation above this
+# fraction means that the gain has not been measured in a grip.
 _LEARNT = 0.8
-# Minimum relative standard deviation of each factor, because rubber and joints vary from day to
+# Minimum relative standard deviation of each factor, because rubber and joints change from day to
 # day.
 _LEAST = 0.02
 _EPILOG = """\

@@ -30,9 +30,9 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import to_stderr
 
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
-_PATIENCE = 10.0  # s, maximum interval without a new frame
-_WAIT = 60.0  # s, time limit for --move
-_BEFORE = 4000  # maximum number of stored frames from before a hold
+_PATIENCE = 10.0  # maximum interval without a new frame [s]
+_WAIT = 60.0  # time limit for --move [s]
+_BEFORE = 4000  # maximum number of frames stored before a hold
 
 
 @dataclass(frozen=True)

@@ -64,10 +64,10 @@ _QUANTITIES = {
 }
 _EXAMPLE = "`d [mm],F [N],tilt [deg]` or `strain [%],stress [kPa]`"
 _NAMED = re.compile(r"^(.*?)\s*(?:[\[(]\s*(.*?)\s*[\])]|[/_]\s*([^\s/_]+))?$")
-_SAME_TILT = 2e-4  # rad, maximum tilt difference within a run
+_SAME_TILT = 2e-4  # maximum tilt difference within a run [rad]
 _POINTS = 10  # number of points that represent a fitted law
 _BINS = 20  # maximum number of points of a measured stress-strain law
-_TOE = 2.0  # ratio of slopes that indicates a toe region or an offset
+_TOE = 2.0  # slope ratio that indicates a toe region or an offset
 # Difference in the information criterion that counts as strong evidence (Kass & Raftery, 1995).
 _BETTER = 6.0
 
@@ -222,7 +222,7 @@ def _force_law(
         raise CalibrationError(f"law: {'; '.join(notes)}")
     best, deepest = ours[0], max(run.depth for run in runs)
     force = max(float(np.ptp(run.force)) for run in runs)
-    # Residuals in excess of the noise are attributed to the material law.
+    # Attribute residuals in excess of the noise to the material law.
     misfit = best.residual * math.sqrt(max(1.0 - 1.0 / best.chi2, 0.0)) / force
     count = 0 if _is_constant(best) else _POINTS
     strain = np.linspace(0.0, deepest / tip.radius, count + 1)[1:]

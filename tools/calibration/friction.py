@@ -22,16 +22,17 @@ from softfinger.tools.calibration.joints import write_keys
 from softfinger.tools.calibration.live_hand import LiveHand
 from softfinger.tools.recordings.reader import read_recording
 
-# (rad/s, rad, number) for each sweep. Slow sweeps determine breakaway friction; fast sweeps
-# determine the other friction parameters.
+# Speed [rad/s], angle [rad] and number of strokes of each sweep. Slow sweeps determine the
+# break-away friction, and fast sweeps the other friction parameters.
 _SWEEPS = ((0.05, 0.06, 2), (0.3, 0.4, 2), (0.6, 0.4, 2))
 _WIDEST = max(wide for _, wide, _ in _SWEEPS)
-_FROM_ENDS = 0.05  # rad, margin to each end of the joint range
-# rad, tolerance for the start of a sweep, because friction may stop a joint before its goal.
+_FROM_ENDS = 0.05  # margin to each end of the joint range [rad]
+# Tolerance for the start of a sweep, because friction may stop a joint before its goal [rad].
 _ARRIVED = 0.05
-_REST = 0.3  # s, pause between two strokes, in addition to the setpoint's smoothing time
-_TOUCHED = 0.2  # s, discarded before and after each contact because detection takes time
-# Standard deviations; breakaway friction is reported if it exceeds sliding friction by more.
+_REST = 0.3  # pause between two strokes, in addition to the setpoint's smoothing time [s]
+_TOUCHED = 0.2  # time discarded before and after each contact [s], because detection takes time
+# Break-away friction is reported if it exceeds sliding friction by this number of standard
+# deviations.
 _SEEN = 2.0
 
 

@@ -36,10 +36,10 @@ _POSES = {
     "open": "open the finger fully",
     "zero": "point the finger straight away from the palm",
 }
-_LEAST = 0.2  # rad, minimum rotation between closed and open
-_ALONE = 0.25  # 1, maximum motion of the other finger, as a fraction of this rotation
-_MARGIN = 0.03  # rad, margin between the stops and the commanded range
-_Counts = dict[int, int]  # keys: servo IDs
+_LEAST = 0.2  # minimum rotation between open and closed [rad]
+_ALONE = 0.25  # maximum motion of the other finger, as a fraction of the rotation
+_MARGIN = 0.03  # margin between the stops and the commanded range [rad]
+_Counts = dict[int, int]  # The keys are servo IDs.
 
 
 def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
@@ -106,7 +106,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
                 f"servo {servo}: torque is on: stop `softfinger run`, or send `disarm`"
             )
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # After power-up, a servo's position is the encoder count, which is less than one turn.
+        # After power-up, a servo's position is its encoder count, which is less than one turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder

@@ -19,7 +19,7 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import client_keys
 
 _MOST = 1000  # maximum number of messages per read
-_WITHIN = 20.0  # s in hand time, time limit for each command
+_WITHIN = 20.0  # time limit for each command, in the hand's time [s]
 
 
 class LiveHand:

@@ -264,7 +264,7 @@ def _modulus(step: Step) -> Done:
     pressed = zip(step.pressures, step.readings, strict=True)
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
-    whole = ~full.any(axis=(1, 2))  # saturated cells mask part of the force
+    whole = ~full.any(axis=(1, 2))  # Saturated cells hide part of the force.
     tip = make_tip(step.settings)
     found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (

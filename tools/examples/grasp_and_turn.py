@@ -28,10 +28,10 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--stream")
 parser.add_argument("--commands")
 parser.add_argument("--picture", default="grasp_and_turn.png")
-where = parser.parse_known_args()[0]  # ignore the arguments of a notebook kernel
+where = parser.parse_known_args()[0]  # Ignore the arguments of a notebook kernel.
 
 FORCE = 8.0  # N on each tip
-ANGLES = (12.0, -12.0, 0.0)  # degrees, in this order
+ANGLES = (12.0, -12.0, 0.0)  # angles in this order [degrees]
 DEGREES = math.degrees(1.0)
 
 
@@ -43,7 +43,7 @@ def settled(state: HandState) -> bool:
 recorded: list[HandState] = []
 with Hand(where.stream, where.commands) as hand:
     with hand.stream(hand.timeout) as states:
-        recorded.append(next(states))  # wait for the stream before moving
+        recorded.append(next(states))  # Wait for the stream before moving.
         try:
             hand.arm()
             hand.grasp(force=FORCE)
@@ -54,8 +54,8 @@ with Hand(where.stream, where.commands) as hand:
             hand.release()
             end = hand.wait_for(lambda state: state.mode == "armed")
         finally:
-            hand.stop()  # switch torque off after any error
-        for state in states:  # all states received so far
+            hand.stop()  # Switch torque off, even after an error.
+        for state in states:  # Read all states that have arrived so far.
             recorded.append(state)
             if state.seq >= end.seq:
                 break
@@ -81,7 +81,7 @@ minimum = theta[np.argmin(energy, axis=1)]
 LOOKS = {"left": ("#0072B2", "-"), "right": ("#D55E00", "--")}
 figure = Figure(figsize=(9.0, 4.2), layout="constrained")
 panels = figure.subplot_mosaic([["force", "map"], ["angle", "map"]], width_ratios=[1.0, 1.15])
-# the levels are denser at low U, because U grows as d³
+# The levels are denser at low U, because U grows as d³.
 levels = 1e3 * energy.max() * np.linspace(0.0, 1.0, 11) ** 2
 shown = panels["map"].contourf(
     theta * DEGREES, d * 1e3, energy * 1e3, levels, cmap="Greys", vmax=1.8 * levels[-1]

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 PITCH = 0.058 / 44  # m
 GRID = SensorGrid(rows=44, cols=44, pitch=PITCH)
 
-TILTED = -11.5  # degrees, relative angle after the finger rotation
-ROLLED = 9.2  # degrees, relative angle after the object has rolled by 20.7°
+TILTED = -11.5  # relative angle after the finger rotation [degrees]
+ROLLED = 9.2  # relative angle after the object has rolled by 20.7° [degrees]
 
 
 def _force(d: Numbers, theta: Numbers) -> FloatArray:
@@ -169,8 +169,8 @@ _TERMS = ("first", "second", "third")
 class Terms(NamedTuple):
     """Integrals of the root, 1 and the inverse root over the area element in eq. 14."""
 
-    first: FloatArray  # m, eq. 16
-    second: FloatArray  # 1, eq. 18
+    first: FloatArray  # eq. 16 [m]
+    second: FloatArray  # eq. 18
     third: FloatArray  # 1/m, eq. 19
 
     def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
@@ -216,7 +216,7 @@ def integrated_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def _appendix() -> tuple[Sheet, ...]:
-    d = np.arange(1, 81) / 10.0  # The terms cancel each other at d = 0.
+    d = np.arange(1, 81) / 10.0  # At d = 0, the terms cancel.
     metres = d * MILLI
     columns = {"d [mm]": d}
     for how, terms in (

@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 TIP = Fingertip(radius=0.020)
-MODULUS = TABLE_I_MAXIMUM  # Pa, the paper's choice
+MODULUS = TABLE_I_MAXIMUM  # the paper's choice [Pa]
 MILLI = 1e-3
 MPA = 1e-6
-_NODES = 64  # Gauss nodes per double integral
-_STEEP_TILT = 25  # degrees, tilt at which the slope is reported
-_FITTED = slice(10, None)  # rows from 1 to 8 mm, which are used to fit the exponents
-_STEP = 1e-4  # relative or rad, finite-difference step
+_NODES = 64  # number of Gauss nodes per double integral
+_STEEP_TILT = 25  # tilt at which the slope is reported [degrees]
+_FITTED = slice(10, None)  # rows from 1 to 8 mm, to which the exponents are fitted
+_STEP = 1e-4  # finite-difference step, relative or in rad
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
 
@@ -139,7 +139,7 @@ class Plotted:
     symbol: str
     label: str
     unit: str
-    scale: float  # factor from SI to the unit
+    scale: float  # factor from SI to this unit
     row: int  # row in closed_forms and double_integrals
     slope: int  # row of the derivative with respect to d in closed_forms
     exponent: int

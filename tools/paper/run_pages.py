@@ -36,23 +36,23 @@ from softfinger.tools.style import GREY, KINDS, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ) and the result of `_estimates`
+Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ), and the result of `_estimates`
 
 RADIUS = 0.020  # m
 SCAN = 0.040  # s
-TILTED = math.radians(11.5)  # finger rotation about its root
+TILTED = math.radians(11.5)  # rotation of the finger about its root
 ROLLED = math.radians(20.7)  # rotation of the object while it rolls back
-_SPEED = 0.002  # m/s, compression speed
-_GAP = 0.5e-3  # m, gap before compression
+_SPEED = 0.002  # compression speed [m/s]
+_GAP = 0.5e-3  # gap before compression [m]
 _D_MAX = 0.4 * RADIUS
-_ROOT_DEPTH = 0.004  # m, displacement after the finger rotation
+_ROOT_DEPTH = 0.004  # displacement after the finger rotation [m]
 _MOTION_MARGIN = math.radians(3.0)
 _WIDTH = 0.040
 _HALF_SEPARATION = 0.050
 _ROLL_STEPS = 104  # number of frames during rolling
 _LATE_FRAME_COUNT = 2  # number of frames in transit
-_RELATIVE_D_MIN = 1.0  # mm, displacement above which relative errors are shown
-_ROLLED_AT = 4  # mm, displacement in the figure of the whole path
+_RELATIVE_D_MIN = 1.0  # displacement above which relative errors are shown [mm]
+_ROLLED_AT = 4  # displacement in the figure of the whole path [mm]
 _PATH = -12.5, 10.5
 _SCALES = {"d": 1e3, "theta": 1.0}  # factors for displayed errors
 
@@ -126,7 +126,7 @@ def _daemon(sections: Sections) -> Daemon:
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
-        # The sensor is calibrated, so a stiffer tip explains the excess pressure.
+        # The sensor is calibrated, so the estimator attributes excess pressure to a stiffer tip.
         "tactile": {
             "rate": 1.0 / SCAN,
             "latency": SCAN,

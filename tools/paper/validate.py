@@ -28,13 +28,14 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-RADIUS, MODULUS, POISSON = 0.020, 0.304e6, 0.49  # m, Pa, 1; the paper's tip
+# Radius [m], modulus [Pa] and Poisson's ratio of the paper's tip.
+RADIUS, MODULUS, POISSON = 0.020, 0.304e6, 0.49
 DEPTHS = np.linspace(0.001, 0.007, 25)  # m
 TILTS = np.radians(np.linspace(0.0, 20.0, 41))
 FIGURES = {"agree": "✓", "disagree": "✗", "unknown": "?"}
 _TRIALS = 5
 _FRAMES = 64
-_PRESSED = 0.005, 0.2  # m, rad; contact in the sensor frames
+_PRESSED = 0.005, 0.2  # contact in the sensor frames [m, rad]
 
 
 class PublishedValue(NamedTuple):

@@ -21,7 +21,7 @@ from softfinger.daemon.errors import SoftfingerError
 
 # This sequence restores the terminal if the monitor was killed.
 RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
-_RECORDER_TIMEOUT = 20.0  # s, time limit for a recorder to subscribe or to close its file
+_RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe or to close its file [s]
 
 
 class RecorderError(SoftfingerError):
@@ -34,7 +34,7 @@ class _Lifeline:
     def start(self, words: list[str], keys: str, **options: Any) -> subprocess.Popen[Any]:
         """Start ``softfinger`` with the arguments ``words`` and, if keys are set, ``--keys``."""
         reads, self._ours = os.pipe()
-        # With -P, a folder named tools in the working directory is not imported.
+        # The option -P keeps Python from importing a folder named tools in the working directory.
         command = [sys.executable, "-P", "-m", "softfinger", *words, "--lifeline", str(reads)]
         try:
             return subprocess.Popen(
@@ -73,7 +73,7 @@ class MonitorProcess:
         self.process = self._lifeline.start(words, keys)
         called = False
 
-        # This handler is also called for stopped and continued children.
+        # This handler is also called if a child is stopped or continued.
         def child_changed(*_: Any) -> None:
             nonlocal called
             if not called and self.process.poll() is not None:
@@ -132,8 +132,8 @@ class RecorderProcess:
         self._closing = False
         self._said = ""
         self._lifeline = _Lifeline()
-        # In a separate session, the recorder does not receive Ctrl-C, so it can record the
-        # daemon's last messages.
+        # The recorder runs in its own session, so that Ctrl-C does not reach it and it can record
+        # the daemon's last messages.
         self._process = self._lifeline.start(
             ["record", *words],
             keys,

@@ -38,7 +38,7 @@ from softfinger.tools.sweep import Progress, processors
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
-_MEMORY_MAX = 400e6  # bytes, upper bound of the memory use per process
+_MEMORY_MAX = 400e6  # upper bound on the memory use per process [bytes]
 _CHECK_INTERVAL = 0.2  # s
 
 
@@ -133,12 +133,12 @@ class _Build:
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
         self._head = f"{settings.model_dump_json()}\n"
         self._missing = missing
-        self._at: dict[str, str] = {}  # kernel being compiled, by part
+        self._at: dict[str, str] = {}  # kernel that each part is compiling
         self._total, self._begun = _kernels(missing), 0
         self._started = time.monotonic()
         self._bar, self._tell = bar, tell
         self._processes: list[subprocess.Popen[str]] = []
-        self._own = threading.local()  # one process per thread
+        self._own = threading.local()  # Each thread has one process.
         self.failed = self._over = False
 
     def run(self) -> None:
@@ -209,7 +209,7 @@ class _Build:
 
 def _start() -> subprocess.Popen[str]:
     """Start a process that runs `main`."""
-    # With -P, a folder named tools in the working directory is not imported.
+    # The option -P keeps Python from importing a folder named tools in the working directory.
     command = [sys.executable, "-P", "-m", "softfinger.tools.processes.compile"]
     path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(
@@ -218,7 +218,7 @@ def _start() -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
         text=True,
-        process_group=0,  # Only the parent process receives Ctrl-C; it then ends the children.
+        process_group=0,  # Ctrl-C reaches only the parent process, which then ends the children.
     )
 
 
@@ -229,7 +229,7 @@ def main() -> None:
     output has three kinds of lines: ``kernel NAME`` when a kernel is started, ``done`` when a part
     has been built, and ``failed REASON`` when a part could not be built.
     """
-    # The compiler allocates many long-lived objects, so frequent garbage collections take 10 % of
+    # The compiler allocates many long-lived objects, so frequent garbage collection takes 10 % of
     # the time.
     gc.set_threshold(100_000)
     out = sys.stdout

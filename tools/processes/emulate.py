@@ -155,10 +155,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) -> int:
-    # The following imports are slow (numpy, numba), so settings errors are reported earlier.
+    # The following imports are slow (numpy, numba), so settings errors are reported first.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
+    gc.disable()  # Garbage collection during imports takes a tenth of the start-up time.
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
         EmulatedServos,
@@ -199,7 +199,7 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
     """
     from softfinger.daemon.simulation.emulator.folder import NoEmulator
 
-    # With -P, a folder named softfinger in the working directory is not imported.
+    # The option -P keeps Python from importing a folder named softfinger in the working directory.
     command = [sys.executable, "-P", "-m", "softfinger", "emulate", *map(str, words)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:

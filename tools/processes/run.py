@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.no_task:
         settings = settings.model_copy(update={"task": TaskSettings()})
     signals = Signals()
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until the loop runs
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # Ignore the signal until the loop runs.
     try:
         log = EventLog(arguments.log, arguments.log_file)
     except OSError as error:
@@ -95,10 +95,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _serve(
     settings: Settings, arguments: argparse.Namespace, signals: Signals, log: EventLog
 ) -> int:
-    # The following imports are slow (numpy, numba, zmq), so settings errors are reported earlier.
+    # The following imports are slow (numpy, numba, zmq), so settings errors are reported first.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
+    gc.disable()  # Garbage collection during imports takes a tenth of the start-up time.
     from softfinger.daemon.loop.build import Daemon
     from softfinger.tools.processes.compile import build_kernels
 
@@ -114,7 +114,7 @@ def _serve(
         daemon = Daemon(settings, on_event=on_event)
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
-        # After exit status 2, systemd does not restart the service.
+        # systemd does not restart the service after exit status 2.
         return 2 if isinstance(error, SettingsError) else 1
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop

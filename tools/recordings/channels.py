@@ -17,8 +17,8 @@ SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
 LIBRARY = "softfinger"
 
-# Frames and events also contain the fields that Foxglove's schemas require. If a stream field has
-# the same name as a Foxglove field, it is renamed in the recording.
+# Frames and events also contain the fields that Foxglove's schemas require. A stream field with the
+# same name as a Foxglove field is renamed in the recording.
 _STAMP = {
     "type": "object",
     "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},

@@ -80,7 +80,7 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
 
 
 Row = dict[str, Any]
-_BLOCK = 2000  # rows per write
+_BLOCK = 2000  # number of rows per write
 
 
 class CsvTable:
@@ -168,7 +168,7 @@ def export(
     OSError, MissingExtra
     """
     tables: dict[bytes, Table] = {}
-    grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts, by finger
+    grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts of each finger
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):

@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Recording", "read_recording"]
 
-_MESSAGE_SIZE_MAX = 1 << 20  # bytes; a frame of the largest grid has 0.2 MB
-_SETTINGS_SIZE_MAX = 4 << 20  # bytes, including per-cell calibrations
-_CHUNK_SIZE_MAX = 64 << 20  # bytes, unpacked; chunks usually have 1 to 8 MB
+_MESSAGE_SIZE_MAX = 1 << 20  # maximum message size [bytes]; a frame of the largest grid has 0.2 MB
+_SETTINGS_SIZE_MAX = 4 << 20  # maximum settings size [bytes], including per-cell calibrations
+_CHUNK_SIZE_MAX = 64 << 20  # unpacked chunk size limit [bytes]; chunks usually have 1 to 8 MB
 # Minimum size counted per channel or message [bytes], because reading each record takes time.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
 _OTHERS_NAMED_MAX = 3  # maximum number of other programs' channels listed in a warning
 _FIELD_COUNT_MAX = 500  # maximum number of fields per message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
-_RECORD = struct.Struct("<BQ")  # record header: kind, content size
+_RECORD = struct.Struct("<BQ")  # record header with kind and content size
 _BEFORE_DATA = struct.Struct("<HIQQ")  # message header: channel, number, log time, publish time
-# Chunk header: first time, last time, size, CRC, length of the compression method's name.
+# Chunk header with first time, last time, size, CRC and length of the compression method's name.
 _BEFORE_CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 _MAGIC = b"\x89MCAP0\r\n"
@@ -101,13 +101,13 @@ class Recording:
         self.damage = ""  # description of the first defect found so far
         self._say = say
         self.counts: dict[str, int] = {}
-        self.others: dict[str, int] = {}  # number of messages in each of other programs' channels
+        self.others: dict[str, int] = {}  # number of messages in each channel of other programs
         self.start = math.nan
         self.end = math.nan
         self.chunks = 0
-        self._first = 0  # ns, log time of the earliest message
-        self._left = 0  # bytes, remaining limit for unpacked data
-        self._names: dict[int, str] = {}  # channel names by channel number
+        self._first = 0  # log time of the earliest message [ns]
+        self._left = 0  # remaining limit for unpacked data [bytes]
+        self._names: dict[int, str] = {}  # maps channel numbers to channel names
         self._other_names: dict[int, str] = {}
         try:
             with open_regular(path) as file:
@@ -161,11 +161,12 @@ class Recording:
     @cached_property
     def zero(self) -> int:
         """Daemon clock time of the first message [ns], which is the origin of all times ``t``."""
-        state = self._left, self.chunks  # used by loops over messages
+        state = self._left, self.chunks  # Loops over messages use these variables.
         for _, message in self.messages():
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
             if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):
-                # The clock time of a frame is its scan time; its timestamp is the arrival time.
+                # The clock time of a frame is its scan time, whereas its timestamp is its arrival
+                # time.
                 after = stamp - self.start - float(message.get("delay_s", 0.0))
                 self._left, self.chunks = state
                 # The Unix time is a float with a resolution of 0.2 µs.
@@ -264,7 +265,7 @@ class Recording:
             for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
                 if (message := self._take_record(kind, content)) is not None:
                     yield message
-        # The exceptions for format and compression errors do not have a common base class.
+        # The exceptions for format errors and compression errors have no common base class.
         except Exception as error:
             self._damaged(error)
 
@@ -291,7 +292,7 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
-        # An unknown topic in a softfinger recording was written by a newer version.
+        # A newer version wrote this topic of a softfinger recording.
         if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
             self._other_names[channel.id] = channel.topic
             return

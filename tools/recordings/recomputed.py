@@ -160,7 +160,7 @@ def _run(
     calibrations: list[str],
     progress: Callable[[int], None] | None,
 ) -> None:
-    # Importing the loop is slow, so first reject recordings that lack settings or inputs.
+    # Importing the loop is slow, so reject recordings without settings or inputs first.
     from softfinger.daemon.loop.process_replay import ProcessReplay
     from softfinger.daemon.loop.publishing import parts
 
@@ -196,13 +196,13 @@ def _run(
         result.ticks += 1
         if state is not None:
             step = state.get("seq_step", 1)
-            # Pack and unpack the state in the same way as the recorded state, for identical types
-            # and rounding.
+            # Pack and unpack the state in the same way as the recorded state, so that types and
+            # rounding are identical.
             again = msgpack.unpackb(pack_state(now, scene, step))
             _compare(result, state, again)
 
 
-# A tick's input, counts of recent frames by (finger, seq), commands, and state (None if missing).
+# Input of a tick, counts of recent frames by (finger, seq), commands, and state (None if missing).
 _Tick = tuple[
     dict[str, Any], dict[tuple[int, int], Any], list[dict[str, Any]], dict[str, Any] | None
 ]

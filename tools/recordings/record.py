@@ -50,17 +50,18 @@ With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mc
 `replay --recompute` requires --topics all; `run --record` records all topics from the first tick.
 Exit status: 0 everything was written, 1 something was not written, with the reason."""
 
-_SILENCE_TIME = 2.0  # s, time without messages before a notice is printed
-# s between socket reads; waking up for each message would take longer than processing it.
+_SILENCE_TIME = 2.0  # time without messages before a notice is printed [s]
+# Time between socket reads [s]. Waking up for each message would take longer than processing it.
 _POLL_INTERVAL = 0.1
-_BACKLOG_TIMEOUT = 10.0  # s, time limit for processing queued messages at the end
-_TRANSIT_TIME = 0.5  # s, waiting time at the end for messages in transit on a busy machine
-_PROGRESS_INTERVAL = 0.5  # s, time between progress lines and between flushes
+_BACKLOG_TIMEOUT = 10.0  # time limit for processing queued messages at the end [s]
+_TRANSIT_TIME = 0.5  # waiting time at the end for messages in transit on a busy machine [s]
+_PROGRESS_INTERVAL = 0.5  # time between progress lines and between flushes [s]
 _BATCH_SIZE = 1000  # number of messages between time checks
 
 
-# A killed recorder loses only the incomplete chunk, i.e. the messages since the last flush.
-CHUNK_SIZE = 256 * 1024  # bytes before compression, 0.2 s of state at 1 kHz
+# A killed recorder loses only the incomplete chunk, which contains the messages since the last
+# flush.
+CHUNK_SIZE = 256 * 1024  # chunk size before compression [bytes], 0.2 s of state at 1 kHz
 
 
 class RecordingWriter:
@@ -80,16 +81,17 @@ class RecordingWriter:
         self.size = 0
         self._dumps = orjson.dumps
         self._added = 0  # number of messages, including those in the incomplete chunk
-        self._filled = 0  # bytes in the incomplete chunk
+        self._filled = 0  # number of bytes in the incomplete chunk
         # The key is the topic or, for tactile frames, the channel name.
         self._channels: dict[bytes | str, tuple[int, Converter]] = {}
         self._schemas: dict[bytes, int] = {}
         self._ended = False
-        self._newest = math.nan  # s, time of the newest message
+        self._newest = math.nan  # time of the newest message [s]
         # Repeated messages that arrived before any other message.
         self._early: list[tuple[bytes, dict[str, Any]]] = []
         try:
-            self._file = path.open("xb", buffering=4 * CHUNK_SIZE)  # one write per chunk
+            # The buffer is large enough for one write per chunk.
+            self._file = path.open("xb", buffering=4 * CHUNK_SIZE)
         except FileExistsError:
             raise RecordingError(f"{path}: already exists; choose another file") from None
         except FileNotFoundError:
@@ -189,7 +191,7 @@ class RecordingWriter:
 
     def _failed(self, error: OSError) -> RecordingError:
         self._ended = True
-        # The rest of the buffer cannot be written either, so drop it.
+        # The rest of the buffer cannot be written either, so discard it.
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):
@@ -215,7 +217,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "tick)",
     )
     add_split(parser)
-    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when this pipe closes
+    # The process ends when this pipe closes.
+    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)
     parser.add_argument(
         "--recover", action="store_true", help="repair a truncated FILE instead of recording"
     )
@@ -238,12 +241,12 @@ class _Recorder:
     def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
         self._ending = ending
-        self._keys = client_keys(arguments.keys)  # Any errors must occur before a file is created.
+        self._keys = client_keys(arguments.keys)  # Errors must occur before a file is created.
         self._gaps: dict[bytes, Gaps] = {}
         # The last writer in this list is the active writer.
         self._writers = [RecordingWriter(arguments.file)]
         self._opened = time.monotonic()
-        self._messages = 0  # number of messages received to be written
+        self._messages = 0  # number of messages received for writing
         self._unreadable = 0
         self._waiting = False  # True once the notice about the missing stream has been printed
 
@@ -291,7 +294,8 @@ class _Recorder:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)
                 shown = now
-        # Messages sent before a signal, such as the daemon's last ones, may arrive after it.
+        # Messages that were sent before a signal, such as the daemon's last ones, may arrive after
+        # the signal.
         self._read_remaining(
             socket, _TRANSIT_TIME if ending.is_requested or not ending.is_met else 0.0
         )
@@ -361,7 +365,7 @@ class _Recorder:
             if written:
                 print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
             else:
-                # An empty file would block the next recording with this name.
+                # An empty file would prevent the next recording with this name.
                 path.unlink(missing_ok=True)
         lost = ", ".join(
             f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost

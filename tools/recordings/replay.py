@@ -30,7 +30,7 @@ requires a recording of all topics: `record --topics all`, or `run --record`, wh
 first tick. If the recording starts there, the same code and settings give bit-identical results.
 Exit status: 0 published, or all states identical; 1 the file can't be read; 3 states differ."""
 
-_SUBSCRIBER_WAIT = 10.0  # s, timeout for the first subscriber
+_SUBSCRIBER_WAIT = 10.0  # timeout for the first subscriber [s]
 _EXIT_DIFFERENT = 3
 
 
@@ -151,9 +151,9 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     return _EXIT_DIFFERENT
 
 
-# Maximum number of messages queued for a subscriber; excess messages are lost.
+# Maximum number of messages queued for a subscriber. Excess messages are lost.
 _QUEUE_LENGTH = 10_000
-_SEND_TIMEOUT = 1.0  # s, timeout for the gateway to accept a message
+_SEND_TIMEOUT = 1.0  # timeout for the gateway to accept a message [s]
 
 
 class Wire:
@@ -186,7 +186,7 @@ class Wire:
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
         """Publish one message as soon as the gateway can accept it."""
-        if topic not in schema.TOPICS:  # the topic comes from another version
+        if topic not in schema.TOPICS:  # The topic comes from another version.
             return
         self._link.wait_for_room(_SEND_TIMEOUT)
         index = GATEWAY_TOPICS.index(topic.decode())

@@ -31,15 +31,15 @@ from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.sweep import Sweep, add_sweep
 
 SHAPES = ("rectangle", "disc")
-SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # mm, width or diameter
+SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # width or diameter [mm]
 FRICTIONS = (0.2, 0.4, 0.6, 0.8)
 MASSES = (0.05, 0.2, 0.5, 1.0, 2.0)  # kg
-_SETTLING_TIME = 3.0  # s, settling time of the grip
-_LOAD_TIME = 1.0  # s, ramp time of the weight
-_OBSERVATION_TIME = 1.0  # s, observation time under the full weight
+_SETTLING_TIME = 3.0  # settling time of the grip [s]
+_LOAD_TIME = 1.0  # duration of the weight ramp [s]
+_OBSERVATION_TIME = 1.0  # observation time under the full weight [s]
 _LOAD_STEP_COUNT = 20  # number of steps in the weight ramp
 _TURN_MIN = math.radians(5.0)
-_SLIDE_MAX = 0.010  # m, displacement along the faces above which the object counts as lost
+_SLIDE_MAX = 0.010  # displacement along the faces above which the object counts as lost [m]
 _GRAVITY = 9.81  # m/s²
 _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
 
@@ -47,8 +47,8 @@ _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#7777
 class Cell(NamedTuple):
     """Result of one grasp."""
 
-    outcome: str  # key of MEANING
-    turned: float  # rad, maximum object rotation
+    outcome: str  # key in MEANING
+    turned: float  # maximum object rotation [rad]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -174,7 +174,7 @@ def grasped(
         if hand.mode != "holding":
             return Cell(REFUSED, math.nan)
         before = hand.plant.object_pose.copy()
-        # The friction of the table opposes the load, so it is added to the load.
+        # The friction of the table opposes the load, so add it to the load.
         pull = weight * (1.0 + settings.simulation.table_friction)
         for k in range(_LOAD_STEP_COUNT):
             load, phi = pull * (k + 1) / _LOAD_STEP_COUNT, float(hand.plant.object_pose[2])

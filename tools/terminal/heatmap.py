@@ -16,11 +16,11 @@ from rich.text import Span, Text
 
 FloatArray = NDArray[np.float64]
 
-LEVELS = 32  # number of colours; fewer colours make redraws faster
+LEVELS = 32  # number of colours; redraws are faster with fewer colours
 SHADES = " ·░▒▓█"  # shades for terminals with too few colours
 
-# Lightness increases in equal steps from dark blue to bright yellow, so the order of the colours is
-# also visible in greyscale and to colour-blind users.
+# Lightness increases in equal steps from dark blue to bright yellow, so that the order of the
+# colours is also visible in greyscale and to colour-blind users.
 _ANCHORS = (
     (24, 18, 56),
     (50, 46, 110),
@@ -129,7 +129,8 @@ class FullScale:
 
     def __init__(self, smallest: float, patience: float = 3.0) -> None:
         self._smallest = smallest
-        # s, time for which the peak must stay below the next smaller scale before the scale shrinks
+        # Time for which the peak must stay below the next smaller scale before the scale shrinks
+        # [s].
         self._patience = patience
         self._since: float | None = None
         self.value = smallest

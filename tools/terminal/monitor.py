@@ -33,11 +33,11 @@ from softfinger.tools.terminal.status import describe
 from softfinger.tools.terminal.stream_state import Commander, StreamReader, StreamState, printable
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
-STEP_ANGLE = math.radians(5.0)  # rad, object rotation per press of an arrow key
-# (upper limit of a force range [N], step in this range [N]).
+STEP_ANGLE = math.radians(5.0)  # object rotation per press of an arrow key [rad]
+# Upper limit of a force range [N], and step in this range [N].
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
-_ACCUMULATION_TIME = 1.0  # s, interval within which key presses add up
-_CONFIRMATION_TIME = 3.0  # s, time limit for the second press of d, which confirms disarming
+_ACCUMULATION_TIME = 1.0  # interval within which key presses add up [s]
+_CONFIRMATION_TIME = 3.0  # time limit for the second press of d, which confirms disarming [s]
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
@@ -51,7 +51,7 @@ class HandKeys:
         self._target: float | None = None  # object angle [rad]
         self._chosen = math.nan  # grasp force [N]
         self._pressed = -math.inf  # time of the last force change made on this page
-        self._asked = -math.inf  # time of the first d key during a grip
+        self._asked = -math.inf  # time of the first d key press during a grip
 
     def press(self, key: str, now: float) -> None:
         """Send the command assigned to a key; ignore unassigned keys."""
@@ -125,9 +125,9 @@ class HandKeys:
         self._commander.send(now, label, "rotate", angle=self._target)
 
 
-REDRAW_INTERVAL = 0.1  # s, minimum time between redraws
-PLAIN_READ_INTERVAL = 0.1  # s, time between stream reads in plain mode
-PLAIN_LINE_INTERVAL = 1.0  # s, time between plain lines
+REDRAW_INTERVAL = 0.1  # minimum time between redraws [s]
+PLAIN_READ_INTERVAL = 0.1  # time between stream reads in plain mode [s]
+PLAIN_LINE_INTERVAL = 1.0  # time between plain lines [s]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -139,7 +139,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plain", action="store_true", help="print plain lines instead of the page"
     )
-    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when this pipe closes
+    # The process ends when this pipe closes.
+    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -197,12 +198,12 @@ class _MonitorStop(StopCondition):
     def __init__(self, args: argparse.Namespace) -> None:
         super().__init__(args.duration, args.lifeline)
         self.begin()
-        self.why = ""  # message to be printed once the terminal is restored
+        self.why = ""  # message to print once the terminal is restored
         self.suspend = False
         self.terminal: Terminal | None = None
         self._no_wait: bool = args.no_wait
         self._keys: Path | None = args.keys
-        # True if started by the daemon, in the same process group.
+        # True if the daemon started this process, which then shares the daemon's process group.
         self.beside = args.lifeline is not None
         self._wait_until = time.monotonic() + WAIT_MAX
 

@@ -31,12 +31,12 @@ from softfinger.tools.terminal.text_layout import (
     wrapped,
 )
 
-WIDTH, HEIGHT = 80, 24  # minimum page size, columns and lines
-CENTRE = 34  # columns, width of the numbers
+WIDTH, HEIGHT = 80, 24  # minimum page size in columns and lines
+CENTRE = 34  # width of the numbers, in columns
 MAP_LINES = 11  # height of each map at the minimum page size
-OLD_AGE = 1.0  # s, age above which a frame is marked as old
-REPLY_TIME = 12.0  # s, time for which a reply is shown
-DELAY_MIN = 0.05  # s, delay above which a message is displayed
+OLD_AGE = 1.0  # age above which a frame is marked as old [s]
+REPLY_TIME = 12.0  # time for which a reply is shown [s]
+DELAY_MIN = 0.05  # delay above which a message is displayed [s]
 
 GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
 KEY = "bold #56b4e9"
@@ -67,7 +67,7 @@ _KEYS_EXPLAINED = (
     ("+ -", "increase or reduce the force, including that of the current grip"),
 )
 
-# (label, field, factor, decimals, unit, field of the standard deviation)
+# Label, field, factor, decimals, unit, and field of the standard deviation.
 _ROWS = (
     ("d", "d", 1e3, 2, "mm", "d_std"),
     ("θ", "theta", math.degrees(1.0), 1, "°", "theta_std"),
@@ -91,8 +91,8 @@ class MonitorPage:
     address: str
     coloured: bool = True  # True if the terminal has more than 16 colours
     keys: bool = True  # True if a keyboard is available
-    guarded: bool = False  # True if subscribed with access keys
-    force: float = math.nan  # N, force requested by the grasp key
+    guarded: bool = False  # True if the page has subscribed with access keys
+    force: float = math.nan  # force requested by the grasp key [N]
     explains: bool = False  # True if explanations are shown instead of the numbers
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
 
@@ -233,7 +233,7 @@ class MonitorPage:
             value, style = getattr(finger, key), "default" if finger.valid else DIM
             if key == "temperature":
                 style = BAD if finger.time_to_limit < self.feed.heat_warning_time else style
-                value = value or math.nan  # A value of 0 means unknown.
+                value = value or math.nan  # A value of 0 means that the quantity is unknown.
             spread = factor * getattr(finger, std) if std else math.nan
             shown = format_aligned(factor * value, decimals)
             beside = "" if math.isnan(spread) else "±" + format_narrow(spread)

@@ -38,7 +38,7 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-RECENT_TIME = 3.0  # s, time window for the sum of waits for a busy machine
+RECENT_TIME = 3.0  # time window for the sum of waits for a busy machine [s]
 EVENT_COUNT_MAX = 200  # number of stored events
 GLOSSARY = (  # meanings of the terms on the pages
     ("d", "displacement of the tip by the object's face"),
@@ -51,11 +51,11 @@ GLOSSARY = (  # meanings of the terms on the pages
     ("current, bound", "motor current and its limit in the current goal"),
     ("object", "angle and width of the object between the tips"),
 )
-# Relative force increase above which the page reports that the grip force was raised.
+# Relative force increase above which the page reports an increased grip force.
 _INCREASED_RATIO = 1.01
 # Maximum number of messages read per call, so that a flood of messages cannot block drawing.
 _DRAIN_COUNT_MAX = 4000
-_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid has 131 kB
+_MESSAGE_SIZE_MAX = 4_000_000  # maximum message size [bytes]; the largest grid has 131 kB
 
 
 def field(record: object, *path: str) -> Any:
@@ -90,8 +90,8 @@ class ShownFrame(NamedTuple):
     """Tactile frame, prepared for drawing."""
 
     arrived: float  # monotonic time [s]
-    scale: float  # Pa per count, NaN if unknown
-    grid: NDArray[np.float64]  # pressures [Pa], or counts if the scale is unknown; [rows, cols]
+    scale: float  # Pa per count, or NaN if unknown
+    grid: NDArray[np.float64]  # pressures in Pa, or in counts if the scale is unknown; [rows, cols]
     aspect: float  # cell height divided by cell width
     source: schema.TactileFrame
 
@@ -99,7 +99,7 @@ class ShownFrame(NamedTuple):
 class ShownEvent(NamedTuple):
     """A single ``hand/event``, prepared for drawing."""
 
-    timestamp: float  # Unix time [s], NaN if unknown
+    timestamp: float  # Unix time [s], or NaN if unknown
     level: str
     kind: str
     text: str
@@ -129,16 +129,16 @@ class StreamState:
         self._news: deque[ShownEvent] = deque(maxlen=EVENT_COUNT_MAX)
         self._event_times: deque[tuple[float, float]] = deque(maxlen=2 * EVENT_COUNT_MAX)
         self.times: schema.LoopStatistics | None = None  # statistics of all previous ticks
-        # s; a warning is shown if a servo reaches its temperature limit sooner
+        # A warning is shown if a servo will reach its temperature limit within this time [s].
         self.heat_warning_time = 0.0
-        self._lease_holder = "", -math.inf  # holder of the command lease, end of the lease [s]
-        self._lease = math.nan  # s, lease duration
-        self.commanded = math.nan  # N, force in the last grasp command from any client
-        self.force_default = math.nan  # N, force used if a grasp command has none
-        self.force_limit = math.inf  # N, maximum grip force for commands
+        self._lease_holder = "", -math.inf  # holder of the command lease, and end of the lease [s]
+        self._lease = math.nan  # lease duration [s]
+        self.commanded = math.nan  # force in the last grasp command from any client [N]
+        self.force_default = math.nan  # force of a grasp command that specifies no force [N]
+        self.force_limit = math.inf  # maximum grip force for commands [N]
         self.skipped_count = 0
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
-        self._period = 0.0  # s, smoothed time between states
+        self._period = 0.0  # smoothed time between states [s]
         self.topics: dict[bytes, Callable[[Any, float], None]] = {
             schema.STATE: self._read_state,
             schema.TACTILE: self._read_frame,
@@ -314,7 +314,7 @@ class _Pending:
     socket: zmq.Socket[bytes]
     attempts: Attempts
     sent: float
-    # Refusal because of lateness, stored until the command is sent again.
+    # Refusal due to lateness, stored until the command is sent again.
     late: dict[str, Any] | None = None
     again_at: float = 0.0  # time of the next attempt
     warned: bool = False  # True once a message about the missing reply has been shown
@@ -329,7 +329,7 @@ class Commander:
     reply to a stop.
     """
 
-    OPEN_LIMIT = 8  # maximum number of open commands; further commands are dropped, except stop
+    OPEN_LIMIT = 8  # maximum number of open commands; all further commands except stop are dropped
 
     def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
         self._context = context
@@ -370,7 +370,7 @@ class Commander:
                 if each.attempts.remaining():
                     each.late = None
                     each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
-                else:  # The process was suspended while waiting.
+                else:  # The process was suspended while it was waiting.
                     self._end(each, now, each.late)
                 continue
             try:

@@ -20,12 +20,12 @@ from rich.text import Text
 
 from softfinger.daemon.errors import SoftfingerError
 
-with contextlib.suppress(ModuleNotFoundError):  # only `monitor --plain` is supported on Windows
+with contextlib.suppress(ModuleNotFoundError):  # On Windows, only `monitor --plain` is supported.
     import termios
     import tty
 
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, bracketed paste
-# Begins with CAN, which ends a partial sequence.
+# This sequence begins with CAN, which ends a partial sequence.
 _LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # synchronised update, if supported by the terminal
 
@@ -90,7 +90,7 @@ class Terminal:
         if self._keyboard is not None:
             self._attributes = termios.tcgetattr(self._keyboard)
             tty.setcbreak(self._keyboard)  # This call also discards keys that were typed earlier.
-            # Otherwise, Ctrl-Z would also suspend the daemon while the torque is on.
+            # Otherwise, Ctrl-Z would also suspend the daemon while torque is on.
             if not self._suspendable:
                 ours = termios.tcgetattr(self._keyboard)
                 ours[6][termios.VSUSP] = b"\0"
@@ -106,7 +106,8 @@ class Terminal:
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError, termios.error, TerminalGone):
             if self._attributes is not None and self._keyboard is not None:
-                # Do not wait for the output to drain, because a stopped terminal would block.
+                # Do not wait for the output to drain, because the process would block on a stopped
+                # terminal.
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, self._attributes)
         with contextlib.suppress(OSError, termios.error, TerminalGone):
             if self._stuck:  # Discard the rest of the page.

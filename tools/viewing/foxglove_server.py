@@ -37,10 +37,10 @@ SCENE = "hand/scene"
 _FRAME = "hand"  # coordinate frame [m]: x from the left to the right pivot, y away from the palm
 _LIST = {"type": "array", "items": {"type": "object", "properties": {}}}
 _ENTITIES = {"type": "object", "properties": {"deletions": _LIST, "entities": _LIST}}
-_HEAD = struct.Struct("<BIQ")  # message header: kind, subscription, time [ns]
+_HEAD = struct.Struct("<BIQ")  # message header with kind, subscription and time [ns]
 _EVENT_COUNT = 50  # number of events stored for new subscribers, as in the daemon
 _QUEUE_LENGTH = 500  # maximum number of messages queued for a client; excess messages are dropped
-_SEND_TIMEOUT = 2.0  # s, timeout for a client to accept a message
+_SEND_TIMEOUT = 2.0  # timeout for a client to accept a message [s]
 
 
 class _Client:
@@ -80,7 +80,7 @@ class Foxglove:
         described |= {f"{tactile}/{name}": channels.schema_of(schema.TACTILE) for name in FINGERS}
         for topic in (schema.STATE, schema.TRUTH, schema.STATS, schema.EVENT):
             described[topic.decode()] = channels.schema_of(topic)
-        self._channels = list(described)  # channel names by channel number
+        self._channels = list(described)  # channel names, indexed by channel number
         coded = {"encoding": channels.ENCODING, "schemaEncoding": channels.SCHEMA_ENCODING}
         advertised = [
             {"id": number, "topic": topic, "schemaName": name, "schema": json.dumps(form)} | coded

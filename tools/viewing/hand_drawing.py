@@ -36,8 +36,8 @@ COLOURS = {
     OBJECT: (0, 158, 115),
 }
 
-_ARROW_SCALE = 1.6e-3  # m/N, force arrow length
-_ARROW_MAX = 0.045  # m
+_ARROW_SCALE = 1.6e-3  # length of a force arrow [m/N]
+_ARROW_MAX = 0.045  # maximum length of a force arrow [m]
 _HALF_TURN = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 _TURN = np.linspace(0.0, 2.0 * np.pi, 61)
 _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
@@ -46,14 +46,14 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
 class DrawnPart(NamedTuple):
     """Part of a picture; empty if the part is currently absent."""
 
-    lines: list[tuple[str, float, FloatArray]]  # (colour name, width [m], points [n, 2] [m])
-    texts: list[tuple[str, FloatArray, str]]  # (colour name, position [2], text)
+    lines: list[tuple[str, float, FloatArray]]  # colour name, width [m], points [n, 2] [m]
+    texts: list[tuple[str, FloatArray, str]]  # colour name, position [2] and text of each label
 
 
 class FingerLines(NamedTuple):
     """Lines of one finger [m], each with shape [n, 2]."""
 
-    link: FloatArray  # pivot, link end, centre of the tip's base
+    link: FloatArray  # pivot, link end, and centre of the tip's base
     base: FloatArray
     skin: FloatArray
     face: FloatArray | None  # end points of the contact line on the object's face
@@ -212,7 +212,7 @@ def footprint(
     sine = math.hypot(*n)
     if sine >= 1.0:
         return None
-    x, y = n / sine if sine > 0.0 else (1.0, 0.0)  # along the tilt
+    x, y = n / sine if sine > 0.0 else (1.0, 0.0)  # unit vector along the tilt
     across = math.sqrt(2.0 * radius * d - d * d)
     ellipse = across * _UNIT_CIRCLE * (math.sqrt(1.0 - sine * sine), 1.0)
     outline = (radius - d) * n + ellipse @ np.array([(x, y), (-y, x)])

@@ -22,8 +22,8 @@ from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.contact.table_record import TableError
 from softfinger.tools.terminal import heatmap
 
-WIDTH, HEIGHT = 240, 200  # pixels of the landscape
-THETA_END = 45.0  # degrees, maximum |θ|
+WIDTH, HEIGHT = 240, 200  # width and height of the landscape [pixels]
+THETA_END = 45.0  # maximum |θ| [degrees]
 _TOLERANCE = 1e-6  # relative tolerance of the table for the picture
 
 
@@ -34,10 +34,11 @@ class Landscape(NamedTuple):
     along θ = 0 is visible at every depth. The edges between colours are lines of constant energy.
     """
 
-    # `heatmap` levels [HEIGHT, WIDTH]; the level above the highest marks impossible contacts.
+    # Levels of `heatmap` [HEIGHT, WIDTH]. The level above the highest one marks impossible
+    # contacts.
     levels: NDArray[np.uint8]
-    d_end: float  # m, d at the upper edge
-    highest: float  # J, energy of the last colour
+    d_end: float  # d at the upper edge [m]
+    highest: float  # energy of the last colour [J]
 
 
 def landscape(settings: Settings) -> Landscape | None:

@@ -46,11 +46,11 @@ from softfinger.tools.viewing.sources import Playback, ViewError, follow
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
 _WAITING_COUNT_MAX = 40  # maximum number of commands awaiting a reply, for all pages together
-_REQUEST_TIMEOUT = 5.0  # s, timeout for a request's header, long enough for a busy browser
-_NAME_LENGTH_MAX = 40  # maximum number of displayed characters of a command name
+_REQUEST_TIMEOUT = 5.0  # timeout for a request's header [s], long enough for a busy browser
+_NAME_LENGTH_MAX = 40  # maximum number of characters of a command name that are displayed
 _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
-_BUFFER_SIZE = 256 << 10  # bytes, maximum size of the data queued for a page or a Foxglove client
-_MESSAGE_SIZE_MAX = 65536  # bytes, size limit for messages from a page or a Foxglove client
+_BUFFER_SIZE = 256 << 10  # maximum amount of data queued for a page or a Foxglove client [bytes]
+_MESSAGE_SIZE_MAX = 65536  # maximum size of a message from a page or a Foxglove client [bytes]
 _HEADERS = {
     "Cache-Control": "no-store",  # The page may contain a token, which changes at each start.
     "Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
@@ -164,7 +164,7 @@ class Site:
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
-        # In this case each request contains a secret, so any host name is accepted.
+        # In this case, each request contains a secret, so any host name is accepted.
         if self._announce is not None:
             here = True
             if not self._allows(request):
@@ -304,7 +304,7 @@ def listen(host: str, port: int | None) -> socket.socket:
             at = f"--host {host}" if port is None else f"port {port} of {host}"
             raise ViewError(f"{at} can't be used: {error.strerror}") from None
         return listen(host, 0)
-    # Use a small buffer, because data in it count as accepted before the client has read them.
+    # Use a small buffer, because buffered data count as accepted before the client has read them.
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_SIZE)
     return listener
 

@@ -40,16 +40,16 @@ if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
 TOPICS = (*StreamState().topics, schema.TRUTH)
-SECONDS = 60.0  # s, duration of the history sent to a newly opened page
-STEP = 0.1  # s, time between plot rows
+SECONDS = 60.0  # duration of the history sent to a newly opened page [s]
+STEP = 0.1  # time between plot rows [s]
 _TRAIL_LENGTH = 60  # number of rows in a trail on the landscape
 _EVENT_COUNT = 50  # maximum number of displayed events
-_WARNING_TIME = 5.0  # s, display time of a warning
+_WARNING_TIME = 5.0  # display time of a warning [s]
 _LIMIT_FRACTION = 0.8  # fraction of a limit above which a value is reported
-_DARK_SIGMA = 2.0  # standard deviations of cell noise; lower pressures are drawn as zero
-_FULL_SCALE_MIN = 10.0  # standard deviations of cell noise, minimum full scale
-_OLD_TIME = 0.35  # s, age above which the last message is shown as old
-_OLD_PERIODS = 4.0  # the same limit in stream periods; the longer of both times applies
+_DARK_SIGMA = 2.0  # minimum visible pressure, in standard deviations of the cell noise
+_FULL_SCALE_MIN = 10.0  # minimum full scale, in standard deviations of the cell noise
+_OLD_TIME = 0.35  # age above which the last message is shown as old [s]
+_OLD_PERIODS = 4.0  # the same age limit in stream periods; the longer time applies
 _NUMBER_MAX = 1e6  # limit for drawn numbers, because messages may contain any value
 _DEGREE = math.degrees(1.0)
 
@@ -62,7 +62,7 @@ class _Plot(NamedTuple):
     factor: float
     span: float
     paths: str  # `hand/state` fields
-    detail: bool = False  # True if shown only on demand
+    detail: bool = False  # True if the value is shown only on demand
 
 
 _PLOTS = (
@@ -83,14 +83,14 @@ _PLOTS = (
     ),
     _Plot("Loop times", "µs", 1e6, 50.0, "compute_s wake_late_s", True),
 )
-_HEADLINE = (  # title, decimals, plotted fields
+_HEADLINE = (  # title, decimals and plotted fields
     ("Force", 1, "left.force right.force goal_force"),
     ("Object angle", 1, "object.angle goal_angle"),
     ("Object width", 1, "object.width"),
     ("Displacement d", 2, "left.d right.d"),
 )
 _SERVOS = ("q", "current")  # fields that are missing in a hand without servos
-_DEVIATED = ("force", "d", "theta")  # finger fields for which {}_std is drawn as well
+_DEVIATED = ("force", "d", "theta")  # finger fields whose {}_std is drawn, too
 _OTHERS = {  # names and colours of lines that do not belong to a finger
     "object.angle": ("object", OBJECT),
     "object.width": ("object", OBJECT),
@@ -154,8 +154,8 @@ class Pictures:
         self._number = 0  # number of rows so far
         self._marks: list[Any] = []
         self.recording: dict[str, Any] = {}  # status set by the page's recorder
-        self._settings_text = ""  # the last settings, unparsed
-        self.seen = self.unreadable = 0  # number of states, number of unreadable messages
+        self._settings_text = ""  # last settings message, unparsed
+        self.seen = self.unreadable = 0  # number of states, and number of unreadable messages
         self.clear()
         self._read_settings(Settings())
 

@@ -31,7 +31,7 @@ class PageRecorder:
         """Start a recording, or end the running one, and return a line about the result."""
         try:
             from softfinger.tools.processes.child_processes import RecorderError, RecorderProcess
-        except ImportError:  # The system has no termios.
+        except ImportError:  # This system has no termios.
             return "✗ record: available only on Linux and macOS; use softfinger record instead"
         with self._lock:
             if self._process is not None:

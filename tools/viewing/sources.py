@@ -24,12 +24,12 @@ from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.terminal.stream_state import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
-_SILENCE_TIME = 2.0  # s, time without messages before a notice is printed
-_DRAW_PAUSE_MAX = 1.0  # s, maximum time between pictures if drawing is slow
+_SILENCE_TIME = 2.0  # time without messages before a notice is printed [s]
+_DRAW_PAUSE_MAX = 1.0  # maximum time between pictures if drawing is slow [s]
 _MARK_COUNT_MAX = 2_000  # maximum number of marks shown for a recording
 _SPEED_RANGE = 0.1, 10.0
-# Maximum number of messages queued between reads; enough for 2 s of states, truth and frames at 1
-# kHz.
+# Maximum number of messages queued between reads. This is enough for 2 s of states, truth and
+# frames at 1 kHz.
 _QUEUE_LENGTH = 5_000
 
 
@@ -100,13 +100,13 @@ class Playback:
     def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
         self._recording = recording
         self._pictures = pictures
-        self._period = period  # s, time between pictures
-        self._target: float | None = 0.0  # s, requested position, set by another thread
+        self._period = period  # time between pictures [s]
+        self._target: float | None = 0.0  # requested position, set by another thread [s]
         self.playing = True
         self.speed = 1.0
-        self.position = 0.0  # s, time since the first message
+        self.position = 0.0  # time since the first message [s]
         self._messages: Iterator[tuple[bytes, dict[str, Any]]] = iter(())
-        self._ahead: tuple[bytes, dict[str, Any]] | None = None  # next message
+        self._ahead: tuple[bytes, dict[str, Any]] | None = None  # next message to be drawn
         # Read the settings first, because a recording may contain them only once.
         for message in islice(recording.messages([schema.SETTINGS]), 1):
             pictures.take(*message)
@@ -128,8 +128,8 @@ class Playback:
     def run(self, ending: StopCondition) -> None:
         """Play until the end is requested."""
         recording, pictures = self._recording, self._pictures
-        # Search for marks with a separate reader, because this takes seconds for a long recording
-        # and must not delay the first picture.
+        # Search for marks with a separate reader. The search takes seconds for a long recording and
+        # must not delay the first picture.
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
@@ -150,7 +150,7 @@ class Playback:
         if (target := self._target) is not None:
             self._target, self.position = None, target
             pictures.clear()
-            # including plot history
+            # Include the history for the plots.
             self._messages = recording.messages(TOPICS, target - SECONDS)
             self._ahead = next(self._messages, None)
         while self._ahead is not None and (self._is_past(self._ahead[1]) or not pictures.states):

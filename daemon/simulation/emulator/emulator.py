@@ -48,16 +48,16 @@ from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTacti
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
-_STEP = 0.002  # s, maximum physics delay
-_REQUESTS = ("report", "forget", "place")  # words on the control socket that are not faults
-# rad; 6 rad is beyond the joint stops.
+_STEP = 0.002  # maximum delay of the physics [s]
+_REQUESTS = ("report", "forget", "place")  # words on the control socket that do not start a fault
+# Joint goals [rad]. A goal of 6 rad is beyond the joint stops.
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
-_TURN_CURRENT = 0.3  # A, motor current equivalent to turning a joint by hand
+_TURN_CURRENT = 0.3  # motor current equivalent to turning a joint by hand [A]
 _TURN_TIME = 1.0  # s
-_STALL_TIME = 0.05  # s, longest time that one call adds to the hand's clock
-# s, maximum lead of the hand's clock over the daemon's, because the daemon waits for replies.
+_STALL_TIME = 0.05  # longest time that one call adds to the hand's clock [s]
+# Maximum lead of the hand's clock over the daemon's clock [s]. The daemon waits for replies.
 _AHEAD_TIME = 0.002
-_POLL_INTERVAL = 0.0005  # s, interval between checks for a new deadline
+_POLL_INTERVAL = 0.0005  # interval between checks for a new deadline [s]
 # Default board, as in config/hil.toml.
 DEFAULT_BOARD = {
     "backend": "flexitac",
@@ -87,7 +87,7 @@ class EmulatorClock:
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
-        self.held = False  # True if the deadline limited the last returned time
+        self.held = False  # True if the deadline limited the time returned last
         self._deadline = deadline
         self._seen = 0.0
         self._bound = math.inf  # time after which the clock waits for the next deadline
@@ -128,9 +128,9 @@ class EmulatorClock:
 class EmulatedServos:
     """Options of the emulated servos that are not part of the settings."""
 
-    baud: int = 0  # 0: reply immediately at any baud rate
+    baud: int = 0  # 0 for an immediate reply at any baud rate
     factory: bool = False  # factory defaults except for IDs and baud rate
-    ids: tuple[int, ...] | None = None  # replacements for the IDs in the settings; IDs may be equal
+    ids: tuple[int, ...] | None = None  # replacements for the IDs in the settings, possibly equal
 
 
 class Emulator:
@@ -174,7 +174,7 @@ class Emulator:
         self._wake = os.pipe()
         self._closers.append(self._close_wake)
         self._stopping = False
-        # poll and epoll have only millisecond resolution.
+        # poll and epoll only have millisecond resolution.
         self._selector = selectors.SelectSelector()
         self._selector.register(self._wake[0], selectors.EVENT_READ)
         self._servos: PtyServoBus | None = None
@@ -280,7 +280,7 @@ class Emulator:
         start = self.clock.now()
         if servos is not None:
             due = min(due, servos.next_event())
-        # No event becomes due while the hand's clock is paused, so avoid a busy loop.
+        # Avoid a busy loop, because no event becomes due while the hand's clock is paused.
         wait = max(due - start, _POLL_INTERVAL if self.clock.held else 0.0)
         ready = [key for key, _ in self._selector.select(wait)]
         t = self.clock.now()
@@ -348,7 +348,7 @@ class Emulator:
                 self._take_away(finger)
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
-        self._advance_due = now  # faults without a time begin immediately
+        self._advance_due = now  # Faults without a time begin immediately.
         return reply
 
     def press(self, text: str) -> str:

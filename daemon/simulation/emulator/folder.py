@@ -26,10 +26,10 @@ _LOCK = ".emulator.lock"
 _CONTROL = "control"
 _MESSAGE_SIZE_MAX = 4096  # bytes per message
 _REPLY_SIZE_MAX = 1 << 17
-_CLIENT_COUNT_MAX = 8  # simultaneous clients
-_CLIENT_TIMEOUT = 10.0  # s, client timeout, long enough for a busy machine
+_CLIENT_COUNT_MAX = 8  # maximum number of clients at a time
+_CLIENT_TIMEOUT = 10.0  # client timeout [s], long enough for a busy machine
 _MOTIONS = ("press", "turn")
-_QUERY_INTERVAL = 0.1  # s, interval between queries about the motion of a plate or joint
+_QUERY_INTERVAL = 0.1  # interval between queries about the motion of a plate or joint [s]
 
 
 class FolderError(SoftfingerError):
@@ -72,7 +72,7 @@ class LinkFolder:
                     f"{self.path}: in use by another emulator (process {holder or 'unknown'}); "
                     "end that emulator or select another --dir"
                 ) from None
-            # The previous holder may have removed the file between the open and the lock.
+            # The previous holder may have removed the lock file between open and lock.
             with contextlib.suppress(FileNotFoundError):
                 if path.stat().st_ino == os.fstat(lock).st_ino:
                     os.ftruncate(lock, 0)
@@ -135,7 +135,8 @@ class ControlPort:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with contextlib.suppress(FileNotFoundError):
-                # This process holds the folder lock, so the socket was left by a killed emulator.
+                # This process holds the folder lock, so a killed emulator has left the socket
+                # behind.
                 if not stat.S_ISSOCK(os.stat(_CONTROL, dir_fd=self._folder).st_mode):
                     raise FolderError(f"{folder / _CONTROL}: already exists; move it elsewhere")
                 os.unlink(_CONTROL, dir_fd=self._folder)

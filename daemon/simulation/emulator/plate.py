@@ -20,10 +20,10 @@ from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
 
-_CLEARANCE = 1e-3  # m, distance from the tip at which the plate tilts and waits
+_CLEARANCE = 1e-3  # distance from the tip at which the plate tilts and waits [m]
 _LIFT_SPEED = 0.02  # m/s
-_FILL_TIME = 0.1  # s, inflation time of a bladder
-_PAUSE = 1.0  # s, pause without contact between presses
+_FILL_TIME = 0.1  # inflation time of a bladder [s]
+_PAUSE = 1.0  # pause without contact between presses [s]
 
 _UNITS = {
     "depth": {"mm": 1e-3, "m": 1.0},
@@ -116,7 +116,7 @@ def _value(name: str, text: str) -> float:
 
 def _press(values: dict[str, float], table: ContactTable, scale: float) -> PlatePress:
     d, theta, pressure = values.get("depth", 0.0), values["tilt"], values.get("pressure", 0.0)
-    # Limit the depth to the valid range of the contact law at this tilt.
+    # Limit the depth to the range in which the contact law is valid at this tilt.
     d_max = 0.75 * table.tip.radius * (1.0 - abs(math.sin(theta)))
     known = [(float(x), lookup(table.data, x, theta)) for x in np.linspace(0.0, d_max, 1001)]
     depths = [x for x, (*_, inside) in known if inside]
@@ -140,9 +140,9 @@ class Plate:
         self._d = [-_CLEARANCE]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
-        ]  # for the interval from each knot: the press, and True if the plate is stationary
+        ]  # press and standstill flag for the interval that begins at each knot
         self._reported = -1
-        self.arrives = 0.0  # arrival time of the sequence's last press
+        self.arrives = 0.0  # arrival time of the last press in the sequence
 
     def go(self, presses: Sequence[PlatePress], t: float) -> None:
         """Lift off, then perform ``presses``, starting at ``t``."""

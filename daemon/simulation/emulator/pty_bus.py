@@ -25,14 +25,15 @@ _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control char
 _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _READ_SIZE = 4096
-_READS_PER_TURN = 4  # maximum number of reads per turn, which leaves time for other tasks
-# s, duration of silence that ends a packet. It exceeds 1.5 ms because this process may be delayed.
+_READS_PER_TURN = 4  # maximum number of reads per turn; the limit leaves time for other tasks
+# Duration of silence that ends a packet [s]. It is longer than 1.5 ms because this process may be
+# delayed.
 _GAP_TIME = 0.02
-# s, typical pseudo-terminal latency from a write to the reader's wake-up. A paced bus subtracts it
-# in both directions, because the simulated wire has its own transmission time.
+# Typical pseudo-terminal latency from a write to the reader's wake-up [s]. A paced bus subtracts
+# this latency in both directions, because the simulated wire has its own transmission time.
 PASSAGE_TIME = 15e-6
-# s, maximum age of a reading when its reply is sent. Real servos also measure at their own
-# intervals. This tolerance allows the physics to be computed outside the exchange.
+# Maximum age of a reading when its reply is sent [s]. Real servos also measure at their own
+# intervals. With this tolerance, the physics can be computed outside the exchange.
 _LAG_TIME = 0.0005
 
 
@@ -153,7 +154,7 @@ class PtyServoBus:
             for _ in range(_READS_PER_TURN):
                 try:
                     data = os.read(self._master, _READ_SIZE)
-                except OSError:  # no data
+                except OSError:  # No data are available.
                     break
                 if self._receive(data, t):
                     break  # The client needs time to read the reply.
@@ -204,7 +205,8 @@ class PtyServoBus:
             self._write(heapq.heappop(self._due)[2])
 
     def _write(self, data: bytes) -> None:
-        # A client that never reads fills the terminal. A real wire would also lose these bytes.
+        # A client that never reads fills the terminal buffer. A real wire would lose these bytes,
+        # too.
         try:
             os.write(self._master, data)
         except BlockingIOError:

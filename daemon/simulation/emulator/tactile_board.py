@@ -25,11 +25,11 @@ from softfinger.daemon.simulation.faults import BOARD_FAULTS, WELL
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
-# limit on unread bytes; must be less than 4095, the maximum that a tty reports
+# Maximum number of unread bytes. It must be less than 4095, the maximum that a tty reports.
 _TTY_SIZE_MAX = 2048
 _DRAIN = 4096
-_RETRY_TIME = 5e-4  # s, interval at which the source is polled for a late frame
-_NOISE_LENGTH = 64  # bytes, longest noise burst between frames
+_RETRY_TIME = 5e-4  # interval between polls of the source for a late frame [s]
+_NOISE_LENGTH = 64  # length of the longest noise burst between frames [bytes]
 
 
 class FrameSource(Protocol):
@@ -50,7 +50,7 @@ class FrameWriter:
     def __init__(self) -> None:
         self._master, self._slave, self.path = open_pty()
         self.dropped = 0  # frames
-        self._remaining = b""  # unsent part of a frame
+        self._remaining = b""  # part of a frame that has not been sent yet
         self._unread = array.array("i", [0])
 
     def fileno(self) -> int:
@@ -175,7 +175,7 @@ class TactileBoard:
         """Send the newest frame if a new frame is due at time t [s]."""
         if self.plugged:
             self._writer.flush()
-        # The due time may be rounded up or down.
+        # Rounding may shift the due time in either direction.
         self._due = (math.floor((t - self._delay) * self._rate + 1e-6) + 1) / self._rate
         self._due += self._delay
         frame = self._source.latest()
@@ -201,7 +201,7 @@ class TactileBoard:
             counts = counts if self._frozen is None else self._frozen
         self._frozen = counts
         if "saturated" in faults:
-            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # clipped by the encoder
+            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # The encoder clips these.
         elif "zero" in faults:
             counts = np.zeros_like(counts)
         if "wrong-size" in faults:
@@ -219,7 +219,7 @@ class TactileBoard:
         return data
 
 
-# counts [rows, cols], scan number, board time [s] → bytes
+# Arguments: counts [rows, cols], scan number and board time [s]. Result: bytes.
 Encode = Callable[[NDArray[np.uint16], int, float], bytes]
 
 

@@ -16,9 +16,9 @@ from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Pla
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth undamped steps
-# relative rounding error of the energy, large because d is a small difference of lengths
+# Relative rounding error of the energy. It is large because d is a small difference of lengths.
 _ROUNDING = 3e-13
-HALVINGS = 12  # maximum number of halvings of a step
+HALVINGS = 12  # maximum number of times that a step is halved
 
 
 @inner_kernel
@@ -137,7 +137,7 @@ def shorten(plant: Plant, scale: float) -> None:
         now.bristles[j] = before.bristles[j] + scale * bent
         layers, earlier = plant.layers[j], plant.last_layers[j]
         mean = square = 0.0
-        for k in range(LAYERS):  # array expressions would load Numba's ufuncs on each startup
+        for k in range(LAYERS):  # Array expressions would load Numba's ufuncs on each startup.
             layers[k] = earlier[k] + scale * (layers[k] - earlier[k])
             mean += layers[k] / LAYERS
         for k in range(LAYERS):

@@ -45,9 +45,9 @@ from softfinger.daemon.simulation.physics.tip import (
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
 
-STIFFNESS = 1e5  # N/m per corner, normal to the palm and along it
-LOSS = 1e-3  # s, ratio of damping to stiffness
-# Tip radii; the tip-to-tip contact is evaluated if half the centre distance is below this.
+STIFFNESS = 1e5  # contact stiffness per corner, normal to the palm and along it [N/m]
+LOSS = 1e-3  # ratio of damping to stiffness [s]
+# Limit in tip radii. The tip-to-tip contact is evaluated if half the centre distance is smaller.
 _DISTANCE_MAX = 1.5
 
 
@@ -154,7 +154,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
     d = p.radius - half
     ex = apart_x / apart
     ey = apart_y / apart
-    # Components of v along e and along e rotated by 90°.
+    # Components of v along e, and along e rotated by 90°.
     m1 = left.x_q * ex + left.y_q * ey
     m2 = right.x_q * ex + right.y_q * ey
     t1 = left.y_q * ex - left.x_q * ey
@@ -169,7 +169,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
     for finger in range(2):
         tip = stage.on_tip[finger]
         side = 1.0 - 2.0 * finger
-        ux = plant.fingers[finger].cosine  # For the right tip, the finger axis and e are mirrored.
+        ux = plant.fingers[finger].cosine  # The finger axis and e are mirrored for the right tip.
         uy = -side * plant.fingers[finger].sine
         tip.sine = ux * ey - uy * ex
         tip.cosine = ux * ex + uy * ey

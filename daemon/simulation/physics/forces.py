@@ -177,7 +177,8 @@ def place_finger(plant: Plant, finger: int, q: float) -> None:
     p, its = plant.parameters, plant.fingers[finger]
     cosine = math.cos(q)
     sine = math.sin(q)
-    # Tip centre relative to its pivot, inwards and away from the palm (hand.geometry).
+    # Position of the tip centre relative to its pivot, inwards and away from the palm
+    # (hand.geometry).
     inward = p.length * sine + p.offset * cosine
     ahead = p.length * cosine - p.offset * sine
     side = 1.0 - 2.0 * finger

@@ -10,7 +10,7 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import DISC, Parameters, TipContact
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-FACE = -1.0  # code for a plane face instead of a radius of curvature
+FACE = -1.0  # code that marks a plane face instead of a radius of curvature
 _DISTANCE_MIN = 1e-12  # m
 
 
@@ -36,7 +36,8 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
             best = out
             face = k
         if out > 0.0:
-            # Edges run counter-clockwise, so their direction is the normal rotated by 90°.
+            # Edges run counter-clockwise, so an edge direction is the outward normal rotated by
+            # 90°.
             along = (v - edge.y) * edge.normal_x
             along -= (u - edge.x) * edge.normal_y
             if 0.0 <= along <= edge.length:

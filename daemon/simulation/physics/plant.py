@@ -242,7 +242,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
     row.t = due
     for finger in range(2):
         now, before = sensed_contact_of(plant, finger), plant.sensed_contact[finger]
-        # Do not interpolate between two contacts with different bodies.
+        # Do not interpolate between contacts with two different bodies.
         same = senses_other_tip(plant, finger) == (plant.on_other_tip[finger] != 0)
         fraction = back if same else 0.0
         row.d[finger] = now.d - fraction * (now.d - before.d)
@@ -281,7 +281,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
-    # Pass a record from here on, because each array argument costs a reference count per call.
+    # Pass a single record from here on, because each array argument costs a reference count per
+    # call.
     data = tables[0]
     h = p.step
     g = _GAMMA * h
@@ -309,7 +310,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             state.position[2] = script_x(plant, plant.step_count * h)
         if relaxing:
             relax_shears(plant)
-        # Slip: this limits the shears, which `settle` then stores.
+        # This evaluation applies slip by limiting the shears, and `settle` then stores them.
         evaluate_state(plant, data)
         if scripted:
             open_guard(plant)
@@ -326,8 +327,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
         store_bristles(plant)
         settle(plant, ring)
         if p.tips_relax:
-            # The relaxation factor is constant within a step. The energy change between steps comes
-            # from the tip itself, so the guard accepts it.
+            # The relaxation factor is constant within a step. Between steps, relaxation changes the
+            # energy of the tip itself, so the guard accepts the change.
             relax_tips(plant)
             evaluate_state(plant, data)
             allow_relaxed_energy(plant)

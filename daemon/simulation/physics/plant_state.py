@@ -28,11 +28,11 @@ ALONG_D = 0
 ALONG_THETA = 1
 ALONG_SHEAR = 2
 
-LAYERS = 8  # footprint layers that slip successively from the edge inwards
+LAYERS = 8  # number of footprint layers that slip successively from the edge inwards
 CORNERS = 8  # maximum number of object corners
-SHEARS = CORNERS + 2  # palm shear at each corner, then tip-on-tip shear of each tip
+SHEARS = CORNERS + 2  # palm shear at each corner, followed by the tip-on-tip shear of each tip
 PALM_ROWS = 2 * CORNERS  # height and slip of each corner
-EXTRA_ROWS = PALM_ROWS + 6  # plus d, θ and d_t of each tip on the other
+EXTRA_ROWS = PALM_ROWS + 6  # adds d, θ and d_t of each tip on the other tip
 
 Shears = Annotated[FloatArray, SHEARS]
 
@@ -54,7 +54,7 @@ class Motion(Record):
 class Sample(Record):
     """Tip contacts at a frame's sample time; fields as in :class:`TipContact`."""
 
-    number: int  # -1 if empty
+    number: int  # -1 for an empty entry
     t: float  # time since the start [s]
     d: Pair
     theta: Pair
@@ -79,21 +79,21 @@ class Parameters(Record):
 
     step: float  # sub-step [s]
     sample_period: float  # [s]
-    modulus: float  # modulus of the real tip at zero strain [Pa]
+    modulus: float  # zero-strain modulus of the real tip [Pa]
     radius: float  # tip radius [m]
     deepest: float  # maximum d for which the contact law is valid [m]
     scale: float  # ratio of the real modulus to the table modulus
     friction: float
-    loss: float  # damping over stiffness [s]
+    loss: float  # ratio of damping to stiffness [s]
     shear_stiffness: float  # shear stiffness relative to the spring model
     shear_coupling: float  # coupling of d_t with d and θ: 1 for springs, 0 for bristles
-    creep: float  # fraction of a stuck shear that relaxes per sub-step
+    creep: float  # fraction of a sticking shear that relaxes per sub-step
     micro_slip: bool  # True if the edge of the footprint slips first
     tips_relax: bool
     relaxation: FloatTriple  # Prony term stiffnesses relative to the long-term stiffness
     relaxation_step: FloatTriple  # fraction of each Prony term that relaxes per sub-step
     rim_stiffness: float  # [N/m]
-    tolerance: float  # relative energy gain allowed in smooth steps
+    tolerance: float  # relative energy gain that is allowed in smooth steps
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
     offset: float  # tip offset from the finger axis [m]
@@ -113,17 +113,17 @@ class Parameters(Record):
     table_torque: float  # Coulomb friction torque between table and object [N·m]
     table_speed: float  # speed below which table friction is viscous [m/s]
     table_spin: float  # angular speed below which table friction is viscous [rad/s]
-    palm: float  # y of the palm [m]
+    palm: float  # y coordinate of the palm [m]
     palm_friction: float
     joint_inertia: float  # [kg·m²]
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
     stribeck: float  # additional friction at standstill [N·m]
-    load_friction: Pair  # ratio of friction to gear torque, and its addition at standstill
-    stribeck_speed: float  # speed at which additional friction decreases to 1/e [rad/s]
-    presliding: float  # slip deflection of the bristles [rad]
+    load_friction: Pair  # ratio of friction to gear torque, and additional ratio at standstill
+    stribeck_speed: float  # speed at which the additional friction has decreased to 1/e [rad/s]
+    presliding: float  # bristle deflection at which the gears slip [rad]
     torque_constant: float  # [N·m/A]
-    electric_time: float  # current lag [s]
+    electric_time: float  # time constant of the current [s]
     current_limit: float  # [A]
     stall_current: float  # [A]
     no_load_speed: float  # [rad/s]
@@ -134,7 +134,7 @@ class Parameters(Record):
     stop_stiffness: float  # [N·m/rad]
     joints_held: bool
     object_held: bool
-    script_speed: float  # speed of a held object moving back and forth [m/s]
+    script_speed: float  # speed of a held object that moves back and forth [m/s]
     script_travel: Pair  # travel to the left and to the right [m]
     script_x: float  # start position [m]
 
@@ -147,9 +147,9 @@ class Goals(Record):
     q: Pair  # [rad]
     current: Pair  # [A]
     stiffness: Pair  # position-loop stiffness relative to the factory setting
-    damping: Pair  # damping beyond the factory setting, relative to its stiffness [s]
+    damping: Pair  # damping beyond the factory setting, relative to the factory stiffness [s]
     duty: Pair  # motor voltage limit as a fraction of the supply voltage
-    load: FloatTriple  # external force x, y [N] and torque [N·m] on the object
+    load: FloatTriple  # external force x, y [N] and external torque [N·m] on the object
 
 
 class Finger(Record):
@@ -168,7 +168,7 @@ class Gears(Record):
 
     deflection: float  # bristle deflection at the start of the step [rad]
     level: float  # friction level at the start of the step [N·m]
-    limited_deflection: float  # deflection in the last evaluation, after limiting [rad]
+    limited_deflection: float  # deflection in the last evaluation, after it was limited [rad]
     friction: float  # friction level in the last evaluation [N·m]
     stiffness: float  # bristle stiffness in the step matrix [N·m/rad]
 
@@ -183,23 +183,23 @@ class TipContact(Record):
     theta: float  # tilt of the object relative to the tip [rad]
     sine: float  # sin θ
     cosine: float
-    tangent: float  # tan θ, 0 for bristles and beyond the soft hemisphere
-    gain: float  # ratio of the force to that on a plane, due to w(θ) and face curvature
+    tangent: float  # tan θ, or 0 for bristles and beyond the soft hemisphere
+    gain: float  # ratio of the force to the force on a plane, due to w(θ) and face curvature
     curvature: float  # curvature of the touched surface [1/m]
     travel: float  # largest possible increase in d during this step [m]
     rate_d: float  # [m/s]
     rate_theta: float  # [rad/s]
     slip_rate: float  # tangential velocity of the surface relative to the tip [m/s]
-    shear: float  # d_t after limiting [m]
+    shear: float  # d_t after it was limited [m]
     shear_variance: float  # shear variance of the layers [m²]
     shear_rate: float  # rate of d_t without slip [m/s]
-    force: float  # total force on the tip base, the sum over a pressure grid [N]
+    force: float  # total force on the tip base, which is the sum over a pressure grid [N]
     energy: float  # elastic energy [J]
     normal: float  # N [N]
     tangential: float  # T [N]
-    rim: float  # rim penetration depth, 0 without contact [m]
-    rim_energy: float  # rim energy, set if ``rim`` is above 0 [J]
-    rim_d: float  # derivatives of rim energy: d [N], θ [N·m]
+    rim: float  # rim penetration depth, or 0 without contact [m]
+    rim_energy: float  # rim energy, which is set if ``rim`` is above 0 [J]
+    rim_d: float  # derivatives of the rim energy with respect to d [N] and θ [N·m]
     rim_theta: float
     rows: Annotated[FloatArray, 3, 4]  # derivatives of d, θ and d_t with respect to the coordinates
     stiffness: FloatTriple  # stiffness along each row
@@ -222,7 +222,7 @@ class ExtraRow(Record):
     row: FloatFive
     stiffness: float
     damping: float
-    shear: int  # 1 + index of the row's extra shear, 0 if it has none
+    shear: int  # index of the row's extra shear plus 1, or 0 if the row has none
 
 
 class Factors(Record):
@@ -238,13 +238,13 @@ class Plant(Record):
     parameters: Parameters
     goals: Goals
     state: Motion
-    # Current contact of each tip, or its stronger contact if it has two.
+    # Current contact of each tip. If a tip has two contacts, this is the stronger one.
     sensed_contact: Annotated[Records[TipContact], 2]
-    on_other_tip: Flags  # 1 if this contact is with the other tip
+    on_other_tip: Flags  # 1 if the contact is with the other tip
     step_count: int  # number of completed sub-steps
     sample_count: int  # number of samples taken
     energy: float  # kinetic, elastic and gravitational [J]
-    energy_limit: float  # energy limit, given by the work done on the hand [J]
+    energy_limit: float  # energy limit that results from the work done on the hand [J]
     limited_step_count: int  # number of sub-steps that the energy guard has limited
     last_state: Motion  # state before the step
     stage_state: Motion  # state of the second stage
@@ -263,7 +263,7 @@ class Plant(Record):
     last_layers: Annotated[FloatArray, 2, LAYERS]  # layer shears before the step [m]
     shear_variance: Pair  # variance of the layer shears [m²]
     relaxation_state: Annotated[FloatArray, 2, 3]  # state of each tip's Prony terms [N]
-    relaxation_factor: Pair  # tip force relative to its long-term force
+    relaxation_factor: Pair  # ratio of tip force to long-term tip force
     palm_energy: float  # [J]
     tips_may_touch: bool  # True if the tip-to-tip contact was evaluated
     has_extra_rows: bool  # True if extra rows may be active in this step

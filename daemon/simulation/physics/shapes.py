@@ -28,10 +28,10 @@ class Shape:
     """Outline of an object with its centre of mass at the origin. Lengths are in m."""
 
     kind: int  # shape constant from plant_state
-    corners: FloatArray  # [n, 2], counter-clockwise; for a disc, its circumscribed square
-    roundness: float  # radius of a disc, otherwise 0
+    corners: FloatArray  # counter-clockwise corners [n, 2]; a disc has its circumscribed square
+    roundness: float  # radius of a disc, or 0 for other shapes
     gyration: float  # radius of gyration
-    mean_radius: float  # mean distance of all points from the centre, for spin friction
+    mean_radius: float  # mean distance of all points from the centre, for the spin friction
 
     @property
     def extent(self) -> float:

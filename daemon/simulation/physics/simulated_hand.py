@@ -43,20 +43,20 @@ from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
 
 SPARE_SAMPLE_COUNT = 8
-ADVANCE_MAX = 10.0  # s, maximum simulated time per kernel call
+ADVANCE_MAX = 10.0  # maximum simulated time per kernel call [s]
 
 _MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
 
 STANDARD_GRAVITY = 9.80665  # m/s²
 STEP_MAX = 0.25e-3  # s
 STEP_MIN = 0.05e-3  # s
-PHASE_MAX = 0.25  # rad, maximum phase angle of the fastest oscillation in one sub-step
-ELECTRIC_TIME = 1e-3  # s, lag of the servo current behind its reference
-FULL_EFFORT_ERROR = 0.27  # rad, position error at which the loop commands the stall current
-TABLE_SPEED = 0.0005  # m/s, speed below which table friction is viscous
-STOP_CLEARANCE = 0.05  # rad, distance from the commanded range to the mechanical end stops
+PHASE_MAX = 0.25  # maximum phase angle of the fastest oscillation in one sub-step [rad]
+ELECTRIC_TIME = 1e-3  # lag of the servo current behind its reference [s]
+FULL_EFFORT_ERROR = 0.27  # position error at which the loop commands the stall current [rad]
+TABLE_SPEED = 0.0005  # speed below which table friction is viscous [m/s]
+STOP_CLEARANCE = 0.05  # distance from the commanded range to the mechanical end stops [rad]
 STOP_STIFFNESS = 500.0  # N·m/rad
-RIM_STIFFNESS = 1e6  # N/m, stiffness of the backing plate against the object
+RIM_STIFFNESS = 1e6  # stiffness of the backing plate against the object [N/m]
 COMPRESSION_DEPTH = 0.4  # depth of the scripted compression as a fraction of the tip radius
 
 
@@ -73,8 +73,8 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius, table.header.deepest)
     c = table(d, 0.0)
-    # Normal stiffness ∂F/∂d and shear stiffness 2F/d are similar. The factor 2 accounts for two
-    # tips.
+    # The normal stiffness ∂F/∂d and the shear stiffness 2F/d are similar. The factor 2 accounts for
+    # two tips.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
     stiffness *= 1.0 + sum(simulation.tip_relaxation)
     shape = shape_of(settings)
@@ -84,7 +84,8 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
         turning = (shape.half_width / shape.gyration) ** 2
         fastest = math.sqrt(stiffness / simulation.object_mass * max(1.0, turning))
     step = min(max(PHASE_MAX / fastest, STEP_MIN), STEP_MAX)
-    # An integer number of sub-steps per millisecond keeps ticks and frames aligned with sub-steps.
+    # With an integer number of sub-steps per millisecond, ticks and frames stay aligned with
+    # sub-steps.
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
 
@@ -146,7 +147,7 @@ def _object(p: Parameters, settings: Settings) -> None:
     p.table_torque = p.table_force * shape.mean_radius
     p.table_speed = TABLE_SPEED
     p.table_spin = TABLE_SPEED / shape.mean_radius
-    # A single finger can't hold an object, so in this case the object is fixed to the test bench.
+    # A single finger cannot hold an object, so the object is then fixed to the test bench.
     p.object_held = (
         shape.kind == NO_OBJECT
         or len(settings.scene.fingers) == 1
@@ -171,7 +172,7 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # This gives critical damping of the joint with its position loop.
+    # This damping makes the joint with its position loop critically damped.
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
@@ -266,19 +267,20 @@ class SimulatedHand:
         self.object_pose = state.position[2:]  # x, y, φ
         self.object_velocity = state.velocity[2:]
         felt: Any = self.plant.sensed_contact
-        self.d = felt.array["d"]  # m, negative for a gap
+        self.d = felt.array["d"]  # normal displacement, negative for a gap [m]
         self.theta = felt.array["theta"]  # rad
         self.force = felt.array["force"]  # F on the tip base [N]
         self.normal = felt.array["normal"]  # N [N]
         self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
-        # Penetration depth of the backing plate rim; above 0, the tip is beyond its limit.
+        # Penetration depth of the backing plate's rim. If it is above 0, the tip is beyond its
+        # limit.
         self.rim = felt.array["rim"]  # m
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
         self.torque_on = goals.torque_on  # 1 if the servo's torque is on
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
-        # Faults of each finger's tactile sensor and servo, left finger first. They do not change
-        # the physics.
+        # Faults of each finger's tactile sensor and servo, left finger first. These faults do not
+        # change the physics.
         self.measurement_faults = MeasurementFaults(), MeasurementFaults()
         self.servo_heat = ServoHeat.of(settings), ServoHeat.of(settings)
         self._run(0)
@@ -297,7 +299,7 @@ class SimulatedHand:
         self._advance(t)
 
     def _advance(self, t: float) -> None:
-        # Adding 1e-6 prevents rounding down when t is a multiple of the sub-step.
+        # Adding 1e-6 prevents rounding down if t is a multiple of the sub-step.
         remaining = int((t - self.start) * self._per_step + 1e-6) - self._done
         steps_max = int(ADVANCE_MAX * self._per_step)
         while remaining > 0:

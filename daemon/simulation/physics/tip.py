@@ -71,14 +71,14 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.lookup import lookup_at, normal_at, stiffness_ahead
 from softfinger.kinematics.contact.table_record import Table
 
-D_MIN = 1e-9  # m, minimum d for a contact
-_FADE_FROM = 1.15  # rad, angle above which w(θ) decreases
-_FADE_TO = 1.35  # rad, angle at which w(θ) becomes 0
-# Fraction of the radius, minimum distance from the tip centre to a corner.
+D_MIN = 1e-9  # minimum d for a contact [m]
+_FADE_FROM = 1.15  # angle above which w(θ) decreases [rad]
+_FADE_TO = 1.35  # angle at which w(θ) becomes 0 [rad]
+# Minimum distance from the tip centre to a corner, as a fraction of the radius.
 _CORNER_DISTANCE_MIN = 1e-3
 _FRICTION_TOLERANCE = 5e-13  # relative tolerance for the friction limit
 _RELAXATION_MIN = 0.02  # minimum relaxation factor, for tips with delayed recovery
-# fraction of the radius, distance from the end of the soft range to the rim at θ = 0
+# Distance from the end of the soft range to the rim at θ = 0, as a fraction of the radius.
 _RIM_ROUNDING = 0.03
 
 
@@ -177,7 +177,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         ahead = stiffness_ahead(table, 2.0 * math.pi * p.modulus * gain, tip.travel)
         ahead *= inverse_cosine
     if gain > 0.0 and d > D_MIN:
-        # d_soft is d limited to the soft range; d_soft_d and d_soft_theta are its derivatives.
+        # d_soft is d limited to the soft range. d_soft_d and d_soft_theta are the derivatives of
+        # d_soft.
         radius = p.radius
         d_soft = d
         d_soft_d = 1.0
@@ -204,7 +205,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         slope *= scale
         slope_d *= scale
         slope_theta *= scale
-        # Beyond this range, extrapolate U₀ with its slope ∂U₀/∂d.
+        # Beyond the soft range, extrapolate U₀ with its slope ∂U₀/∂d.
         inverse_d = 1.0 / d_soft
         over = d - d_soft
         soft = scale * soft + slope * over
@@ -222,7 +223,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # shear at which T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # Most steps are far from slip. Two comparisons detect this case.
+        # Most steps are far from slip, and two comparisons detect these steps.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction
@@ -237,7 +238,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
             tangential = t0 + t1 * shear
         normal += n2 * shear_variance
 
-        # Second term of U and its derivatives.
+        # Compute the second term of U and its derivatives.
         bent = firm * sine * inverse_d
         sheared = coupled * shear + ratio * shear * shear + ratio * shear_variance
         by_soft = force_d * sheared - force * ratio * inverse_d * shear * shear
@@ -256,7 +257,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         shear = 0.0
 
     # Damping must not make a separating tip pull, and shear damping must not exceed friction. A
-    # stuck tip does not slide, apart from the spring model's term tan θ ḋ, which keeps the virtual
+    # stuck tip does not slide, except by the spring model's term tan θ ḋ, which keeps the virtual
     # work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
@@ -322,7 +323,7 @@ def touch_object(
     side = 1.0 - 2.0 * finger
     radius = p.radius
     mu, mv, distance, curved = nearest(p, rx * nx + ry * ny, ry * nx - rx * ny)
-    # m points from the tip centre into the object; t is m rotated by 90°.
+    # The vector m points from the tip centre into the object, and t is m rotated by 90°.
     mx = mu * nx - mv * ny
     my = mu * ny + mv * nx
     d = radius - distance
@@ -337,7 +338,7 @@ def touch_object(
     tip.sine = sine
     tip.cosine = cosine
 
-    # Derivatives with respect to (q, x, y, φ). The contact point is ``distance`` · m away from the
+    # Derivatives with respect to (q, x, y, φ). The contact point is at ``distance`` · m from the
     # tip centre.
     px = rx + distance * mx
     py = ry + distance * my
@@ -350,7 +351,7 @@ def touch_object(
     y_rate = now.velocity[3]
     rotation_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
-    # The integrator matrix uses the stiffness at the end of the step, so that it is correct during
+    # The integrator matrix uses the stiffness at the end of the step, which keeps it correct during
     # an impact. Damping uses the current stiffness.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
@@ -362,8 +363,8 @@ def touch_object(
     theta_y = 0.0
     theta_rotation = 1.0
     if curved >= 0.0:
-        # m points to the centre of curvature, which is fixed to the object: the corner or the disc
-        # centre.
+        # The vector m points to the centre of curvature, which is fixed to the object: the corner
+        # or the disc centre.
         inverse = 1.0 / max(distance + curved, _CORNER_DISTANCE_MIN * radius)
         theta_q -= v_t * inverse
         theta_x = -my * inverse

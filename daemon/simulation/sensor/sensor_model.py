@@ -275,7 +275,7 @@ def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) ->
     lagged: FloatArray = state[1]
     ratio = elapsed / time
     decay = math.exp(-ratio)
-    # Mean decay over the interval, which is 1 − r/2 + … for short intervals.
+    # Mean decay over the interval, which is 1 − r/2 + … for a short interval.
     mean = -math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0
     lagged *= decay
     lagged += (mean - decay) * before + (1.0 - mean) * pressure
@@ -329,4 +329,4 @@ def count(
     lowest, full = ends
     value = np.clip(signal + 0.5, 0.0, full + 0.5)
     value[~active | (value < lowest)] = 0.0
-    out[:] = value  # truncation to integers
+    out[:] = value  # The assignment truncates to integers.

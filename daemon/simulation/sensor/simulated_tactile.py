@@ -40,7 +40,7 @@ class StageTouch(NamedTuple):
 
     d: float  # m
     theta: float  # rad
-    pressure: float  # if above 0, uniform pressure on all cells that replaces the contact [Pa]
+    pressure: float  # uniform pressure on all cells [Pa]; replaces the contact if it is above 0
 
 
 class SimulatedTactile:
@@ -80,9 +80,9 @@ class SimulatedTactile:
         self._relaxation = list(
             zip(simulation.tip_relaxation, simulation.tip_relaxation_times, strict=True)
         )
-        # lagged plate force of each Prony term [N]
+        # Lagged plate force of each Prony term [N].
         self._relaxation_state = [0.0] * len(self._relaxation)
-        self._pressed = -1  # number of the newest sample applied to the cells
+        self._pressed = -1  # number of the newest sample that was applied to the cells
         self._frame: Frame | None = None
         self._faults = hand.measurement_faults[finger]
         self._given: deque[NDArray[np.uint16]] = deque(
@@ -125,7 +125,7 @@ class SimulatedTactile:
 
     def _read(self, number: int, arrival: float) -> None:
         """Compute the frame of a sample that the plant still stores; make it the newest frame."""
-        # If readings depend on earlier contacts, samples whose frame is not computed also matter.
+        # If readings depend on earlier contacts, samples without a computed frame also matter.
         first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
             self._press(each)
@@ -181,10 +181,11 @@ class SimulatedTactile:
             shear = float(sample.tangential[finger]) * (1.0 - d / self._radius)
             self._model.press(d, theta, 0.0, number * self._period, curvature, factor, shear)
             return True
-        # Remove the effect of curvature from the factor, because the sensor model computes this
-        # effect.
+        # Remove the effect of curvature from the factor, because the sensor model already includes
+        # this effect.
         factor *= math.sqrt(1.0 + curvature * self._radius)
-        # Force is proportional to d². If half the tip is beyond the face edge, the force is halved.
+        # The force is proportional to d². If half the tip is beyond the face edge, the force is
+        # halved.
         relaxation_factor = float(sample.relaxation_factor[finger])
         d *= math.sqrt(factor / relaxation_factor)
         self._model.press(d, theta, 0.0, number * self._period, curvature, relaxation_factor)
@@ -199,7 +200,7 @@ class Arrivals:
     to ``jitter`` [s]. Frames never overtake each other.
     """
 
-    # Allow for clock rounding errors, so that a frame due now counts as arrived.
+    # Allowance for clock rounding errors, with which a frame that is due now counts as arrived.
     _SLACK = 1e-9
 
     def __init__(
@@ -219,7 +220,7 @@ class Arrivals:
         self._random = np.random.default_rng(seed)
         self.number = -1  # number of the newest frame
         self.arrival = start  # arrival time of the newest frame [s]
-        self.arrived = 0  # frames
+        self.arrived = 0  # number of frames that have arrived
         self.missed = 0  # number of frames lost before the newest frame
         self._next = -1
         self.next_arrival = start + delay  # arrival time of the next frame [s]

@@ -39,7 +39,7 @@ DATA_LIMIT: Final = 0x06
 ACCESS: Final = 0x07
 ALERT: Final = 0x80
 
-MAX_LENGTH: Final = 1024  # maximum packet length accepted by a servo
+MAX_LENGTH: Final = 1024  # maximum packet length that a servo accepts
 _PREFIX: Final = HEADER + b"\x00"
 _STUFFED: Final = HEADER + b"\xfd"
 _UNSTUFFED: Final = re.compile(rb"\xff\xff\xfd[^\xfd]")
@@ -142,7 +142,7 @@ class PacketParser:
             end = 7 + length
             body = bytes(buffer[7 : end - 2])
             if len(buffer) > end - 2:
-                body += b"\0"  # a header at the end of the body is not followed by stuffing
+                body += b"\0"  # A header at the end of the body is not followed by stuffing.
             if intruder := _UNSTUFFED.search(body):
                 self._drop(7 + intruder.start())
                 continue

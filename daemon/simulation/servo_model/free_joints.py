@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 STEP = 0.0005  # s
-INERTIA = 0.002  # kg·m², rotor inertia reflected to the gearbox output
+INERTIA = 0.002  # rotor inertia reflected to the gearbox output [kg·m²]
 VISCOUS = 0.05  # N·m·s/rad
 COULOMB = 0.02  # N·m
 TORQUE_CONSTANT = 1.78  # N·m/A
 CURRENT_LAG = 0.001  # s
 STIFFNESS = 8.0  # A/rad
 DAMPING = 0.10  # A·s/rad
-STALL = 3.21  # A at full supply voltage
+STALL = 3.21  # stall current at full supply voltage [A]
 
 
 class FreeJoints:
@@ -26,13 +26,13 @@ class FreeJoints:
 
     def __init__(self, count: int = 2, start: float = 0.0) -> None:
         self._start = start
-        self._done = 0  # steps since the start
-        self.q: FloatArray = np.zeros(count)  # rad; may be written to position the joints
+        self._done = 0  # number of steps since the start
+        self.q: FloatArray = np.zeros(count)  # joint angles [rad]; callers may write them
         self.dq: FloatArray = np.zeros(count)  # rad/s
         self.current: FloatArray = np.zeros(count)  # A
-        # True if torque is on, signed current, angle, and current limit of each joint.
+        # Torque-on flag, signed current, angle, and current limit of each joint.
         self._goals = [(False, 0.0, 0.0, 0.0)] * count
-        # stiffness, damping and duty of each joint; see `tune`
+        # Stiffness, damping and duty of each joint; see `tune`.
         self._tuned = [(1.0, 0.0, 1.0)] * count
 
     def measured_current(self, joint: int) -> float:

@@ -30,9 +30,9 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
     ServoJoint,
 )
 
-REBOOT_TIME = 0.34  # s without a reply
-JUMP_COUNTS = 130  # counts (0.2 rad at the shaft), jump of the encoder zero
-FAR_GOAL = 0.05  # rad, distance from the angle at torque on beyond which a goal counts as far
+REBOOT_TIME = 0.34  # time without a reply during a reboot [s]
+JUMP_COUNTS = 130  # jump of the encoder zero, in counts (0.2 rad at the shaft)
+FAR_GOAL = 0.05  # distance from the torque-on angle above which a goal counts as far [rad]
 _WATCHED_REGISTERS = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 _TUNING_REGISTERS = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
 _CLEAR_FIRMWARE = 42
@@ -75,12 +75,12 @@ class EmulatedServo:
         self.health = ServoHealth(model, heat)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self.recorder = BusRecorder(t)
-        self._watched = 0.0  # time of the last watchdog restart
+        self._watched = 0.0  # time when the watchdog was last restarted
         self._booted = t
         self._boot_at = -math.inf  # end of a reboot
         self._next_step = math.inf
         self._next_sense = t
-        # write that waits for an action instruction
+        # Write that is waiting for an action instruction.
         self._registered: tuple[int, bytes] | None = None
         for address, value in eeprom.items():
             self.table.set(address, value)
@@ -355,7 +355,8 @@ class EmulatedServo:
         self._joint.forget_turns()
         self._registered = None
         self._reset_goals()
-        if self._memory[reg.STARTUP_CONFIGURATION] & 1:  # 0 if the firmware lacks this register.
+        # The value is 0 if the firmware lacks this register.
+        if self._memory[reg.STARTUP_CONFIGURATION] & 1:
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.hold()
         self._next_step = math.inf
@@ -398,14 +399,14 @@ class BusRecorder:
     """
 
     def __init__(self, t: float) -> None:
-        self._goals: dict[int, tuple[int, int]] = {}  # minimum and maximum counts of each register
+        self._goals: dict[int, tuple[int, int]] = {}  # minimum and maximum goal per register
         self._refused = 0
         self._torque_on = 0  # number of torque-on events
         self._torque_t: float | None = None
         self._far = 0
         self._farthest = 0.0  # rad
         self._last = t  # time of the last packet
-        self._quiet = 0.0  # s, longest silence while torque is on
+        self._quiet = 0.0  # longest silence while torque is on [s]
         self._fired = 0
         self._fired_t: float | None = None
 

@@ -37,7 +37,7 @@ _SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
 _GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}
 _FAST_READS = frozenset((framing.FAST_SYNC_READ, framing.FAST_BULK_READ))
 _READS = _GROUP_READS | {framing.PING, framing.READ}
-_FACTORY_RESET_GUARD = 42  # first firmware that ignores a full factory reset by broadcast
+_FACTORY_RESET_GUARD = 42  # first firmware that ignores a broadcast of a full factory reset
 _SPAN = struct.Struct("<HH")  # address, length
 _ITEM = struct.Struct("<BHH")  # ID, address, length
 
@@ -64,7 +64,7 @@ class ServoBus:
         self.plant = plant
         self.faults = FaultSource(seed)
         self.parser = PacketParser()
-        self.lag = 0.0  # s, maximum age of a reading when its reply is sent
+        self.lag = 0.0  # maximum age of a reading when its reply is sent [s]
         self.packets = 0  # number of packets received
         self._now = -math.inf
         self._due = -math.inf  # time of the next servo event, or an earlier time
@@ -205,19 +205,19 @@ class ServoBus:
         if packet.id == BROADCAST:
             return self._broadcast(packet, servos, t)
         if instruction == framing.STATUS:
-            return []  # the reply of another servo, or an echo
-        # Status return level: 0 replies only to pings, 1 also to reads, 2 to all instructions.
+            return []  # This packet is the reply of another servo, or an echo.
+        # Status return level 0 allows replies only to pings, level 1 also to reads, and level 2 to
+        # all instructions.
         needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)
         replies = []
         for servo in servos:
             if servo.id == packet.id:
-                # The reply uses the return level, delay and ID that were set before the
-                # instruction.
+                # The reply uses the return level, delay and ID from before the instruction.
                 level = servo.table.get(reg.STATUS_RETURN_LEVEL)
                 delay, name = servo.return_delay, servo.id
                 error, data = _execute(servo, instruction, packet.parameters, t)
                 if level >= needed:
-                    # The reply uses the alert bit as it is after the instruction.
+                    # The reply uses the alert bit from after the instruction.
                     status = framing.status(name, error | servo.alert, data)
                     replies.append(TimedReply(delay, status))
             elif servo.shadow == packet.id:

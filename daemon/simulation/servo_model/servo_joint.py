@@ -19,18 +19,19 @@ from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
-STEP_TIME = 0.001  # s, time step for trajectories and velocity mode
-OVERLOAD_TIME = 2.0  # s, time at the current limit until an overload error
-SENSE_INTERVAL = 0.010  # s, interval between checks of heat, voltage and overload
+STEP_TIME = 0.001  # time step for trajectories and velocity mode [s]
+OVERLOAD_TIME = 2.0  # time at the current limit until an overload error [s]
+SENSE_INTERVAL = 0.010  # interval between checks of heat, voltage and overload [s]
 _VOLTAGE = 0  # bit in the hardware error status
 POSITION_MODES = (
     reg.POSITION_MODE,
     reg.EXTENDED_POSITION_MODE,
     reg.CURRENT_BASED_POSITION_MODE,
 )
-_PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # counts/s per unit
+# Counts/s per register unit.
+_PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
 _PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-_ARRIVAL_COUNTS = 20  # counts, tolerance for arrival at the goal
+_ARRIVAL_COUNTS = 20  # tolerance for arrival at the goal [counts]
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 
 
@@ -117,7 +118,7 @@ class ServoJoint:
         target = float(table.get(reg.GOAL_POSITION))
         acceleration, speed = table.get(reg.PROFILE_ACCELERATION), table.get(reg.PROFILE_VELOCITY)
         if not speed:
-            profile.hold(target)  # Profile velocity 0 disables the profile.
+            profile.hold(target)  # A profile velocity of 0 disables the profile.
         elif memory[reg.DRIVE_MODE] & 4:
             profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
         else:
@@ -211,9 +212,10 @@ class ServoJoint:
 
 ROOM_TEMPERATURE = 25.0  # °C
 _THERMOMETER_LAG = 4.0  # s
-_CONVECTION = 0.006  # 1/K, relative increase in cooling with temperature difference
-_STEP_MAX = 1.0  # s, maximum step
-# counts; without this tolerance, rounding of the square root would prevent arrival.
+_CONVECTION = 0.006  # relative increase of the cooling per kelvin of temperature difference [1/K]
+_STEP_MAX = 1.0  # maximum step [s]
+# Arrival tolerance in counts. Without this tolerance, rounding of the square root would prevent
+# arrival.
 _ARRIVAL_TOLERANCE = 1e-6
 
 
@@ -267,7 +269,7 @@ class Profile:
             return
         limit = self.speed if self.speed > 0.0 else math.inf
         if self.acceleration > 0.0:
-            # Maximum speed that allows stopping at the target, including the next step.
+            # Maximum speed from which the motion can stop at the target, including the next step.
             a = self.acceleration
             stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
             speed = math.copysign(min(limit, stop), distance)
