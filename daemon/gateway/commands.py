@@ -31,9 +31,9 @@ from softfinger.daemon.wire.loop_link import ASK, Ask
 
 _PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't be part of a string
 _MALFORMED_REFUSAL = refusal(
-    "envelope: expected one frame with the command, optionally after an envelope of at most "
-    f"{bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes ending with an "
-    "empty frame",
+    "envelope: expected a single frame with the command; an envelope may precede this frame if "
+    f"the envelope ends with an empty frame and has at most {bounds.PART_COUNT_MAX - 2} frames and "
+    f"{bounds.ENVELOPE_SIZE_MAX} bytes",
     Reason.REQUEST,
 )
 _QUEUE_FULL_REFUSAL = refusal("too many commands are waiting", Reason.BUSY)

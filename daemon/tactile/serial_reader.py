@@ -178,7 +178,7 @@ class SerialReader:
                 f"no data {within}: check the board's power supply, tactile.port and tactile.baud "
                 f"= {self.settings.baud}"
             )
-        return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
+        return f"no valid frame in {self._bytes} bytes {within}: {self._decoder.diagnosis()}"
 
     def _run(self, port: int, stop: int) -> None:
         """Read in the thread, which blocks in the kernel and wakes up once or twice per frame."""

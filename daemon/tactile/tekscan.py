@@ -169,7 +169,8 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
             header[key] = value
             in_comments = key.startswith("COMMENT")
     raise TekscanError(
-        "found no line ASCII_DATA, expected a Tekscan-style export, or an .npz or .npy file"
+        "the file does not contain a line ASCII_DATA; expected a Tekscan-style export, or an .npz "
+        "or .npy file"
     )
 
 
@@ -194,10 +195,11 @@ def _frames(
                     raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
             else:
                 if frames and len(frames[-1]) < rows:
-                    had = f"found {len(frames[-1])}, expected {rows}"
-                    raise TekscanError(f"line {number}: rows of frame {numbers[-1]}: {had}")
+                    had = f"found {len(frames[-1])} rows, expected {rows}"
+                    raise TekscanError(f"line {number}: frame {numbers[-1]}: {had}")
                 if numbers and int(match[1]) <= numbers[-1]:
-                    raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
+                    what = f"frame {match[1]} after frame {numbers[-1]}"
+                    raise TekscanError(f"line {number}: found {what}, expected increasing numbers")
                 numbers.append(int(match[1]))
                 frames.append([])
                 places.append([])
@@ -215,7 +217,7 @@ def _frames(
         raise TekscanError("the file does not contain any frames")
     if len(frames[-1]) < rows:
         raise TekscanError(
-            f"the file ends in frame {numbers[-1]}: {len(frames[-1])} rows of {rows}"
+            f"the file ends after {len(frames[-1])} of {rows} rows of frame {numbers[-1]}"
         )
     return numbers, frames, places
 

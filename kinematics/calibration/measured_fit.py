@@ -68,8 +68,8 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     ):
         raise CurvesError(
             f"found {len(d)} presses at {len(np.unique(d))} depths, {tilted.sum()} of them "
-            f"tilted; expected at least {_PRESS_COUNT_MIN} at 3 depths, including upright presses "
-            "and 2 presses tilted by 5° or more"
+            f"tilted; expected at least {_PRESS_COUNT_MIN} presses at 3 depths, including upright "
+            "presses and 2 presses tilted by 5° or more"
         )
     frames = [each for each, use in zip(presses.frames, used, strict=True) if use]
     first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
@@ -138,8 +138,8 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     force_error, lever_error = max(missed[:2]), max(missed[2:])
     if max(force_error, lever_error / radius) > _CURVE_ERROR_MAX:
         raise CurvesError(
-            "the best smooth increasing curve deviates from the presses' force by "
-            f"{force_error:.1%} or from their centroid by {lever_error * 1e3:.2f} mm"
+            "the best smooth increasing curves deviate from the presses by "
+            f"{force_error:.1%} of the force and {lever_error * 1e3:.2f} mm of the centroid"
         )
     return replace(law, force_error=force_error, lever_error=lever_error)
 

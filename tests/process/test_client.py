@@ -130,8 +130,8 @@ def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
             hand.arm()
     asyncio.run(ask())
     said = [
-        f"no hand/state from {stream} yet, waiting up to 1.05 s",
-        f"no reply to arm from {commands} yet, waiting up to 1.05 s",
+        f"no hand/state from {stream} yet; waiting up to 1.05 s",
+        f"no reply to arm from {commands} yet; waiting up to 1.05 s",
     ]
     assert caplog.messages == said + said
 
@@ -429,7 +429,7 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
             Hand()
 
 
-UNKNOWN = "found unknown host 'no..host' (not a host name), expected an IP address or a"
+UNKNOWN = "found the unknown host 'no..host' (not a host name), expected an IP address or a"
 
 
 @pytest.mark.parametrize("cls", [Hand, AsyncHand])
@@ -490,8 +490,9 @@ def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     ):
         error = in_a_thread(use)
         assert isinstance(error, WrongThread), use
-        assert "thread other_0: found a Hand whose stream is used by thread MainThread" in str(
-            error
+        assert (
+            "thread other_0: the stream of this Hand is already used by thread MainThread"
+            in str(error)
         )
     assert next(states).mode == hand.state().mode == "holding"
 

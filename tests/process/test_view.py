@@ -235,7 +235,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
-    assert "the stream has schema 2, this page supports 1" in picture["notes"]
+    assert "the stream uses schema 2, but this page supports schema 1" in picture["notes"]
     assert "0 messages could not be read" in said
 
 
@@ -508,7 +508,7 @@ def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline)
     assert not (tmp_path / "a.html").exists()
     for words, message in (
         ((recorded, "--save", "a.gif"), "expected a name ending in .html or .svg, found 'a.gif'"),
-        (("--save", "a.html"), "--save needs a recording"),
+        (("--save", "a.html"), "--save requires a recording"),
     ):
         done = inline("view", *words)
         assert done.returncode == 2

@@ -415,7 +415,8 @@ def test_the_only_stack_of_an_archive_is_used_and_reported(press, tmp_path, name
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t == pytest.approx(STEPS * 1e-3)
     assert read.notes == (
-        f"found no array 'frames'; using {name!r}, the only three-dimensional array",
+        f"the file does not contain an array 'frames'; using {name!r}, the only three-dimensional "
+        "array",
     )
     check(tmp_path / "a.npz")
 
@@ -438,7 +439,7 @@ def test_a_pitch_that_contradicts_the_header_is_reported(press, tmp_path, inline
     path.write_bytes(export(press))
     tactile = {"rows": 44, "cols": 44, "recording": (str(path), ""), "pitch": 0.00127}
     wanted = (
-        r"cells of 1\.318 × 1\.318 mm in its header, expected 1\.27 × 1\.27 mm as in "
+        r"cells of 1\.318 × 1\.318 mm in the header, expected 1\.27 × 1\.27 mm as in "
         r"tactile\.pitch: set tactile\.pitch"
     )
     with pytest.raises(TactileError, match=wanted):
@@ -456,7 +457,7 @@ def test_a_calibration_reports_suspicious_recordings(tared, tmp_path, inline):
     words = ("--recording", tmp_path / "a.npy", "--config", "paper", "--no-plot")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words)
     assert done.returncode == 0
-    assert "this is noise after a tare, and these readings are set to 0" in done.stderr
+    assert "they are treated as noise after a tare and set to 0" in done.stderr
 
 
 def test_generators_differ():
@@ -474,16 +475,16 @@ def test_generators_differ():
     ("changes", "told"),
     [
         ({}, ""),
-        ({"tip.radius": 0.010}, "sensor area of 58 × 58 mm for a tip of 20 mm diameter"),
+        ({"tip.radius": 0.010}, "sensor area of 58 × 58 mm for a tip with a diameter of 20 mm"),
         (
             {"tactile.rows": 26},
-            r"smaller than the tip's footprint at safety\.d_max = 12 mm, 36\.7 mm wide",
+            r"but the tip's footprint at safety\.d_max = 12 mm is 36\.7 mm wide",
         ),
         (
             {"tactile.rows": 20, "control.force_default": 24.0},
-            r"smaller than the tip's footprint at control\.force_default = 24 N, 30\.9 mm wide",
+            r"but the tip's footprint at control\.force_default = 24 N is 30\.9 mm wide",
         ),
-        ({"tactile.centre": (0.02, 0.0)}, "smaller than the tip's footprint"),
+        ({"tactile.centre": (0.02, 0.0)}, "but the tip's footprint"),
         ({"tactile.pitch_y": 0.0006}, "sensor area of 58 × 26.4 mm, smaller than"),
     ],
 )
@@ -506,7 +507,7 @@ def test_the_sensor_of_a_solid_tip_covers_its_base():
     solid = {"tip": {"physics": "solid"}, "material": {"law": "constant"}}
     settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
     (doubt,) = plausibility_warnings(settings)
-    assert "smaller than the tip's base, 40 mm wide" in doubt
+    assert "but the tip's base is 40 mm wide" in doubt
 
 
 @pytest.mark.parametrize("zero", [0.0, 50.0, 3000.0])

@@ -275,18 +275,18 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
 @pytest.mark.parametrize(
     ("step", "known", "told"),
     [
-        ("curve", {"d": [0.002, 0.03]}, "d: found 30 mm, expected at most the tip's radius, 20 mm"),
+        ("curve", {"d": [0.002, 0.03]}, "d: found 30 mm, expected at most 20 mm, the tip's radius"),
         (
             "modulus",
             {"d": [0.002, 0.03]},
-            "d: found 30 mm, expected at most the tip's radius, 20 mm",
+            "d: found 30 mm, expected at most 20 mm, the tip's radius",
         ),
         (
             "modulus",
             {"d": [0.002, 0.004], "theta": [0.0, -1.6]},
             "theta: found 91.6732°, expected less than 90°",
         ),
-        ("modulus", {"d": [-0.001, 0.0]}, "no frame with d above 0"),
+        ("modulus", {"d": [-0.001, 0.0]}, "the run does not contain any frames with d above 0"),
         ("centre", {"words": ["--theta", "nan"]}, "theta: found a value that is not finite"),
         ("curve", {"words": ["--d", "inf"]}, "d: found a value that is not finite"),
     ],

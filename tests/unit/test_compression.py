@@ -188,7 +188,7 @@ def shuffled(d, force):
     ("change", "told"),
     [
         (shuffled, "reversals of d in 210 rows"),
-        (lambda d, force: (d[140:], force[140:]), "only decreasing d"),
+        (lambda d, force: (d[140:], force[140:]), "d only decreases"),
         (lambda d, force: (0 * d, force), "the same displacement"),
         (lambda d, force: (d, 0.003 * force + 0.2), "tip was loaded"),
         (lambda d, force: (d, -force), "expected positive d and F"),

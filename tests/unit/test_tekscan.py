@@ -105,7 +105,7 @@ def test_a_single_frame_needs_no_frame_line():
         ("7,255,1", "7,-255,1", "row 2, cell 2 is -255"),
         ("7,255,1", "7,inf,1", "row 2, cell 2 is inf"),
         ("7,255,1\n", "", "rows of frame 4: found 1, expected 2"),
-        ("3,4,5\n", "", "the file ends in frame 6: 1 rows of 2"),
+        ("3,4,5\n", "", "the file ends after 1 of 2 rows of frame 6"),
         ("3,4,5\n", "3,4,5\n6,7,8\n", "line 22"),
     ],
 )
@@ -124,5 +124,7 @@ def test_an_export_is_read_as_a_recording(tmp_path):
     path.write_text(EXPORT.replace("RAW", "kPa"))
     assert load_recording(path, 50.0, 100.0).counts[0, 1].tolist() == [140, 5100, 20]
     path.write_text("nothing")
-    with pytest.raises(RecordingError, match=r"run\.asf: found no line ASCII_DATA"):
+    with pytest.raises(
+        RecordingError, match=r"run\.asf: the file does not contain a line ASCII_DATA"
+    ):
         load_recording(path, 4.0, 100.0)

@@ -255,7 +255,7 @@ def _last_state(arguments: argparse.Namespace) -> HandState:
     path = arguments.recording[-1]
     last = deque(Recording(path).messages({STATE}), maxlen=1)
     if not last:
-        raise CalibrationError(f"{path}: contains no {STATE.decode()}")
+        raise CalibrationError(f"{path}: the recording does not contain {STATE.decode()}")
     return read(HandState, last[0][1])
 
 

@@ -269,7 +269,7 @@ class Site:
         if name == "record":
             return self.record()
         if name != "stop" and math.isnan(age):
-            return f'✗ {name}: expected "seen", the time of its picture'
+            return f'✗ {name}: expected "seen", the time of the displayed picture'
         if name != "stop" and not age < self._stale:
             return f"✗ {name}: discarded because the page is {age:.0f} s behind"
         try:
@@ -327,7 +327,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
         address = _address(listener)
 
         def announce(code: str) -> None:
-            print(f"view: http://{address}/?code={code} opens in one browser", flush=True)
+            print(f"view: http://{address}/?code={code} can be opened in one browser", flush=True)
 
         site = Site(loop, token, hand_on, foxglove, arguments.timeout, announce if away else None)
         period = 1.0 / arguments.rate
