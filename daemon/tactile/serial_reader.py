@@ -270,7 +270,7 @@ def open_port(path: str, baud: int) -> serial.Serial:
         elif number in (errno.EACCES, errno.EPERM):
             why = f"no permission to open it: {grant(path)}"
         elif number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
-            why = "the port is in use by another program; end that program first"
+            why = "the port is in use by another program: end that program first"
         else:
             why = f"can't be opened as a serial port ({error})"
     except (OSError, ValueError) as error:
