@@ -175,7 +175,7 @@ class RealTime:
         except OSError as error:
             there = ", ".join(map(str, sorted(before)))
             self._refused(
-                f"processor {names} refused ({error.strerror}; available processors: {there}): the "
+                f"use of processor {names} refused ({error.strerror}; available: {there}): the "
                 "loop may move between processors"
             )
         else:

@@ -430,8 +430,8 @@ _OVERLAP_RATIO = 0.5  # fraction of the tip radius; offset errors and frame late
 
 
 @Limit("joint.opens",
-    "computed positions at which the tips would overlap during the approach, although one tip has "
-    "no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
+    "overlap of the tips, computed from the joint angles, while a tip has no contact during the "
+    "approach", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 
@@ -563,7 +563,7 @@ def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
 
 # --- sensors --------------------------------------------------------------------------------------
 
-LIMITS.append(Limit("tactile.late", "age of the last valid frame; older frames freeze the goal",
+LIMITS.append(Limit("tactile.late", "age of the last valid frame; the goal is frozen above it",
     "limit", ("safety.frame_age_hold",), "sensors", gripping=True))  # fmt: skip
 
 

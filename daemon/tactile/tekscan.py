@@ -253,11 +253,11 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
         elif cols < len(cells) < 2 * cols and all(each.isdigit() or each == "B" for each in cells):
             raise TekscanError(
-                f"line {number}: {len(cells)} cells, expected {cols}: the comma is both the "
+                f"line {number}: found {len(cells)} cells, expected {cols}: the comma is both the "
                 "separator and the decimal sign; export with decimal points or another separator"
             )
     if len(cells) != cols:
-        raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
+        raise TekscanError(f"line {number}: found {len(cells)} cells, expected {cols}")
     try:
         values = np.array([-math.inf if cell == "B" else _number(cell) for cell in cells])
     except ValueError as error:

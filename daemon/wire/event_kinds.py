@@ -39,7 +39,7 @@ KINDS: dict[str, EventKind] = {
     "settings": EventKind(
         "warning",
         "A setting is allowed but probably wrong, for example a sensor smaller than the footprint.",
-        "Correct the keys named in the text. To see the warning again, run `softfinger config "
+        "Correct the settings named in the text. To see the warning again, run `softfinger config "
         "check`.",
     ),
     "calibration": EventKind(
@@ -216,7 +216,7 @@ KINDS: dict[str, EventKind] = {
         "error",
         "A joint moves the tip of the other finger, or the object rotates in the direction "
         "opposite to the command.",
-        f"Swap the two values of `servos.ids`, `servos.zero` and `servos.direction`. "
+        f"Swap the left and right values of `servos.ids`, `servos.zero` and `servos.direction`. "
         f"{_CALIBRATE_JOINTS}",
     ),
     "joint.opens": EventKind(
@@ -253,8 +253,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "tactile": EventKind(
         "info, warning",
-        "A sensor was reopened. A warning states why a sensor could not be reopened, or it "
-        "reports a sensor size that does not match the tip, or a problem in a replayed file.",
+        "A sensor was reopened. The level is warning if a sensor could not be reopened, if the "
+        "sensor size does not match the tip, or if a replayed file has a problem.",
         "Check the cable and `tactile.port`. For a size mismatch, check `tactile.rows`, `cols`, "
         "`pitch` and `tip.radius`.",
     ),

@@ -91,8 +91,8 @@ def tare(frames: ArrayLike) -> Tare:
     restless = np.count_nonzero(noise > _UNREST_SIGMA * max(float(np.median(noise)), 0.5))
     if restless >= _UNREST_CELL_COUNT:
         raise CalibrationError(
-            f"tare: found changing readings in {restless} cells, expected constant readings; "
-            "check that the tip is not in contact"
+            f"tare: the readings of {restless} cells change, expected constant readings; check "
+            "that the tip is not in contact"
         )
     zero = stack.mean(axis=0)
     excess = float(np.maximum(stack - zero, 0.0).mean())
@@ -161,7 +161,9 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     response = readings.sum(axis=0)
     typical = float(np.median(response))
     if not typical > 0.0:
-        raise CalibrationError("equilibrate: most cells do not read above their zero offset")
+        raise CalibrationError(
+            "equilibrate: the readings of most cells do not exceed their zero offset"
+        )
     active = response > DEAD_RESPONSE * typical
     target = np.array([reading[active].mean() for reading in readings])
     if (target <= 0.0).any():

@@ -295,7 +295,7 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
         raise CalibrationError(_TOO_DEEP)
     strains = np.linspace(0.0, deepest / tip.radius, 50)
     if not (_power_law(factors, strains, 1) > 0.0).all():
-        raise CalibrationError("its modulus would not be positive")
+        raise CalibrationError("the modulus of this model would not be positive")
     left = force - jacobian @ np.concatenate([factors, np.zeros(len(runs)), zeros])
     freedom = max(len(force) - jacobian.shape[1], 1)
     variance = float(left @ left) / freedom

@@ -99,7 +99,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
             (t, q, times), y, np.hypot(sigma, _STAGE_ERROR * np.abs(y)), powers, squares, valid
         )
         if best is None:
-            raise CurvesError(f"no smooth increasing curve fits the {name} of the presses")
+            raise CurvesError(f"no smooth increasing curve fits the presses ({name})")
         return tuple(map(tuple, best.tolist()))
 
     one = np.ones(len(d))
@@ -159,7 +159,9 @@ def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """Return the covariance [4, 4] of one frame's sums, from the frames of each press."""
     if min(map(len, frames)) < 5:
-        raise CurvesError("expected at least five frames of each press to measure the noise")
+        raise CurvesError(
+            "expected at least five frames for each press, which are needed to measure the noise"
+        )
     each = [weights @ every.reshape(len(every), -1).T for every in frames]
     return np.asarray(np.mean([np.cov(sums) for sums in each], axis=0))
 

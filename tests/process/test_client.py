@@ -281,7 +281,7 @@ def test_an_unknown_schema_is_reported_once_and_known_fields_are_kept(fake, hand
     fake.changes = {"schema": 7, "news": [1, 2], "overruns": "many"}
     until(lambda: fake.published > 2)
     with hand.stream(timeout=60.0) as states:
-        with pytest.warns(UserWarning, match="schema 7, this client supports 1") as told:
+        with pytest.warns(UserWarning, match="schema 7, but this client supports schema 1") as told:
             state = [next(states), next(states)][-1]
         assert len(told) == 1
         assert (state.schema, state.mode, state.overruns) == (7, "holding", 0)

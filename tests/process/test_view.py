@@ -503,7 +503,7 @@ def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline)
     with pytest.raises(ViewError, match="No such file or directory"):
         save(tmp_path / "none" / "a.svg", Recording(recorded), 0.1, print)
     RecordingWriter(tmp_path / "empty.mcap").close()
-    with pytest.raises(ViewError, match="received nothing to show"):
+    with pytest.raises(ViewError, match="received no hand/state"):
         save(tmp_path / "a.html", Recording(tmp_path / "empty.mcap"), 0.1, print)
     assert not (tmp_path / "a.html").exists()
     for words, message in (
@@ -589,7 +589,7 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
         (("text.mcap",), "not an MCAP file"),
         (("text.mcap", "--port", "-1"), "expected a port"),
         (("--address", "nowhere"), "nowhere: Invalid"),
-        (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "received nothing to show"),
+        (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "received no hand/state"),
         (("--address", "tcp://127.0.0.1:9", "--no-wait"), "no stream from tcp"),
         (("--rate", "fast"), "expected 0.1 to 100 Hz"),
     ],

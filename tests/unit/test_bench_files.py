@@ -251,7 +251,7 @@ def test_commas_as_separator_and_decimal_sign_are_reported_if_ambiguous(tmp_path
     text = "ROWS 1\nCOLS 3\nUNITS kPa\nASCII_DATA @@\nFrame 1\n0,0,0\nFrame 2\n0,1,25,0\n@@\n"
     (tmp_path / "a.asf").write_text(text)
     with pytest.raises(
-        RecordingError, match="line 8: 4 cells, expected 3: the comma is both the separator"
+        RecordingError, match="line 8: found 4 cells, expected 3: the comma is both the separator"
     ):
         load_recording(tmp_path / "a.asf", SCALE, 100.0)
 
@@ -445,7 +445,7 @@ def test_a_pitch_that_contradicts_the_header_is_reported(press, tmp_path, inline
     with pytest.raises(TactileError, match=wanted):
         ReplayTactile(TactileSettings.model_validate(tactile), VirtualClock(), 0)
     done = inline("analyse", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
-    assert "found cells of 1.318 × 1.318 mm in its header" in done.stderr
+    assert "found cells of 1.318 × 1.318 mm in the header" in done.stderr
     assert "6 with contact, 0 invalid" in done.stdout
     words = ("--recording", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words, "--no-plot")
@@ -485,7 +485,7 @@ def test_generators_differ():
             r"but the tip's footprint at control\.force_default = 24 N is 30\.9 mm wide",
         ),
         ({"tactile.centre": (0.02, 0.0)}, "but the tip's footprint"),
-        ({"tactile.pitch_y": 0.0006}, "sensor area of 58 × 26.4 mm, smaller than"),
+        ({"tactile.pitch_y": 0.0006}, "sensor area of 58 × 26.4 mm, but the tip's"),
     ],
 )
 def test_a_sensor_size_that_does_not_fit_the_tip_is_reported(changes, told):

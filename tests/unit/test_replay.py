@@ -91,7 +91,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
     [
         ({"other": FRAMES[0]}, r"found other \(4, 6\), expected an array 'frames'"),
         ({"a": FRAMES, "b": FRAMES}, r"but a \(5, 4, 6\), b \(5, 4, 6\); rename the array"),
-        ({"other": np.array(["x"])}, "no array 'frames'"),
+        ({"other": np.array(["x"])}, "expected an array 'frames'"),
         ({}, "found no arrays, expected an array 'frames'"),
         ({"frames": FRAMES[0]}, r"expected \[n, rows, cols\]"),
         ({"frames": FRAMES[:0]}, "shape"),
@@ -101,7 +101,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
         ({"frames": FRAMES * 1e305}, "outside 0 to 65535"),
         ({"frames": FRAMES, "t": np.zeros(5)}, "expected increasing times"),
         ({"frames": FRAMES, "t": np.arange(4)}, "5 numbers"),
-        ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: not finite"),
+        ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: found a number that is not finite"),
         ({"frames": FRAMES, "live": np.ones(3)}, "live: found shape"),
         ({"frames": np.array([{}], dtype=object)}, "run.npz"),
     ],

@@ -89,7 +89,7 @@ def test_a_single_frame_needs_no_frame_line():
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("ASCII_DATA @@", "", "no line ASCII_DATA"),
+        ("ASCII_DATA @@", "", "does not contain a line ASCII_DATA"),
         ("ROWS 2\n", "", "ROWS is missing"),
         ("ROWS 2", "ROWS two", "ROWS: found 'two'"),
         ("ROWS 2", "ROWS 99999", "ROWS: found"),
@@ -99,7 +99,7 @@ def test_a_single_frame_needs_no_frame_line():
         ("0.04", "-1", "SECONDS_PER_FRAME"),
         ("Frame 6 0.08 s", "Frame 3", "line 19: frame 3 after frame 4"),
         ("Frame 6 0.08 s", "Frame six", "line 19"),
-        ("7,255,1", "7,255", "line 17: 2 cells, expected 3"),
+        ("7,255,1", "7,255", "line 17: found 2 cells, expected 3"),
         ("7,255,1", "7,,1", "line 17"),
         ("7,255,1", "7,nan,1", "line 17: found a cell that is not a number"),
         ("7,255,1", "7,-255,1", "row 2, cell 2 is -255"),

@@ -146,7 +146,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.compression and step != "law":
         from softfinger.kinematics.calibration.calibration import CalibrationError
 
-        raise CalibrationError(f"--compression: found the step {step}, expected law")
+        raise CalibrationError(
+            f"--compression: found the step {step}, but only the step law uses this file"
+        )
     if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file
     settings = profile(arguments)

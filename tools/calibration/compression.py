@@ -179,8 +179,8 @@ def fit_files(
     """
     if settings.tip.physics == "measured":
         raise CalibrationError(
-            'law: found tip.physics = "measured", whose curves require frames; expected '
-            '"springs" or "solid"'
+            'law: found tip.physics = "measured", expected "springs" or "solid"; measured curves '
+            "require frames"
         )
     if theta and len(theta) != len(paths):
         raise CalibrationError(f"--theta: found {len(theta)} values for {len(paths)} files")
