@@ -379,9 +379,9 @@ def test_frames_without_contact_are_reported_with_the_maximum_reading(
     done = inline("analyse", path, "--config", "paper")
     (line,) = [each for each in done.stdout.splitlines() if "no contact in any frame" in each]
     assert cause in line
-    assert "threshold 4560 Pa (3 times tactile.noise)" in line
+    assert "threshold is 4560 Pa (3 times tactile.noise)" in line
     with np.load(path) as held:
-        assert f"largest reading {held['frames'].max():.4g} " in line
+        assert f"largest reading is {held['frames'].max():.4g} " in line
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.uint16])
@@ -394,7 +394,7 @@ def test_noise_above_its_setting_is_reported_with_both(tmp_path, inline, kind):
         for each in inline("analyse", tmp_path / "a.npz", "--config", "paper").stdout.splitlines()
         if "no contact in any frame" in each
     ]
-    found = re.search(r"threshold 4560 Pa .*the measured cell noise is (\d+) Pa: set", line)
+    found = re.search(r"threshold is 4560 Pa .*the measured cell noise is (\d+) Pa: set", line)
     assert float(found[1]) == pytest.approx(4000.0, rel=0.03)
 
 
@@ -423,7 +423,9 @@ def test_the_only_stack_of_an_archive_is_used_and_reported(press, tmp_path, name
 
 def test_the_contents_of_an_archive_without_frames_are_listed(press, tmp_path):
     np.savez(tmp_path / "a.npz", left=press, right=press, note=np.array("x"))
-    with pytest.raises(RecordingError, match=r"but left \(8, 44, 44\), right .*, note \(\)"):
+    with pytest.raises(
+        RecordingError, match=r"found left \(8, 44, 44\), right .*, note \(\), expected"
+    ):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
     many = {f"a{k}": np.zeros(k + 1) for k in range(30)}
     np.savez(tmp_path / "b.npz", **many)

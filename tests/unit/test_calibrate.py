@@ -204,9 +204,9 @@ def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
 @pytest.mark.parametrize(
     ("tactile", "told"),
     [
-        ({"sensor": ("B2", "")}, "sensor A17, here B2"),
-        ({"pitch": 0.001}, "pitch 1.812 × 1.812 mm, here 1 × 1 mm"),
-        ({"full_count": 255}, "full_count 4095, here 255"),
+        ({"sensor": ("B2", "")}, "sensor: found A17, expected B2"),
+        ({"pitch": 0.001}, "pitch: found 1.812 × 1.812 mm, expected 1 × 1 mm"),
+        ({"full_count": 255}, "full_count: found 4095, expected 255"),
     ],
 )
 def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, told):
@@ -225,7 +225,10 @@ def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, 
         (["modulus", "--recording", "rest.npz"], "expected --d"),
         (["centre", "--recording", "rest.npz"], "press 1 does not give a valid contact"),
         (["tare", "--recording", "none.npz"], "No such file"),
-        (["tare", "--recording", "rest.npz", "--finger", "right"], "finger left, here right"),
+        (
+            ["tare", "--recording", "rest.npz", "--finger", "right"],
+            "finger: found left, expected right",
+        ),
     ],
 )
 def test_impossible_steps_are_reported_and_change_nothing(bench, capsys, words, told):

@@ -239,7 +239,7 @@ def test_file_formats_of_testing_machines_are_read(tmp_path, capsys, header, for
     assert step.modulus == pytest.approx(E, rel=0.01)
     assert step.offset == pytest.approx(LATE, abs=5e-5)
     told = capsys.readouterr().out
-    assert "70 of the unloading" in told
+    assert "70 rows of the unloading" in told
     assert f"material.modulus = {round(step.modulus, -1)}" in told
 
 
@@ -249,7 +249,11 @@ def test_file_formats_of_testing_machines_are_read(tmp_path, capsys, header, for
         ("d [mm],F [lbs]", "1,2", "'F [lbs]': found the unit 'lbs', expected one of N, mN, kN"),
         ("d,F", "1,2", "'d': found no unit, expected one of mm"),
         ("x [mm],y [N]", "1,2", "found the columns 'x [mm]', 'y [N]', expected `d [mm],F [N]"),
-        ("d [mm],F [N],force [N]", "1,2,3", "found 'F [N]' and 'force [N]', expected one force"),
+        (
+            "d [mm],F [N],force [N]",
+            "1,2,3",
+            "found the columns 'F [N]' and 'force [N]', expected one column with force",
+        ),
         ("d [mm],F [N]", "1,2\n1.1,many", "line 3: force: found 'many', expected a number"),
         ("d [mm],F [N]", "1,2\n1.1", "line 3: force: found '', expected a number"),
         ("strain [kPa],stress [kPa]", "1,2", "'strain [kPa]': found the unit 'kPa'"),

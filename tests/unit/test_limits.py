@@ -39,7 +39,11 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
     "current": ({"reading.current.1": -1.9}, "joint.current", "the right joint draws -1.90 A"),
     "stalled": ({"mode": Mode.MOVING} | STALLED, "joint.stall", "17.2° from its goal at 0.39 A"),
     "dead": (TOWARDS, "joint.dead", "the left joint is stationary 17.2° from its goal and draws"),
-    "pulled away": (TOWARDS | {"reading.current.0": -0.4}, "joint.dead", "only -0.40 A of 0.40 A"),
+    "pulled away": (
+        TOWARDS | {"reading.current.0": -0.4},
+        "joint.dead",
+        "only -0.40 A (maximum 0.40 A)",
+    ),
     "frozen": (
         {"reading.frozen": 0b01},
         "servos.frozen",

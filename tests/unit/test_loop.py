@@ -65,7 +65,7 @@ def test_move_reaches_its_goal_within_the_limits(make):
     assert daemon.loop.state.reading.q == pytest.approx([-0.2, -0.3], abs=0.04)
     with pytest.raises(
         Refused,
-        match=r"left: found 286\.5° \(5 rad\), expected -28\.6° to 57\.3° \(-0\.50 to 1\.00\)",
+        match=r"left: found 286\.5° \(5 rad\), expected -28\.6° to 57\.3° \(-0\.50 to 1\.00 rad\)",
     ):
         command(daemon, "move", left=5.0)
 
@@ -195,7 +195,8 @@ def test_the_state_contains_the_goals_of_the_grip(make):
 def test_an_unreachable_angle_is_refused(make):
     daemon = grasped(make(), 8.0)
     with pytest.raises(
-        Refused, match=r"found 34\.4° \(0\.6 rad\), expected .*° to .*° \(-0\.\d\d to 0\.\d\d\) in"
+        Refused,
+        match=r"found 34\.4° \(0\.6 rad\), expected .*° to .*° \(-0\.\d\d to 0\.\d\d rad\) in",
     ):
         command(daemon, "rotate", angle=0.6)
     found = re.search(r"to (0\.\d+)", refusal(daemon, "rotate", angle=2.0))
@@ -230,7 +231,7 @@ def test_a_tare_reports_the_change_of_the_zero(make):
         command(daemon, "tare")
         daemon.loop.advance(0.5)
         [text] = [text for level, kind, text in events
-                  if (level, kind) == ("info", "tare") and text.startswith("left")]  # fmt: skip
+                  if (level, kind) == ("info", "tare") and text.startswith("the left")]  # fmt: skip
         return text
 
     pascal = daemon.settings.tactile.pascal_per_count

@@ -90,7 +90,10 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
     ("held", "told"),
     [
         ({"other": FRAMES[0]}, r"found other \(4, 6\), expected an array 'frames'"),
-        ({"a": FRAMES, "b": FRAMES}, r"but a \(5, 4, 6\), b \(5, 4, 6\); rename the array"),
+        (
+            {"a": FRAMES, "b": FRAMES},
+            r"found a \(5, 4, 6\), b \(5, 4, 6\), expected an array 'frames'",
+        ),
         ({"other": np.array(["x"])}, "expected an array 'frames'"),
         ({}, "found no arrays, expected an array 'frames'"),
         ({"frames": FRAMES[0]}, r"expected \[n, rows, cols\]"),

@@ -275,7 +275,7 @@ def test_a_law_far_from_its_points_causes_a_warning():
 
 
 def test_invalid_tables_are_refused():
-    with pytest.raises(TableError, match="meets 1e-17; the lowest error is"):
+    with pytest.raises(TableError, match="meets the tolerance 1e-17; the lowest error is"):
         ContactTable.build(TIP, CONSTANT, 1e-17)
     with pytest.raises(TableError, match="the lowest error is") as error:
         ContactTable.build(TIP, STIFFENING, 1e-15)

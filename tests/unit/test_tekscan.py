@@ -97,7 +97,7 @@ def test_a_single_frame_needs_no_frame_line():
         ("1.27 mm", "-1.27 mm", "ROW_SPACING"),
         ("UNITS RAW", "UNITS stone", "UNITS"),
         ("0.04", "-1", "SECONDS_PER_FRAME"),
-        ("Frame 6 0.08 s", "Frame 3", "line 19: frame 3 after frame 4"),
+        ("Frame 6 0.08 s", "Frame 3", "line 19: found frame 3 after frame 4"),
         ("Frame 6 0.08 s", "Frame six", "line 19"),
         ("7,255,1", "7,255", "line 17: found 2 cells, expected 3"),
         ("7,255,1", "7,,1", "line 17"),
