@@ -195,8 +195,8 @@ def _frames(
                     raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
             else:
                 if frames and len(frames[-1]) < rows:
-                    had = f"found {len(frames[-1])} rows, expected {rows}"
-                    raise TekscanError(f"line {number}: frame {numbers[-1]}: {had}")
+                    had = f"frame {numbers[-1]} has {len(frames[-1])} of {rows} rows"
+                    raise TekscanError(f"line {number}: {had}")
                 if numbers and int(match[1]) <= numbers[-1]:
                     what = f"frame {match[1]} after frame {numbers[-1]}"
                     raise TekscanError(f"line {number}: found {what}, expected increasing numbers")
@@ -217,7 +217,7 @@ def _frames(
         raise TekscanError("the file does not contain any frames")
     if len(frames[-1]) < rows:
         raise TekscanError(
-            f"the file ends after {len(frames[-1])} of {rows} rows of frame {numbers[-1]}"
+            f"the file ends in frame {numbers[-1]}, which has {len(frames[-1])} of {rows} rows"
         )
     return numbers, frames, places
 

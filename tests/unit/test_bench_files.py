@@ -429,7 +429,7 @@ def test_the_contents_of_an_archive_without_frames_are_listed(press, tmp_path):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
     many = {f"a{k}": np.zeros(k + 1) for k in range(30)}
     np.savez(tmp_path / "b.npz", **many)
-    with pytest.raises(RecordingError, match=r"a7 \(8,\), …; rename the array"):
+    with pytest.raises(RecordingError, match=r"a7 \(8,\), …, expected an array 'frames'"):
         load_recording(tmp_path / "b.npz", SCALE, 100.0)
 
 
