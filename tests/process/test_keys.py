@@ -86,7 +86,7 @@ def test_damaged_missing_and_readable_key_files_are_reported(folder):
             load_client(folder / "alice")
     for path in (folder / "server" / "clients").iterdir():
         path.unlink()
-    with pytest.raises(KeyFileError, match="found no client keys"):
+    with pytest.raises(KeyFileError, match="does not contain client keys"):
         load_server(folder)
 
 

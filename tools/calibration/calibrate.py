@@ -43,12 +43,12 @@ _EPILOG = """\
 steps of a hand; FILE is a profile, copied from that of --config if it does not exist:
   joints       you close, open and straighten each finger by hand, with torque off; determines the
                servo, direction, zero and range of each finger
-  heat         temperature rise and time constants of the servo of --finger, from the recording of a
-               grip of some minutes that starts with a cold servo
+  heat         temperature rise and time constants of the servo of --finger, from a recording of a
+               grip that lasts some minutes and starts with a cold servo
   friction     friction of each joint without contact; the running daemon sweeps the joint back and
                forth, or use a recording of such a motion
   latency      latency of the frames; the running daemon grasps an object with several forces
-               (--force: the first), or use a recording of such a grip
+               (--force is the first), or use a recording of such a grip
 
 steps of a tip, in this order; each step adds its result to FILE:
   tare         zero offset of each cell, noise and its correlation, drift; without load
