@@ -217,7 +217,7 @@ def notice_servo(
         ),
         (
             table[reg.DRIVE_MODE] & DRIVE_REVERSE,
-            "its drive mode reverses the direction in addition to servos.direction",
+            "its drive mode is reversed in addition to the reversal by servos.direction",
         ),
         (table[reg.TORQUE_ENABLE], "torque is already on and stays on until `disarm` or `arm`"),
         (

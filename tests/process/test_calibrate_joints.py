@@ -90,7 +90,7 @@ def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
         servos.write(2, reg.TORQUE_ENABLE, 1, 0)
         servos.close()
     assert calibrate(folder, *words) == 1
-    assert "left finger: found 0.0° between closed and open" in capsys.readouterr().err
+    assert "left finger: found a range of 0.0° between closed and open" in capsys.readouterr().err
     monkeypatch.setattr(emulator._servos.bus.servos[0]._joint, "shift", 4000)
     assert calibrate(folder, *words) == 1
     assert "(one turn), because a servo loses its full turns" in capsys.readouterr().err

@@ -134,7 +134,7 @@ def test_own_folder_refuses_links_files_and_other_users(tmp_path, monkeypatch):
     if os.geteuid() == 0:
         os.chown(tmp_path / "new", 54321, 54321)
     monkeypatch.setattr(own_folder.os, "geteuid", lambda: 12345)
-    with pytest.raises(PermissionError, match="expected the current user 12345"):
+    with pytest.raises(PermissionError, match="expected the current user, 12345"):
         OwnFolder(tmp_path / "new")
 
 

@@ -156,7 +156,7 @@ def test_unsuitable_contacts_are_refused():
     with pytest.raises(CurvesError, match="the best smooth increasing curves deviate"):
         fit_measured(replace(falls, frames=softer), A, GRID)
     single = replace(falls, frames=[each[:1] for each in falls.frames])
-    with pytest.raises(CurvesError, match="five frames of each press"):
+    with pytest.raises(CurvesError, match="five frames for each press"):
         fit_measured(single, A, GRID)
 
 

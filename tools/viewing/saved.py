@@ -33,7 +33,7 @@ def save(path: Path, recording: Recording, period: float, say: Callable[[str], N
     if count > _PICTURE_COUNT_MAX:
         raise ViewError(
             f"{recording.path}: {recording.duration:.0f} s of recording require {count} pictures, "
-            f"expected at most {_PICTURE_COUNT_MAX} pictures; choose a lower --rate"
+            f"expected at most {_PICTURE_COUNT_MAX}; choose a lower --rate"
         )
     scenes, rows, seen = _pictures(recording, period, count, say)
     if seen == 0:
