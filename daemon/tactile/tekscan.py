@@ -110,7 +110,11 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     wrong = np.argwhere((np.abs(values) > _READING_MAX) | (raw & (values < 0.0)))
     if wrong.size:
         k, i, j = wrong[0].tolist()
-        raise TekscanError(f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}")
+        low = 0.0 if raw else -_READING_MAX
+        raise TekscanError(
+            f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}, expected {low:g} "
+            f"to {_READING_MAX:g}"
+        )
     full = _RAW_SATURATION if raw and values.max() <= _RAW_SATURATION else math.inf
     if not raw:
         rounding = 0.5 * factor * 10.0 ** -_digits(values)

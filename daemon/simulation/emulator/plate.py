@@ -90,7 +90,9 @@ def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, lis
                 values[name] = _value(name, value)
         load = [name for name in _LOADS if name in values]
         if len(load) != 1:
-            raise PlateError(f"press {' '.join(words)!r}: expected one of {', '.join(_LOADS)}")
+            raise PlateError(
+                f"press {' '.join(words)!r}: expected exactly one of {', '.join(_LOADS)}"
+            )
         press = _press(values, table, scale)
         for finger in FINGERS if tip == "both" else (tip,):
             made.setdefault(finger, []).append(press)
