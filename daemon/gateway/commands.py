@@ -167,7 +167,9 @@ class CommandEndpoint(Endpoint):
         elif ends + 1 != len(parts):
             self._answer(route, _MALFORMED_REFUSAL)
         elif len(payload) > self._config.max_bytes:
-            text = f"found {len(payload)} bytes, expected at most {self._config.max_bytes}"
+            text = (
+                f"the command has {len(payload)} bytes, expected at most {self._config.max_bytes}"
+            )
             self._answer(route, refusal(text, Reason.REQUEST))
         else:
             came = now if self._dated is None else self._dated
