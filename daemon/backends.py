@@ -110,7 +110,7 @@ def plugins(kind: Kind) -> list[EntryPoint]:
 def source(entry: EntryPoint) -> str:
     """Return a plugin's name and the name and version of its package."""
     package = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "no package"
-    return f"{entry.name} of {package}"
+    return f"plugin {entry.name} from {package}"
 
 
 @cache
@@ -120,7 +120,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
         raise KeyError(name)
     if len(entries) > 1:
         raise PluginError(
-            f"{' and '.join(map(source, entries))} have the same name: uninstall one of them"
+            f"{' and '.join(map(source, entries))} have the same name; uninstall one of them"
         )
     (entry,) = entries
     try:

@@ -118,8 +118,8 @@ _MEANINGS = {
         "The command was received before the last `stop`, or too soon after it. Programs must "
         "not repeat it automatically."
     ),
-    Reason.SUPERSEDED: "A newer `hold` of the same connection replaced this one, or another "
-    "command was carried out before this one was repeated.",
+    Reason.SUPERSEDED: "A newer `hold` of the same connection replaced this `hold`, or another "
+    "command was carried out before this command was repeated.",
     Reason.BUSY: (
         "Too many commands are waiting, or this client exceeds the command rate. Send fewer "
         "commands."
@@ -127,7 +127,7 @@ _MEANINGS = {
     Reason.LEASE: "Another client has the lease (`commands.lease`).",
     Reason.MODE: "The hand does not accept this command in its current mode.",
     Reason.BOUNDS: "A number is out of range.",
-    Reason.SCENE: "The profile lacks a sensor, servos or a task that the command requires.",
+    Reason.SCENE: "The command requires a sensor, servos or a task that the profile lacks.",
     Reason.STATE: (
         "The current state prevents the command: a limit is exceeded, a tip is in contact, a "
         "tare is in progress, or the servos do not reply."

@@ -140,5 +140,5 @@ def _refuse_foreign(path: str, found: os.stat_result) -> None:
     strange = HAS_OWNERS and found.st_uid not in (os.geteuid(), 0)
     link = stat.S_ISLNK(found.st_mode)
     if strange and (link or Path(path).parent.stat().st_mode & _WORLD_WRITABLE):
-        what = "a link" if link else "a file in a world-writable folder"
-        raise PermissionError(errno.EPERM, f"{what} owned by another user", path)
+        what = "this link" if link else "this file in a world-writable folder"
+        raise PermissionError(errno.EPERM, f"{what} is owned by another user", path)

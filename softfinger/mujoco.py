@@ -257,7 +257,9 @@ class SoftTips:
         self._touching = [model.geom(name).id for name in touching]
         for name, geom in zip(tips, self._tips, strict=True):
             if abs(model.geom_size[geom, 0] - settings.tip.radius) > 1e-9:
-                raise SettingsError(f"{name}: expected a sphere of {settings.tip.radius:g} m")
+                raise SettingsError(
+                    f"{name}: expected a sphere of radius {settings.tip.radius:g} m"
+                )
         self.model, self.data = model, data
         material = make_material(settings.material)
         self.table = make_table(settings, material) if table is None else table
@@ -336,7 +338,9 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
     """
     shape, count = settings.simulation.object_shape, len(settings.scene.fingers)
     if shape != "rectangle" or count != 2:
-        raise SettingsError(f"object_shape: found {shape}, {count} fingers; expected rectangle, 2")
+        raise SettingsError(
+            f"found the object_shape {shape} and {count} fingers, expected rectangle and 2 fingers"
+        )
     fingers = sensors = ""
     for k, (name, side) in enumerate((("left", 1), ("right", -1))):
         end = f"{side * p.offset:.9g} {p.length:.9g} 0"

@@ -155,10 +155,7 @@ def waiting(address: str, folder: Path | None) -> str:
 
 def no_stream(address: str, folder: Path | None) -> str:
     """Return the error message for a stream that has not arrived in time."""
-    return (
-        f"no stream from {address} within {WAIT_MAX:g} s; check that softfinger is "
-        f"running{_hint(folder)}"
-    )
+    return f"no stream from {address} within {WAIT_MAX:g} s; is softfinger running?{_hint(folder)}"
 
 
 def _hint(folder: Path | None) -> str:

@@ -38,8 +38,11 @@ GROUPS = {  # package in tools/ and description of each subcommand
     "data": {
         "record": ("recordings", "record the running daemon's stream into an MCAP file"),
         "replay": ("recordings", "publish a recording again, or recompute it with this version"),
-        "analyse": ("analysis", "compute contact, force and energy versus time from frames"),
-        "plot": ("analysis", "plot a recording with the model: forces, energy landscape, errors"),
+        "analyse": ("analysis", "compute contact, force and energy over time from frames"),
+        "plot": (
+            "analysis",
+            "plot a recording together with the model: forces, energy landscape, errors",
+        ),
         "export": ("recordings", "export a recording's topics as CSV or Parquet"),
     },
     "machine": {
@@ -58,7 +61,7 @@ GROUPS = {  # package in tools/ and description of each subcommand
         "completion": ("setup", "print a completion script for bash, zsh or fish"),
     },
     "develop": {
-        "figures": ("paper", "plot the paper's figures with this model, as CSV and PNG"),
+        "figures": ("paper", "compute the paper's figures with this model, as CSV and PNG"),
         "validate": ("paper", "compare this model with published results"),
         "bench": ("benchmarks", "measure run times and the simulated hand's behaviour"),
     },

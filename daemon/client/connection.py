@@ -73,8 +73,8 @@ def require_host(address: str) -> None:
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or "not a host name"
         raise SettingsError(
-            f"{address}: found unknown host {host!r} ({why}), expected an IP address or a host "
-            "name that this machine can resolve"
+            f"{address}: found the unknown host {host!r} ({why}), expected an IP address or a "
+            "host name that this machine can resolve"
         ) from None
 
 
@@ -97,8 +97,9 @@ class OneThread:
             owner = self._owner
         if owner is not thread:
             raise WrongThread(
-                f"thread {thread.name}: found a Hand whose stream is used by thread {owner.name}, "
-                "expected each Hand to be used by one thread; create another Hand in this thread"
+                f"thread {thread.name}: the stream of this Hand is already used by thread "
+                f"{owner.name}, but only one thread can use a Hand; create another Hand in this "
+                "thread"
             )
 
 
@@ -147,4 +148,4 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
 
 def still_waiting(what: str, timeout: float) -> str:
     """Return the warning text for data that has not arrived yet."""
-    return f"no {what} yet, waiting up to {round(timeout, 2):g} s"
+    return f"no {what} yet; waiting up to {round(timeout, 2):g} s"

@@ -186,8 +186,8 @@ class Subscriber(Generic[_Record]):
         if found != SCHEMA and not self._warned:
             self._warned = True
             warnings.warn(
-                f"the stream has schema {found!r}, this client supports {SCHEMA}; unknown fields "
-                "are ignored",
+                f"the stream uses schema {found!r}, but this client supports schema {SCHEMA}; "
+                "unknown fields are ignored",
                 stacklevel=3,
             )
         return record

@@ -21,9 +21,9 @@ PACKAGED_MAP = Path(__file__).with_name("envelope.toml")
 HELD, TURNED, LOST, REFUSED = "htlr"
 OUTCOME_TEXTS = {
     HELD: "held",
-    TURNED: "held, but turned by more than 5°",
+    TURNED: "the object is held, but rotates by more than 5°",
     LOST: "the object slips out",
-    REFUSED: "the hand cannot grip it",
+    REFUSED: "the hand can't grip the object",
 }
 _GRAVITY = 9.81  # m/s²
 _SECTIONS = ("hand", "tip", "material")
@@ -81,11 +81,13 @@ class Envelope:
             self._force_limit = found["raised"]
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
             raise SettingsError(
-                f"control.envelope: {own}: can't read this map; create it with `softfinger "
-                f"envelope --keep`: {error!r}"
+                f"control.envelope: {own}: can't be read: {error!r}; create a map with "
+                "`softfinger envelope --keep`"
             ) from None
         if own and other:
-            raise SettingsError(f"control.envelope: {own} belongs to another hand: {other}")
+            raise SettingsError(
+                f"control.envelope: {own}: the map belongs to another hand: {other}"
+            )
         self._is_valid = not other
         self._settings = settings
 
@@ -106,8 +108,8 @@ class Envelope:
         if HELD in outcome or TURNED in outcome:
             return ""
         return (
-            f"outside the simulated envelope of this hand: {1e3 * settings.object.width:g} mm "
-            f"(object.width) at friction {control.tip_friction:g} (control.tip_friction) and "
-            f"{mass:.2g} kg (control.object_load) with {force:g} N: {OUTCOME_TEXTS[outcome[0]]}; "
-            "see docs/envelope.md"
+            "this grip is outside the simulated envelope of this hand: with object.width = "
+            f"{1e3 * settings.object.width:g} mm, control.tip_friction = {control.tip_friction:g}, "
+            f"a mass of {mass:.2g} kg (control.object_load) and a force of {force:g} N, "
+            f"{OUTCOME_TEXTS[outcome[0]]}; see docs/envelope.md"
         )

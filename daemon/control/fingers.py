@@ -22,7 +22,8 @@ _TILT_RESERVE = 0.1
 def range_text(angle: float, low: float, high: float) -> str:
     """Return the "found …, expected …" part of a message about an out-of-range angle [rad]."""
     found, lower, upper = (f"{math.degrees(each):.1f}°" for each in (angle, low, high))
-    return f"found {found} ({angle:.4g} rad), expected {lower} to {upper} ({low:.2f} to {high:.2f})"
+    expected = f"{lower} to {upper} ({low:.2f} to {high:.2f} rad)"
+    return f"found {found} ({angle:.4g} rad), expected {expected}"
 
 
 class Fingers:

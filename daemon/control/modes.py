@@ -83,8 +83,8 @@ _FORCE = Parameter(
 _QUEUED = ("queued", "until")
 _GRIP_REFUSALS = {
     Reason.BOUNDS: "The force or the angle is out of range.",
-    Reason.SCENE: "The scene lacks tactile sensors, `servos.mode` is `position`, or an angle is "
-    "given without two fingers and the object model.",
+    Reason.SCENE: "The scene has no tactile sensors, `servos.mode` is `position`, or an angle is "
+    "given although the scene has only one finger or no object model.",
     Reason.STATE: "A limit is exceeded, a tare is in progress, or the object's angle is unknown.",
 }
 
@@ -119,7 +119,7 @@ COMMANDS: dict[str, CommandKind] = {
         refusals={
             Reason.REQUEST: "Neither joint is given.",
             Reason.BOUNDS: "An angle is out of range.",
-            Reason.SCENE: "The scene lacks this finger.",
+            Reason.SCENE: "The scene does not have this finger.",
         },
     ),
     "grasp": CommandKind(
@@ -130,7 +130,7 @@ COMMANDS: dict[str, CommandKind] = {
         ("warning",),
         {
             Reason.BOUNDS: "The force is out of range.",
-            Reason.SCENE: "The scene lacks tactile sensors, or `servos.mode` is `position`.",
+            Reason.SCENE: "The scene has no tactile sensors, or `servos.mode` is `position`.",
             Reason.STATE: "A limit is exceeded, or a tare is in progress.",
         },
     ),
@@ -141,8 +141,9 @@ COMMANDS: dict[str, CommandKind] = {
         {"angle": Parameter(True, "rad", "range of the grip", "angle in the hand's frame")},
         _QUEUED,
         {
-            Reason.BOUNDS: "The angle is outside this grip's range, which the error text gives.",
-            Reason.SCENE: "The scene lacks a finger or the object model.",
+            Reason.BOUNDS: "The angle is outside the range of this grip. The error text states the "
+            "range.",
+            Reason.SCENE: "The scene has only one finger or no object model.",
             Reason.STATE: "The object's angle is unknown.",
         },
     ),

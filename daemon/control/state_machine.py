@@ -400,7 +400,7 @@ class Control:
         if off < _ARRIVAL_DISTANCE:
             self._enter_armed()
         elif state.arrived_for > _ARRIVAL_TIMEOUT:
-            text = f"{state.mode.value} ended {math.degrees(off):.1f}° before the goal"
+            text = f"{state.mode.value}: stopped {math.degrees(off):.1f}° before the goal"
             self._warn("short", text)
             self._enter_armed()
 
@@ -434,7 +434,7 @@ class Control:
         if before + dt > _EMPTY_TIME:
             text = (
                 f"no object between the tips: their distance is {pose.width * 1e3:.1f} mm, "
-                f"expected at least object.width_min = {width_min * 1e3:g} mm; opening"
+                f"expected at least object.width_min = {width_min * 1e3:g} mm; the hand opens"
             )
             self._warn("grasp", text)
             self.release()
@@ -528,7 +528,7 @@ class Control:
         """Report slip and the start of each force increase that counteracts it."""
         grip = self.grip
         if grip.has_slipped:
-            self._warn("slip", "the object is turning in the grip")
+            self._warn("slip", "the object is rotating in the grip")
         if grip.target <= grip.commanded:
             history.increase_reported = False
         elif not history.increase_reported and grip.target > (1 + _FORCE_NOISE) * grip.commanded:
@@ -539,4 +539,5 @@ class Control:
                     f"the load may reach {grip.slip.assumed_load:.1f} N along the object's face "
                     "at each tip"
                 )
-            self._warn("slip", f"grip force increased above {grip.commanded:.1f} N: {why}")
+            text = f"grip force increased above the commanded {grip.commanded:.1f} N: {why}"
+            self._warn("slip", text)

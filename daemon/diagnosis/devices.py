@@ -163,7 +163,7 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
         return found.old_protocol()
     if not found.servos and not found.garbled:
         problem = f"no servo replies on {servos.port} at any baud rate"
-        return [Finding("FAIL", "servos", problem, "check the servo supply and the bus cable")]
+        return [Finding("FAIL", "servos", problem, "check the power supply and the bus cable")]
     what = plan(found, settings, model, model.baud_rates)
     lines = [Finding("FAIL", "servos", str(each), ONE_SERVO_ONLY) for each in found.garbled]
     for change in what.changes:
@@ -184,7 +184,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
     problem = "no other servo replies at any baud rate"
     if not volts:
         return [Finding("note", "found", problem)]
-    fix = "replace the cable between the servos, then check the supply"
+    fix = "replace the cable between the servos; if this does not help, check the power supply"
     return [
         Finding(
             "note",

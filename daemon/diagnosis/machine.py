@@ -103,7 +103,7 @@ def check_wake_ups(late: list[float]) -> Finding:
     )
     if middle < 0.25 * _PERIOD:
         return Finding("pass", "wake-ups", text)
-    problem = f"{text}: the machine is busy or wakes up slowly"
+    problem = f"{text}: the machine is busy, or its processors wake up slowly"
     return Finding("warn", "wake-ups", problem, "end other programs")
 
 
@@ -117,7 +117,7 @@ def check_kernels(settings: Settings) -> list[Finding]:
         fix = "export NUMBA_CACHE_DIR=FOLDER, where FOLDER is your own folder"
         return [Finding("warn", "kernel cache", problem, fix)]
     if spoilt:
-        problem = f"{spoilt} corrupted files in {place}: they will be recompiled at the next start"
+        problem = f"found {spoilt} corrupted files in {place}: the next start will recompile them"
         return [
             Finding("warn", "kernels", problem, "run `softfinger compile`, or start the daemon")
         ]

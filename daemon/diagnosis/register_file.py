@@ -98,7 +98,9 @@ def restore_registers(settings: Settings, path: Path) -> list[Finding]:
             number = line.ping(servo_id)
             model = "no reply" if number is None else reg.name_of(number)
             if model != kept.model:
-                text = f"not restored: {path} was saved from an {kept.model}, found {model}"
+                text = (
+                    f"not restored: {path} contains the registers of an {kept.model}, found {model}"
+                )
                 result.append(Finding("warn", name, text))
                 continue
             _restore(line, servo_id, name, kept.registers, result)
@@ -150,7 +152,7 @@ def _stored(path: Path) -> dict[int, StoredServo]:
     except ValidationError as error:
         where = ".".join(str(each) for each in error.errors()[0]["loc"])
         raise ServoError(
-            f"{path}: {where}: {error.errors()[0]['msg']}; expected a file of `softfinger doctor "
-            "--save`"
+            f"{path}: {where}: {error.errors()[0]['msg']}; expected a file written by `softfinger "
+            "doctor --save`"
         ) from None
     return {each.id: each for each in stored.servos}

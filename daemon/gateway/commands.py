@@ -32,9 +32,9 @@ from softfinger.daemon.wire.loop_link import ASK, Ask
 # This byte sequence cannot occur inside a string.
 _PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")
 _MALFORMED_REFUSAL = refusal(
-    "envelope: expected one frame with the command, optionally after an envelope of at most "
-    f"{bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes ending with an "
-    "empty frame",
+    "envelope: expected a single frame with the command; an envelope may precede this frame if "
+    f"the envelope ends with an empty frame and has at most {bounds.PART_COUNT_MAX - 2} frames and "
+    f"{bounds.ENVELOPE_SIZE_MAX} bytes",
     Reason.REQUEST,
 )
 _QUEUE_FULL_REFUSAL = refusal("too many commands are waiting", Reason.BUSY)
@@ -168,7 +168,9 @@ class CommandEndpoint(Endpoint):
         elif ends + 1 != len(parts):
             self._answer(route, _MALFORMED_REFUSAL)
         elif len(payload) > self._config.max_bytes:
-            text = f"message of {len(payload)} bytes, expected at most {self._config.max_bytes}"
+            text = (
+                f"the command has {len(payload)} bytes, expected at most {self._config.max_bytes}"
+            )
             self._answer(route, refusal(text, Reason.REQUEST))
         else:
             came = now if self._dated is None else self._dated

@@ -102,7 +102,8 @@ class Admission(ThreadAuthenticator):
         gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
         if gone or found.secret != self._keys.secret:
             raise RestartNeeded(
-                f"access.keys: disconnected clients without a key file: {', '.join(gone) or 'all'}"
+                "access.keys: disconnected the clients that have no key file: "
+                f"{', '.join(gone) or 'all'}"
             )
         self._keys = found
 

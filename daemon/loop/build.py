@@ -115,7 +115,7 @@ class Daemon:
                 return servos.connect()
             except ServosSilent as silent:
                 if time.monotonic() - began >= patience:
-                    text = f"{silent}; waited servos.open_timeout = {patience:g} s"
+                    text = f"{silent}; gave up after servos.open_timeout = {patience:g} s"
                     raise ServosSilent(text) from None
                 if on_event is not None and not was_reported:
                     text = f"{silent}; waiting for up to servos.open_timeout = {patience:g} s"

@@ -325,7 +325,7 @@ class Loop:
         if name == "clear":
             self._latch("", "")
         if self._task is not None and not by_task:
-            self._end_task(f"ended by command {name}")
+            self._end_task(f"the command {name} was received")
         if name == "demo":
             self._task = Task.named(self._settings)
         return reply

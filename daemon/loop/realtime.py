@@ -82,7 +82,7 @@ class RealTime:
         if wanted.timer_slack:
             self._sharpen_timer(max(round(wanted.timer_slack * 1e9), 1))
         if wanted.spin:
-            self._granted(f"spin of {wanted.spin * 1e6:g} µs before each tick")
+            self._granted(f"busy-waiting for {wanted.spin * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
         """Return one event for all granted measures, and one event for each refused measure."""
@@ -108,7 +108,7 @@ class RealTime:
         self._undo += undo
 
     def _refused(self, text: str, remedy: str = "") -> None:
-        self.refused.append(f"{text}; to grant it: {remedy}" if remedy else text)
+        self.refused.append(f"{text}; to grant this measure: {remedy}" if remedy else text)
 
     def _keep_interpreter(self, freeze: bool) -> None:
         """Keep the garbage collector and other threads from delaying the loop.
@@ -175,8 +175,8 @@ class RealTime:
         except OSError as error:
             there = ", ".join(map(str, sorted(before)))
             self._refused(
-                f"processor {names} refused ({error.strerror}; available: {there}): the loop may "
-                "move between processors"
+                f"use of processor {names} refused ({error.strerror}; available: {there}): the "
+                "loop may move between processors"
             )
         else:
             self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))

@@ -270,7 +270,7 @@ class Requests:
             refuse_if(
                 state.torque and not self._control.torque,
                 Reason.STATE,
-                "the servos have not confirmed torque off yet: check their cable and power supply",
+                "the servos have not confirmed torque off yet: check their power supply and cable",
             )
         begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING_MODES)
         if begins or name in ("arm", "clear"):
@@ -306,7 +306,7 @@ class Requests:
             numbers.setdefault("force", settings.control.force_default)
         if "force" in numbers:
             force, (low, high) = numbers["force"], bounds(settings, "force")
-            text = f"force: found {force:g} N, expected above {low:g} to {high:g}"
+            text = f"force: found {force:g} N, expected more than {low:g} N and at most {high:g} N"
             refuse_if(not low < force <= high, Reason.BOUNDS, text)
         if "angle" in numbers:
             turns = len(settings.scene.fingers) == 2 and settings.scene.object_model
@@ -375,7 +375,7 @@ class Requests:
                     raise Refused(f"{name}: {error}") from None
                 self._emit("warning", "tactile", str(error))
             else:
-                self._emit("info", "tactile", f"{side} sensor reopened")
+                self._emit("info", "tactile", f"the {side} sensor was reopened")
                 self._perception.update(self._state)
 
     def _status(self) -> dict[str, Any]:

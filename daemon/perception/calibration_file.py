@@ -189,7 +189,7 @@ def load_calibration(path: Path) -> Calibration:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise CalibrationFileError(
-            f"{path}: not a calibration file of this version: {where}: {first['msg']}"
+            f"{path}: not a calibration file for this version: {where}: {first['msg']}"
         ) from None
     wrong = _contradiction(calibration)
     if wrong:
@@ -222,8 +222,8 @@ def difference(file: Sensor, there: Sensor) -> str:
     ]
     if max(abs(a - b) for a, b in zip(file.pitch, there.pitch, strict=True)) > _PITCH:
         pairs.append(("pitch", _millimetres(file.pitch), _millimetres(there.pitch)))
-    return ", ".join(
-        f"{name} {theirs}, here {ours}" for name, theirs, ours in pairs if theirs != ours
+    return "; ".join(
+        f"{name}: found {theirs}, expected {ours}" for name, theirs, ours in pairs if theirs != ours
     )
 
 

@@ -92,8 +92,8 @@ def make_models(
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
         if material.misfits is not None and on_event is not None:
             text = (
-                f"{name}: the law deviates from its points by up to {material.fit_error:.0f} Pa, "
-                f"or {material.worst_force_error:.1%} of the force"
+                f"{name}: the material law deviates from the measured points by up to "
+                f"{material.fit_error:.0f} Pa ({material.worst_force_error:.1%} of the force)"
             )
             on_event("info", "material", text)
     left, right = (made.get(k) or replace(made[1 - k], finger=k) for k in range(len(FINGERS)))
@@ -125,8 +125,8 @@ def _measured_tip(settings: Settings, finger: int, calibration: Calibration | No
     file = settings.tactile.calibration[finger]
     if law is None:
         raise SettingsError(
-            f'tip.physics: found "measured", but {file or "tactile.calibration"} has no curves '
-            f"for the {FINGERS[finger]} tip; measure them with `softfinger calibrate law`"
+            f'tip.physics: found "measured", but {file or "tactile.calibration"} does not contain '
+            f"curves for the {FINGERS[finger]} tip; run `softfinger calibrate law` to measure them"
         )
     if law.radius != settings.tip.radius:
         raise SettingsError(

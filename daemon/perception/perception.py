@@ -252,7 +252,7 @@ class FingerPerception:
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
         if not np.median(ends) > 0.0:  # With such a zero offset, no contact could be measured.
-            text = f"{side} sensor was not tared: most cells are saturated without contact"
+            text = f"the {side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))
             return
         if self._converter is not None:
@@ -265,7 +265,7 @@ class FingerPerception:
             self._estimator.saturation = least_end(ends)
         middle, most = float(np.median(moved)), float(moved[np.argmax(np.abs(moved))])
         text = (
-            f"{side} sensor's zero offsets changed by {middle:+.1f} counts "
-            f"({middle * self._quantum:+.0f} Pa), in one cell by {most:+.1f} counts"
+            f"the {side} sensor's zero offsets changed by {middle:+.1f} counts "
+            f"({middle * self._quantum:+.0f} Pa); the largest change was {most:+.1f} counts"
         )
         self._events.append(("info", "tare", text))

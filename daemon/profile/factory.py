@@ -29,8 +29,9 @@ def law_problem(material: Material, limit: float) -> str:
     if found <= limit:
         return ""
     return (
-        f"the smooth law deviates from the measured points by up to {material.fit_error:.4g} Pa, "
-        f"{found:.1%} of the force; expected at most {limit:.1%} (material.force_error_max)"
+        "the material law deviates from the measured points by up to "
+        f"{material.fit_error:.4g} Pa ({found:.1%} of the force); expected at most {limit:.1%} "
+        "(material.force_error_max)"
     )
 
 

@@ -294,7 +294,7 @@ def _line(
     expected = _MESSAGE_START.sub("", details["msg"], count=1)
     if details["type"] == "less_than_equal" and not above and _is_length(location):
         metres = 1e-3 * float(details["input"])
-        expected += f" m; {details['input']:g} mm are {metres:g}" if metres < 1.0 else " m"
+        expected += f" m; {details['input']:g} mm is {metres:g} m" if metres < 1.0 else " m"
     return f"{key}: found {shown(details['input'])}, expected {expected}"
 
 

@@ -49,8 +49,8 @@ def _wide_sensor(settings: Settings) -> Iterator[str]:
         and min(_sides(settings)) > _SENSOR_WIDTH_MAX * 2.0 * tip.radius
     ):
         yield (
-            f"tactile.rows, cols, pitch: found a sensor area of {_size(settings)} for a tip of "
-            f"{tip.radius * 2e3:.4g} mm diameter: check these settings and tip.radius"
+            f"tactile.rows, cols, pitch: found a sensor area of {_size(settings)} for a tip with "
+            f"a diameter of {tip.radius * 2e3:.4g} mm: check these settings and tip.radius"
         )
 
 
@@ -78,8 +78,8 @@ def _small_sensor(settings: Settings) -> Iterator[str]:
     for what, reach in reaches:
         if half < reach:
             yield (
-                f"tactile.rows, cols, pitch: found a sensor area of {_size(settings)}, smaller "
-                f"than the tip's {what}, {reach * 2e3:.3g} mm wide with tip.radius = "
+                f"tactile.rows, cols, pitch: found a sensor area of {_size(settings)}, but the "
+                f"tip's {what} is {reach * 2e3:.3g} mm wide with tip.radius = "
                 f"{tip.radius * 1e3:.3g} mm: the pressure outside the sensor is not measured; use "
                 "a larger sensor or a lower force"
             )
@@ -104,9 +104,9 @@ def _strong_grip(settings: Settings) -> Iterator[str]:
     stall = servos.gear_ratio * servo_model(servos.model).stall[0] / lever
     if force > stall:
         yield (
-            f"safety.force_max: found {settings.safety.force_max:g} N, which allows grips of "
-            f"{force:.3g} N, expected at most {stall:.2g} N (stall force of {servos.model} on "
-            "this finger); lower safety.force_max and safety.current_max"
+            f"safety.force_max: found {settings.safety.force_max:g} N, which allows a grip force "
+            f"of {force:.3g} N, but the stall torque of {servos.model} limits the force of this "
+            f"finger to {stall:.2g} N; reduce safety.force_max and safety.current_max"
         )
     bound = settings.control.torque_constant * settings.safety.current_max / lever
     for key, force in _set_forces(settings):
@@ -332,7 +332,7 @@ def _wedge(settings: Settings) -> Iterator[str]:
     if abs(simulation.object_taper) >= limit:
         yield (
             f"simulation.object_taper: found {simulation.object_taper:g} rad, expected less than "
-            f"{limit:.3g} rad, at which the faces of an object of this width and height would meet"
+            f"{limit:.3g} rad: at that angle, the faces of an object of this size would meet"
         )
 
 
@@ -396,7 +396,7 @@ def _forces(settings: Settings) -> Iterator[str]:
         return
     for key, force in _set_forces(settings):
         if not low < force <= high:
-            yield f"{key}: found {force:g} N, expected above {low:g} to {high:g}"
+            yield f"{key}: found {force:g} N, expected more than {low:g} N and at most {high:g} N"
 
 
 def address_problem(address: str, lacking: str) -> str:
@@ -444,7 +444,7 @@ def _folder(settings: Settings) -> Iterator[str]:
         ports += [("tactile.port", port) for port in settings.tactile.port]
     for key, port in ports:
         if "{dir}" in port:
-            yield f"{key}: found {shown(port)}, expected --dir to set the folder for {{dir}}"
+            yield f"{key}: found {shown(port)}, but {{dir}} is not set; pass the folder with --dir"
 
 
 _CHECKS = (

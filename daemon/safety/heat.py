@@ -129,7 +129,8 @@ class HeatWatch:
         if left > self._limits.heat_warn:
             self._error_reported = False
             return ""
-        who = f"{FINGERS[i]} servo will reach {self._limits.temperature_max:g} °C in {left:.0f} s"
+        hot = self._limits.temperature_max
+        who = f"the {FINGERS[i]} servo will reach {hot:g} °C in {left:.0f} s"
         if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
             return ""  # The last reduction has not taken effect yet.
         now = state.goal.force
@@ -141,7 +142,7 @@ class HeatWatch:
         if eased < _FRACTION_MAX * now:
             self._reduction_time = state.t
             control.limit_force(eased, _ACTION_TIME)
-            text = f"{who}: grip force reduced from {now:.1f} to {eased:.1f} N"
+            text = f"{who}: the grip force was reduced from {now:.1f} to {eased:.1f} N"
             events.append(("warning", "servos.heat", text))
             return ""
         if left > _ERROR_TIME:

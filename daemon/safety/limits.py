@@ -220,9 +220,8 @@ LIMITS: list[Limit] = []
 
 # --- servos ---------------------------------------------------------------------------------------
 
-LIMITS.append(Limit("servos.bus", "lost port, servo stopped by its watchdog, or servo that rejects "
-    "goals", "fault",
-    ("servos.watchdog",)))  # fmt: skip
+LIMITS.append(Limit("servos.bus", "lost port, servo stopped by its watchdog, or rejected goals",
+    "fault", ("servos.watchdog",)))  # fmt: skip
 
 
 @Limit("servos.silent", "age of the last valid servo reading; error replies do not count", "fault",
@@ -235,8 +234,9 @@ def _servos_silent(view: View, state: State, _: float) -> str:
     return f"servos: no valid reading {lasted}"
 
 
-@Limit("servos.silent", "fraction of failed readings in the last second, with and without torque",
-    "warn", ("servos.reply_timeout",), "servos")  # fmt: skip
+@Limit("servos.silent",
+    "fraction of servo readings that failed in the last second, with or without torque", "warn",
+    ("servos.reply_timeout",), "servos")  # fmt: skip
 def _servos_late(view: View, _: State, fraction: float) -> str:
     if view.failed <= fraction * _FAILED_FRACTION_MAX:
         return ""
@@ -249,15 +249,15 @@ def _servos_late(view: View, _: State, fraction: float) -> str:
 
 
 @Limit("servos.frozen",
-    "servo whose clock register has not changed for 0.1 s, which means that its readings are "
-    "old", "fault", needs="servos")  # fmt: skip
+    "servo whose clock register has not changed for 0.1 s, so that its readings are old", "fault",
+    needs="servos")  # fmt: skip
 def _servos_frozen(view: View, state: State, _: float) -> str:
     frozen = state.reading.frozen
     if not frozen:
         return ""
     return (
-        f"servos: the readings are old ({_names(view, frozen)}): the clock register has stopped; "
-        "check the cable, and switch the supply off and on"
+        f"servos: old readings from the {_names(view, frozen)} servo: the clock register has "
+        "stopped; check the cable, and switch the power supply off and on"
     )
 
 
@@ -284,7 +284,7 @@ def _servos_warm(view: View, state: State, fraction: float, i: int) -> str:
     left = state.heat[i].time_to_limit
     if left >= view.limits.heat_warn / fraction:
         return ""
-    return f"{FINGERS[i]} servo will reach {view.limits.temperature_max:g} °C in {left:.0f} s"
+    return f"the {FINGERS[i]} servo will reach {view.limits.temperature_max:g} °C in {left:.0f} s"
 
 
 @Limit("servos.temperature", "temperature of a servo", "fault", ("safety.temperature_max",),
@@ -294,7 +294,7 @@ def _servos_hot(view: View, state: State, fraction: float, i: int) -> str:
     bound = fraction * view.limits.temperature_max
     if temperature < bound:
         return ""
-    return f"{FINGERS[i]} servo is at {temperature:.0f} °C, above {bound:g} °C"
+    return f"the {FINGERS[i]} servo is at {temperature:.0f} °C, above {bound:g} °C"
 
 
 @Limit("servos.voltage", "supply voltage of a servo", "fault",
@@ -305,7 +305,7 @@ def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
     if not voltage or low <= voltage <= high:
         return ""
     return (
-        f"supply voltage of the {FINGERS[i]} servo is {voltage:.1f} V, expected {low:.1f} to "
+        f"the supply voltage of the {FINGERS[i]} servo is {voltage:.1f} V, expected {low:.1f} to "
         f"{high:.1f} V"
     )
 
@@ -322,7 +322,7 @@ def _joint_angle(view: View, state: State, _: float, i: int) -> str:
     low, high = hand.q_min[i], hand.q_max[i]
     if low - _STOP_TOLERANCE <= q <= high + _STOP_TOLERANCE:
         return ""
-    return f"{FINGERS[i]} joint is at {q:.3f} rad, outside {low:g} to {high:g} rad"
+    return f"the {FINGERS[i]} joint is at {q:.3f} rad, expected {low:g} to {high:g} rad"
 
 
 @Limit("joint.velocity", "joint velocity", "fault", ("safety.velocity_max",), "servos").each
@@ -330,18 +330,18 @@ def _joint_velocity(view: View, state: State, _: float, i: int) -> str:
     bound, dq = view.limits.velocity_max, state.reading.dq[i]
     if -bound <= dq <= bound:
         return ""
-    return f"{FINGERS[i]} joint is moving at {dq:.2f} rad/s, above {bound:g} rad/s"
+    return f"the {FINGERS[i]} joint is moving at {dq:.2f} rad/s, above {bound:g} rad/s"
 
 
-@Limit("joint.jump", "joint angle that differs from its integrated velocity by 0.1 rad within 0.1 "
-    "s, or changes faster than the maximum velocity", "fault", ("safety.velocity_max",),
+@Limit("joint.jump", "joint angle that deviates from the integrated velocity by 0.1 rad within "
+    "0.1 s, or that changes faster than the maximum velocity", "fault", ("safety.velocity_max",),
     "servos")  # fmt: skip
 def _joint_jump(view: View, _: State, __: float) -> str:
     if not view.motion.jumped:
         return ""
     return (
-        f"angle of the {_names(view, view.motion.jumped)} joint does not follow its velocity: "
-        "check for a slipping encoder or coupling"
+        f"the angle of the {_names(view, view.motion.jumped)} joint does not follow the joint's "
+        "velocity: check for a slipping encoder or coupling"
     )
 
 
@@ -350,8 +350,8 @@ _EXPECTED_CURRENT_MIN = 0.04  # minimum expected current for the check [A]
 _CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 
 
-@Limit("joint.dead", "joint at least 0.05 rad from its goal that neither moves nor draws "
-    "current for 0.05 s", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
+@Limit("joint.dead", "joint that neither moves nor draws current for 0.05 s, at least 0.05 rad "
+    "from its goal", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     """Report a joint that is stationary away from its goal without drawing current.
 
@@ -369,9 +369,9 @@ def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     if not (expected > _EXPECTED_CURRENT_MIN and toward < _CURRENT_FRACTION_MIN * expected):
         return ""
     return (
-        f"{FINGERS[i]} joint is stationary {math.degrees(abs(error)):.1f}° from its goal and "
-        f"draws only {toward:.2f} A of {goal.current[i]:.2f} A: check the encoder, the current "
-        "sensor and the motor"
+        f"the {FINGERS[i]} joint is stationary {math.degrees(abs(error)):.1f}° from its goal and "
+        f"draws only {toward:.2f} A (maximum {goal.current[i]:.2f} A): check the encoder, the "
+        "current sensor and the motor"
     )
 
 
@@ -380,14 +380,14 @@ def _joint_dead(view: View, state: State, _: float, i: int) -> str:
 def _joint_current(view: View, state: State, _: float, i: int) -> str:
     bound, current = view.limits.current_fault, state.reading.current[i]
     well = -bound <= current <= bound
-    return "" if well else f"{FINGERS[i]} joint draws {current:.2f} A, more than {bound:g} A"
+    return "" if well else f"the {FINGERS[i]} joint draws {current:.2f} A, more than {bound:g} A"
 
 
 _FULL_CURRENT = 0.9  # minimum fraction of the goal's current limit that counts as saturated
 
 
-@Limit("joint.stall", "joint that does not move although it is away from its goal and at "
-    "maximum current",
+@Limit("joint.stall", "joint that does not move at maximum current before it reaches its "
+    "goal",
     "fault", ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
     lasts="stall_time").each  # fmt: skip
 def _joint_stall(view: View, state: State, _: float, i: int) -> str:
@@ -401,17 +401,17 @@ def _joint_stall(view: View, state: State, _: float, i: int) -> str:
     if not (stands and error > view.limits.stall_error):
         return ""
     off = f"{math.degrees(error):.1f}° from its goal"
-    return f"{FINGERS[i]} joint has stalled {off} at {current:.2f} A"
+    return f"the {FINGERS[i]} joint has stalled {off} at {current:.2f} A"
 
 
-@Limit("joint.swapped", "joint that moves the other finger's tip, or object that rotates "
-    "opposite to its command", "fault", ("servos.ids",), "sensors")  # fmt: skip
+@Limit("joint.swapped", "joint that moves the tip of the other finger, or an object that rotates "
+    "in the direction opposite to the command", "fault", ("servos.ids",), "sensors")  # fmt: skip
 def _joint_swapped(view: View, _: State, __: float) -> str:
     return view.wiring.swapped
 
 
 @Limit("joint.blocked", "joint that stops for 0.5 s at maximum current during the "
-    "approach without contact", "warn", ("servos.direction",), "servos",
+    "approach although its tip has no contact", "warn", ("servos.direction",), "servos",
     lasts=0.5).each  # fmt: skip
 def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     goal, reading, contact = state.goal, state.reading, state.contacts[i]
@@ -424,9 +424,9 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     if not (full and stands):
         return ""
     return (
-        f"{FINGERS[i]} joint has stopped at {math.degrees(reading.q[i]):.0f}° during the approach "
-        "although its tip has no contact: remove the obstacle; if the finger opens instead of "
-        "closing, correct servos.direction"
+        f"the {FINGERS[i]} joint has stopped at {math.degrees(reading.q[i]):.0f}° during the "
+        "approach although its tip has no contact: remove the obstacle; if the finger opens "
+        "instead of closing, correct servos.direction"
     )
 
 
@@ -434,8 +434,8 @@ _OVERLAP_RATIO = 0.5  # minimum overlap in tip radii; offset errors and frame la
 
 
 @Limit("joint.opens",
-    "tips that overlap according to the joint angles during the approach although one of them "
-    "has no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
+    "overlap of the tips, computed from the joint angles, while a tip has no contact during the "
+    "approach", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 
@@ -454,7 +454,7 @@ def _joint_opens(view: View, state: State, _: float) -> str:
         return ""
     tips = f"the {FINGERS[felt.index(False)]} tip has no" if any(felt) else "neither tip has"
     return (
-        f"according to the joint angles the tips overlap by {1e3 * overlap:.0f} mm, but {tips} "
+        f"according to the joint angles, the tips overlap by {1e3 * overlap:.0f} mm, but {tips} "
         "contact: if a finger opens instead of closing, correct servos.direction; otherwise "
         "correct servos.zero"
     )
@@ -471,7 +471,7 @@ def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     if not state.torque or state.mode not in GRIPPING_MODES or well:
         return ""
     return (
-        f"{FINGERS[i]} joint requires the maximum current of {limit:g} A for this grip; reduce "
+        f"the {FINGERS[i]} joint requires the maximum current of {limit:g} A for this grip; reduce "
         "the force, or raise safety.current_max"
     )
 
@@ -490,12 +490,12 @@ def _goal_lost(view: View, state: State, _: float) -> str:
     lost = state.reading.lost
     if not lost:
         return ""
-    return f"servos: goals are not being received ({_names(view, lost)}): check the cable"
+    return f"servos: goals do not reach the {_names(view, lost)} servo: check the cable"
 
 
 @Limit(
     "goal.number",
-    "computed goal that is not a finite number; it is not sent",
+    "computed goal that is not a finite number; such a goal is never sent",
     "fault",
     needs="servos",
 )
@@ -506,7 +506,7 @@ def _goal_number(view: View, _: State, __: float) -> str:
 LIMITS += [
     Limit("goal.angle", "goal angle", "limit", ("hand.q_min", "hand.q_max")),
     Limit("goal.current", "goal current", "limit", ("safety.current_max",)),
-    Limit("goal.step", "step of a goal angle that is far from the joint angle", "limit",
+    Limit("goal.step", "step of the goal angle while the goal is far from the joint angle", "limit",
         ("safety.goal_reach", "safety.goal_speed")),
     Limit("goal.slew", "increase of a goal current per tick", "limit", ("safety.current_rate",)),
 ]  # fmt: skip
@@ -522,7 +522,7 @@ def _tip_force(view: View, state: State, fraction: float, i: int) -> str:
     bound, contact = fraction * view.limits.force_max, state.contacts[i]
     if not _touches(contact) or contact.force <= bound:
         return ""
-    return f"{FINGERS[i]} tip force is {contact.force:.1f} N, above {bound:g} N"
+    return f"the {FINGERS[i]} tip force is {contact.force:.1f} N, above {bound:g} N"
 
 
 @Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors").each
@@ -532,7 +532,8 @@ def _tip_displacement(view: View, state: State, fraction: float, i: int) -> str:
     bound, contact = fraction * view.limits.d_max, state.contacts[i]
     if not _touches(contact) or contact.d <= bound:
         return ""
-    return f"{FINGERS[i]} tip displacement is {contact.d * 1e3:.2f} mm, above {bound * 1e3:g} mm"
+    d, largest = contact.d * 1e3, bound * 1e3
+    return f"the {FINGERS[i]} tip displacement is {d:.2f} mm, above {largest:g} mm"
 
 
 _TILT_TEXT = "|θ|; the limit is asin(1 − d/a) minus a margin"
@@ -557,16 +558,16 @@ def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
         return ""
     if not contact.inside and view.settings.tip.physics != "springs":
         tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
-        deep = f"{FINGERS[i]} tip is {contact.d * 1e3:.2f} mm deep at a tilt of {tilt:.1f}°"
-        return f"{deep}, which is outside the range of its contact model"
+        deep = f"the {FINGERS[i]} tip is {contact.d * 1e3:.2f} mm deep at a tilt of {tilt:.1f}°"
+        return f"{deep}, outside the range of its contact model"
     limit = fraction * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
-    tilt = math.degrees(contact.theta)
-    return f"{FINGERS[i]} tip tilt is {tilt:.1f}°, above {math.degrees(limit):.1f}° at this depth"
+    tilt, largest = math.degrees(contact.theta), math.degrees(limit)
+    return f"the {FINGERS[i]} tip tilt is {tilt:.1f}°, above {largest:.1f}° at this depth"
 
 
 # --- sensors --------------------------------------------------------------------------------------
 
-LIMITS.append(Limit("tactile.late", "age of the last valid frame; older frames freeze the goal",
+LIMITS.append(Limit("tactile.late", "age of the last valid frame; the goal is frozen above it",
     "limit", ("safety.frame_age_hold",), "sensors", gripping=True))  # fmt: skip
 
 
@@ -606,24 +607,25 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
         if abs(turned) <= ANGLE_JUMP:
             what = f"{deeper:+.1f} mm in d"
         return (
-            f"{side} sensor reports a jump of {what}, which is inconsistent with the joints and "
-            "the other tip: the sensor has shifted, its frames are old, or its tip is at the "
+            f"the {side} sensor reports a jump of {what}, which is inconsistent with the joints "
+            "and the other tip: the sensor has shifted, its frames are old, or the tip is at the "
             "object's edge"
         )
     if found.has_bias[finger] and view.holds(state):
         off, turned = 1e3 * found.d_bias[finger], math.degrees(found.angle_bias[finger])
         if abs(found.angle_bias[finger]) > ANGLE_BIAS_MIN:
             return (
-                f"{side} sensor's angle differs by {turned:+.0f}° from the rolling angle computed "
-                "from the joints: its image has shifted"
+                f"the angle measured by the {side} sensor differs by {turned:+.0f}° from the "
+                "rolling angle computed from the joints: the sensor's image has shifted"
             )
         return (
-            f"{side} sensor's displacement is {abs(off):.1f} mm {'less' if off < 0.0 else 'more'} "
-            "than computed from the joint's angle and torque: tare the sensor"
+            f"the displacement measured by the {side} sensor is {abs(off):.1f} mm "
+            f"{'less' if off < 0.0 else 'more'} than the value computed from the joint's angle and "
+            "torque: tare the sensor"
         )
     for sensor in view.sensors:
         if sensor.finger == finger and sensor.repeats.is_fault:
-            return f"{side} sensor repeats its last {sensor.repeats.period} frames"
+            return f"the {side} sensor repeats its last {sensor.repeats.period} frames"
     return ""
 
 
@@ -637,7 +639,7 @@ def _gain_fault(view: View, finger: int) -> str:
     if not abs(off) - unsure > _GAIN_SIGMA * grasp.gain_prior_std[finger]:
         return ""
     return (
-        f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of the pressure expected from the "
+        f"the {FINGERS[finger]} sensor reads {math.exp(off):.0%} of the pressure expected from the "
         "joints and the other tip: tare or calibrate the sensor"
     )
 
@@ -655,14 +657,15 @@ def _add_consistency_checks(finger: int, side: str) -> None:
             _gain_fault(view, finger) if view.holds(state) else ""
         )
 
-    @Limit(f"consistency.{side}_current", "difference between a joint's measured current in "
-        "a grip and its goal", "warn", (), "servos", in_turn=True)  # fmt: skip
+    @Limit(f"consistency.{side}_current", "difference between the measured current and the "
+        "goal current of a joint in a grip", "warn", (), "servos", in_turn=True)  # fmt: skip
     def _current(view: View, state: State, _: float) -> str:
         if not view.grasp.current_off_time[finger] > CURRENT_OFF_TIME_MAX:
             return ""
         return (
-            f"{side} joint's measured current is {state.reading.current[finger]:.2f} A, but its "
-            f"goal is {state.goal.current[finger]:.2f} A: the measured current is ignored"
+            f"the {side} joint's measured current is {state.reading.current[finger]:.2f} A, but "
+            f"its goal current is {state.goal.current[finger]:.2f} A: the measured current is "
+            "ignored"
         )
 
 
@@ -676,7 +679,7 @@ def _force_response(view: View, state: State, _: float) -> str:
     if not state.t - view.rise_t > _RESPONSE_TIME:
         return ""
     return (
-        f"commanded force rose to {state.goal.force:.1f} N, but the measured force stayed at "
+        f"the commanded force rose to {state.goal.force:.1f} N, but the measured force stayed at "
         f"{view.rise_felt:.1f} N"
     )
 
@@ -688,7 +691,7 @@ def _tactile_frozen(view: View, state: State, _: float) -> str:
         same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed_time
         if same > view.limits.frozen_after > 0.0 and state.contacts[sensor.finger].contact:
             side = FINGERS[sensor.finger]
-            return f"tactile: {side} sensor is frozen: it has sent the same frame for {same:.2f} s"
+            return f"tactile: the {side} sensor has sent the same frame for {same:.2f} s"
     return ""
 
 
@@ -709,13 +712,13 @@ def _tactile_saturated(view: View, _: State, fraction: float) -> str:
     return ""
 
 
-@Limit("tactile.misfit", "frames that do not fit any contact of the model", "warn",
+@Limit("tactile.misfit", "frames that do not match the contact model", "warn",
     ("tactile.noise",), "sensors", in_turn=True, lasts=0.5).each  # fmt: skip
 def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
     if not state.contacts[i].misfit:
         return ""
     return (
-        f"tactile: the {FINGERS[i]} sensor's frames do not fit the contact model, so d and theta "
+        f"tactile: the {FINGERS[i]} sensor's frames do not match the contact model, so d and theta "
         "may be biased: check the tip material, the cell gains and tactile.noise"
     )
 
@@ -784,8 +787,8 @@ def _grip_slip(view: View, state: State, fraction: float) -> str:
     if not view.holds(state) or shear <= fraction * usable:
         return ""
     return (
-        f"shear force is {shear:.2f} times the grip force, above the limit of {usable:.2f}: the "
-        "object may slip"
+        f"the shear force is {shear:.2f} times the grip force, above the limit of {usable:.2f}: "
+        "the object may slip"
     )
 
 

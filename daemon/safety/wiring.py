@@ -76,7 +76,8 @@ class WiringWatch:
         if turned or pressed:
             self.swapped = (
                 f"the {FINGERS[finger]} tip moves with the {FINGERS[other]} joint while the "
-                f"{FINGERS[finger]} joint is stationary: check whether servos.ids are swapped"
+                f"{FINGERS[finger]} joint is stationary: check whether the servo IDs are swapped "
+                "(servos.ids)"
             )
 
     def _check_turn(self, state: State) -> None:
@@ -91,6 +92,6 @@ class WiringWatch:
         against = self._sense * (self._turn - angle)
         if state.object.valid and against > _WRONG_ROTATION:
             self.swapped = (
-                f"the object rotated by {math.degrees(against):.0f}° opposite to the commanded "
-                "direction: check whether servos.ids are swapped"
+                f"the object rotated by {math.degrees(against):.0f}° in the direction opposite to "
+                "the command: check whether the servo IDs are swapped (servos.ids)"
             )

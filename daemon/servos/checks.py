@@ -214,11 +214,11 @@ def notice_servo(
         (
             servos.fault_after > _FAULT_AFTER_LONG,
             f"servos.fault_after = {servos.fault_after:g} s: if replies are missing, the last "
-            "reading is used for this long",
+            "reading is used for up to this time",
         ),
         (
             table[reg.DRIVE_MODE] & DRIVE_REVERSE,
-            "its drive mode is reversed, which adds to the reversal by servos.direction",
+            "its drive mode is reversed in addition to the reversal by servos.direction",
         ),
         (table[reg.TORQUE_ENABLE], "torque is already on and stays on until `disarm` or `arm`"),
         (
@@ -253,8 +253,8 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
         found.append(Finding("warn", name, text, f"control.torque_constant = {constant:.3g}"))
     if model.gear_loss and not settings.control.joint_load_friction:
         text = (
-            f"gear friction consumes {model.gear_loss:g} of the transmitted torque, so a grip may "
-            "never settle"
+            f"gear friction consumes {model.gear_loss:.0%} of the transmitted torque, so a grip "
+            "may never settle"
         )
         fix = f"control.joint_load_friction = {model.gear_loss:g}"
         found.append(Finding("warn", name, text, fix))
@@ -325,5 +325,5 @@ def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Findin
     status: Status = "FAIL" if latency * 1e-3 >= reply_timeout else "warn"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     return Finding(
-        status, subject, f"{latency} ms, expected 1 ms: every read takes at least this long", fix
+        status, subject, f"{latency} ms, expected 1 ms: every read waits for this timer", fix
     )

@@ -153,8 +153,8 @@ def judge_exchanges(
     text = f"{what}: p50 {_ms(times.p50)}, p99 {_ms(times.p99)}, {failed}"
     if decisive > min(1.0 / rate, allowed):
         text += (
-            f"; expected at most one tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}) and at most "
-            f"{_ms(allowed)} (servos.reply_timeout)"
+            f"; expected at most {_ms(1.0 / rate)}, the period of a tick (loop.rate = {rate:g}), "
+            f"and at most {_ms(allowed)} (servos.reply_timeout)"
         )
         return Finding("FAIL", "exchange", text, _remedy(decisive, settings))
     if times.failed > _FAILED_FRACTION_WARN:
@@ -163,7 +163,8 @@ def judge_exchanges(
         return Finding(status, "exchange", text, fix)
     if decisive * rate > _REPLY_FRACTION_MAX:
         text += (
-            f", too much of a tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
+            f"; this takes most of a tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}), so ticks "
+            "will be late"
         )
         return Finding("warn", "exchange", text, _remedy(decisive, settings))
     return Finding("pass", "exchange", text)
@@ -176,12 +177,12 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
     if least * rate <= _REPLY_FRACTION_MAX:
         return []
     text = (
-        f"the servos take at least {_ms(least)} to reply, {least * rate:.0%} of a tick of "
+        f"the servos take at least {_ms(least)} to reply, which is {least * rate:.0%} of a tick of "
         f"{_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
     )
     fix = (
-        f"{_remedy(least, settings)}; to measure the reply times, run `softfinger doctor`, "
-        f"which times {EXCHANGE_COUNT} exchanges"
+        f"{_remedy(least, settings)}; run `softfinger doctor` to measure the reply times of "
+        f"{EXCHANGE_COUNT} exchanges"
     )
     return [Finding("warn", "servos", text, fix)]
 

@@ -148,5 +148,5 @@ def _why_not(path: str, error: Exception) -> str:
     if code == errno.EACCES:
         return f"{path}: no permission: {grant(path)}"
     if code in (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK) or "lock" in str(error).lower():
-        return f"{path}: the port is in use by another process: end that process first"
+        return f"{path}: the port is in use by another program: end that program first"
     return f"{path}: can't be opened: {error}"

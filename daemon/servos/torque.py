@@ -193,7 +193,7 @@ class Torque:
             raw = self._line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
             if raw is None:
                 found.append(
-                    Finding("FAIL", joint.name, "no reply", "check its cable and power supply")
+                    Finding("FAIL", joint.name, "no reply", "check its power supply and cable")
                 )
             elif raw[0]:
                 error = f"hardware error: {reg.hardware_error_names(raw[0])}"

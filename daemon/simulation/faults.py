@@ -227,16 +227,16 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     match = _WORD.fullmatch(word)
     side, kind, text, start, end = match.groups() if match else (None, "", None, None, None)
     if side is not None and side not in FINGERS:
-        raise refused(f"expected the prefix left: or right:, found {side}:")
+        raise refused(f"found the prefix {side}:, expected left: or right:")
     value = None if text is None else _number(text)
     if value is not None and not math.isfinite(value):
         raise refused(f"{text!r} is not a number")
     after = 0.0 if start is None else _number(start)
     if not 0.0 <= after < math.inf:
-        raise refused(f"start {start!r} is not a valid time, expected at least 0 s")
+        raise refused(f"found the start time {start!r}, expected at least 0 s")
     until = after if end is None else _number(end)
     if not after <= until < math.inf:
-        raise refused(f"end {end!r} is not a valid time, expected at least {start} s")
+        raise refused(f"found the end time {end!r}, expected at least {start} s")
     form = next((each for each in _FORMS if each.fits(side, kind, value is not None)), None)
     if form is None:
         known = (f"{', '.join(each.kinds)} {each.value}".strip() for each in _FORMS)

@@ -146,6 +146,6 @@ class DelimitedDecoder(Decoder):
 
     def diagnosis(self) -> str:
         if self._reason:
-            return f"{self._reason}; expected {self._grid()}"
+            return f"found {self._reason}, expected {self._grid()}"
         end = self._delimiter.hex().upper()
-        return f"no packet ended with {end}; check the board and its baud rate"
+        return f"found no packet that ends with {end}; check the board and its baud rate"

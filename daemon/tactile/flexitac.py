@@ -98,15 +98,20 @@ class FlexiTacDecoder(Decoder):
         if found:
             side = round(found**0.5)
             shape = f"{found} cells" + (f" ({side} × {side} if square)" if side**2 == found else "")
-            return f"frames of {shape}, expected {expected}: set tactile.rows and tactile.cols"
+            return (
+                f"found frames of {shape}, expected {expected}: set tactile.rows and tactile.cols"
+            )
         if self._ambiguous:
             return (
-                f"the marker AA 55 occurs several times in each frame of {expected}, so the frame "
+                f"found the marker AA 55 several times in each frame of {expected}, so the frame "
                 "boundary is ambiguous: load the sensor differently"
             )
         if self._markers:
-            return f"found markers AA 55, but not at the distance of one frame of {expected}"
-        return f"no marker AA 55; expected frames of {expected}: check the board and its baud rate"
+            return f"found markers AA 55, but not at intervals of one frame of {expected}"
+        return (
+            f"found no marker AA 55, expected frames of {expected}: check the board and its baud "
+            "rate"
+        )
 
     def _search(self) -> bool:
         """Move the buffer start to a confirmed marker; return False if more bytes are needed."""

@@ -125,9 +125,9 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
         else:
             parts.append(_frames(file))
     if not parts:
-        raise ValueError("found no .npy file with a frame in this folder")
+        raise ValueError("this folder does not contain an .npy file with a frame")
     if len({part.shape[1:] for part in parts}) > 1:
-        raise ValueError("found frames of different shapes in this folder")
+        raise ValueError("this folder contains frames of different shapes")
     return {"frames": np.concatenate(parts), **arrays}
 
 
@@ -169,14 +169,15 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
     stacks = [name for name, (shape, kind) in shapes.items() if len(shape) == 3 and kind in "uif"]
     if len(stacks) == 1:
         notes.append(
-            f"found no array 'frames'; using {stacks[0]!r}, the only three-dimensional array"
+            f"the file does not contain an array 'frames'; using {stacks[0]!r}, the only "
+            "three-dimensional array"
         )
         return stacks[0]
     described = [f"{name} {shape}" for name, (shape, _) in [*shapes.items()][:_LISTED_COUNT_MAX]]
     described += ["…"] * (len(names) > _LISTED_COUNT_MAX)
     raise ValueError(
-        f"found no array 'frames', but {', '.join(described) or 'no other array'}; rename the "
-        "array of shape [n, rows, cols] to frames"
+        f"found {', '.join(described) or 'no arrays'}, expected an array 'frames' of shape [n, "
+        "rows, cols]; rename the array that contains the frames"
     )
 
 
@@ -218,8 +219,8 @@ def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
         raise ValueError(
-            f"found a header with the shape {shape} of {kind}, expected at most as much data as "
-            "the file contains"
+            f"the header states the shape {shape} of {kind}, but the file does not contain that "
+            "much data"
         )
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
@@ -314,8 +315,8 @@ def _check_below(
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     share = np.count_nonzero(frames < 0) / (len(frames) * np.count_nonzero(live))
     notes.append(
-        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: this is noise after a "
-        "tare, and these readings are set to 0"
+        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: they are treated as "
+        "noise after a tare and set to 0"
     )
 
 
@@ -335,7 +336,7 @@ def _row(arrays: dict[str, NDArray[Any]], name: str, count: int) -> NDArray[Any]
         kind = f"{array.dtype} of shape {array.shape}"
         raise ValueError(f"{name}: found {kind}, expected {count} numbers")
     if not np.isfinite(array).all():
-        raise ValueError(f"{name}: not finite")
+        raise ValueError(f"{name}: found a number that is not finite")
     return array
 
 
@@ -403,5 +404,5 @@ def _clipped(found: FrameRecording, scale: float, full: int) -> str:
     unit = "counts" if found.whole else f"counts of {scale:g} Pa"
     return (
         f"{cells} cells have the same maximum reading, {top} {unit}: if these cells are "
-        f"saturated, set tactile.full_count = {top}; otherwise the estimated d is too large"
+        f"saturated, set tactile.full_count = {top}, because d would be overestimated otherwise"
     )

@@ -37,8 +37,8 @@ class GloveDecoder(DelimitedDecoder):
         # Bytes below the offset wrap around to large values here.
         if packet[0] < _OFFSET or halves.max() >= self._values:
             self._reason = (
-                "a byte that is not half of a count; set tactile.full_count = 4095 if the board "
-                "sends 12-bit counts"
+                "a byte that is not a valid half of a count (set tactile.full_count = 4095 if the "
+                "board sends 12-bit counts)"
             )
             return None
         counts = halves[0::2].astype(np.uint16)

@@ -31,7 +31,7 @@ def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> s
         return ""
     x, y = (each * 1e3 for each in recording.pitch)
     return (
-        f"found cells of {x:.4g} × {y:.4g} mm in its header, expected {wanted[0] * 1e3:.4g} × "
+        f"found cells of {x:.4g} × {y:.4g} mm in the header, expected {wanted[0] * 1e3:.4g} × "
         f"{wanted[1] * 1e3:.4g} mm as in tactile.pitch: set tactile.pitch = {x * 1e-3:.6g}, "
         f"tactile.pitch_y = {y * 1e-3:.6g}"
     )
@@ -96,7 +96,7 @@ class ReplayTactile:
         if recording.counts.shape[1:] != (settings.rows, settings.cols):
             rows, cols = recording.counts.shape[1:]
             raise TactileError(
-                f"{path}: frames of {rows} × {cols} cells, expected {settings.rows} × "
+                f"{path}: found frames of {rows} × {cols} cells, expected {settings.rows} × "
                 f"{settings.cols}: set tactile.rows and tactile.cols"
             )
         if wrong := pitch_difference(recording, (settings.pitch, settings.pitch_y)):

@@ -179,7 +179,7 @@ class SerialReader:
                 f"no data {within}: check the board's power supply, tactile.port and tactile.baud "
                 f"= {self.settings.baud}"
             )
-        return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
+        return f"no valid frame in {self._bytes} bytes {within}: {self._decoder.diagnosis()}"
 
     def _run(self, port: int, stop: int) -> None:
         """Read frames in the reader thread, which blocks in the kernel between reads."""
@@ -271,7 +271,7 @@ def open_port(path: str, baud: int) -> serial.Serial:
         elif number in (errno.EACCES, errno.EPERM):
             why = f"no permission to open it: {grant(path)}"
         elif number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
-            why = "the port is in use by another program; end that program first"
+            why = "the port is in use by another program: end that program first"
         else:
             why = f"can't be opened as a serial port ({error})"
     except (OSError, ValueError) as error:

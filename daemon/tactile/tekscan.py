@@ -110,7 +110,11 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     wrong = np.argwhere((np.abs(values) > _READING_MAX) | (raw & (values < 0.0)))
     if wrong.size:
         k, i, j = wrong[0].tolist()
-        raise TekscanError(f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}")
+        low = 0.0 if raw else -_READING_MAX
+        raise TekscanError(
+            f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}, expected {low:g} "
+            f"to {_READING_MAX:g}"
+        )
     full = _RAW_SATURATION if raw and values.max() <= _RAW_SATURATION else math.inf
     if not raw:
         rounding = 0.5 * factor * 10.0 ** -_digits(values)
@@ -169,7 +173,8 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
             header[key] = value
             in_comments = key.startswith("COMMENT")
     raise TekscanError(
-        "found no line ASCII_DATA, expected a Tekscan-style export, or an .npz or .npy file"
+        "the file does not contain a line ASCII_DATA; expected a Tekscan-style export, or an .npz "
+        "or .npy file"
     )
 
 
@@ -194,10 +199,11 @@ def _frames(
                     raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
             else:
                 if frames and len(frames[-1]) < rows:
-                    had = f"found {len(frames[-1])}, expected {rows}"
-                    raise TekscanError(f"line {number}: rows of frame {numbers[-1]}: {had}")
+                    had = f"frame {numbers[-1]} has {len(frames[-1])} of {rows} rows"
+                    raise TekscanError(f"line {number}: {had}")
                 if numbers and int(match[1]) <= numbers[-1]:
-                    raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
+                    what = f"frame {match[1]} after frame {numbers[-1]}"
+                    raise TekscanError(f"line {number}: found {what}, expected increasing numbers")
                 numbers.append(int(match[1]))
                 frames.append([])
                 places.append([])
@@ -215,7 +221,7 @@ def _frames(
         raise TekscanError("the file does not contain any frames")
     if len(frames[-1]) < rows:
         raise TekscanError(
-            f"the file ends in frame {numbers[-1]}: {len(frames[-1])} rows of {rows}"
+            f"the file ends in frame {numbers[-1]}, which has {len(frames[-1])} of {rows} rows"
         )
     return numbers, frames, places
 
@@ -251,11 +257,11 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
         elif cols < len(cells) < 2 * cols and all(each.isdigit() or each == "B" for each in cells):
             raise TekscanError(
-                f"line {number}: {len(cells)} cells, expected {cols}: the comma is both the "
+                f"line {number}: found {len(cells)} cells, expected {cols}: the comma is both the "
                 "separator and the decimal sign; export with decimal points or another separator"
             )
     if len(cells) != cols:
-        raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
+        raise TekscanError(f"line {number}: found {len(cells)} cells, expected {cols}")
     try:
         values = np.array([-math.inf if cell == "B" else _number(cell) for cell in cells])
     except ValueError as error:

@@ -39,7 +39,7 @@ KINDS: dict[str, EventKind] = {
     "settings": EventKind(
         "warning",
         "A setting is allowed but probably wrong, for example a sensor smaller than the footprint.",
-        "Correct the keys named in the text. To see the warning again, run `softfinger config "
+        "Correct the settings named in the text. To see the warning again, run `softfinger config "
         "check`.",
     ),
     "calibration": EventKind(
@@ -99,8 +99,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "slip": EventKind(
         "warning",
-        "The object slips or rotates in the grip. The event also reports that the grip force "
-        "was increased, or a rotation was stopped, to prevent slip.",
+        "The object slips or rotates in the grip, or the grip force was increased or a rotation "
+        "was stopped to prevent slip.",
         "Grasp with more force; check `control.tip_friction` and `control.object_load`.",
     ),
     "grip.slip": EventKind(
@@ -122,7 +122,7 @@ KINDS: dict[str, EventKind] = {
     # Servos
     "servos": EventKind(
         "info, warning",
-        "The servos were reconnected. A warning lists the problems that were found in the process.",
+        "The servos were reconnected. A warning lists the problems that were found.",
         "Run `softfinger doctor --fix`, which corrects most problems.",
     ),
     "servos.bus": EventKind(
@@ -133,7 +133,8 @@ KINDS: dict[str, EventKind] = {
     "servos.silent": EventKind(
         "warning, error",
         "No valid reading arrived within `servos.fault_after`. If the level is warning, most "
-        "readings in the last second failed; this is also checked while the hand is disarmed.",
+        "readings in the last second failed. The warning is also issued while the hand is "
+        "disarmed.",
         "Run `softfinger doctor`, which measures the reply times and checks the supply voltage. "
         "Check the cables.",
     ),
@@ -172,12 +173,12 @@ KINDS: dict[str, EventKind] = {
     "goal.number": EventKind(
         "error",
         "The controller computed a goal that is not a finite number. The goal was not sent.",
-        "Report this error together with a recording.",
+        "Report this error, and attach a recording.",
     ),
     "torque.off": EventKind(
         "error, info",
-        "The servos have not confirmed torque off. A later event of level info reports the "
-        "confirmation.",
+        "The servos have not confirmed torque off. When they confirm it, an event of level info "
+        "follows.",
         "Switch off the supply, then find out why the servos do not reply.",
     ),
     # Joints
@@ -193,7 +194,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "joint.jump": EventKind(
         "error",
-        "A joint angle changed faster than its velocity allows.",
+        "A joint angle does not follow the measured velocity of the joint.",
         "Check the encoder and the cable of the servo.",
     ),
     "joint.dead": EventKind(
@@ -213,13 +214,15 @@ KINDS: dict[str, EventKind] = {
     ),
     "joint.swapped": EventKind(
         "error",
-        "A joint moves the tip of the other finger, or the object rotates opposite to its command.",
-        f"Swap `servos.ids`, `zero` and `direction`. {_CALIBRATE_JOINTS}",
+        "A joint moves the tip of the other finger, or the object rotates in the direction "
+        "opposite to the command.",
+        f"Swap the left and right values of `servos.ids`, `servos.zero` and `servos.direction`. "
+        f"{_CALIBRATE_JOINTS}",
     ),
     "joint.opens": EventKind(
         "warning",
-        "According to the joint angles the tips overlap during the approach, but one of them "
-        "has no contact.",
+        "According to the joint angles, the tips overlap during the approach, but at least one "
+        "tip has no contact.",
         f"Correct `servos.direction`, or `servos.zero`. {_CALIBRATE_JOINTS}",
     ),
     "joint.blocked": EventKind(
@@ -250,16 +253,17 @@ KINDS: dict[str, EventKind] = {
     ),
     "tactile": EventKind(
         "info, warning",
-        "A sensor was reopened. A warning states why this failed, or reports a sensor size that "
-        "does not match the tip, or a problem in a replayed file.",
+        "A sensor was reopened. The level is warning if a sensor could not be reopened, if the "
+        "sensor size does not match the tip, or if a replayed file has a problem.",
         "Check the cable and `tactile.port`. For a size mismatch, check `tactile.rows`, `cols`, "
         "`pitch` and `tip.radius`.",
     ),
     "tactile.silent": EventKind(
         "error",
         "No valid frame arrived within `safety.frame_age_fault`.",
-        "The text states the reason, and the cell noise if it exceeds `tactile.noise`. Check "
-        "the cable, and check the board with `softfinger doctor`.",
+        "The text states the reason. If the cell noise exceeds `tactile.noise`, the text also "
+        "states the measured noise. Check the cable, and check the board with `softfinger "
+        "doctor`.",
     ),
     "tactile.frozen": EventKind(
         "error",
@@ -280,7 +284,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "tare": EventKind(
         "info, warning",
-        "A tare has ended. The text states the median and the largest change of the zero "
+        "A tare has ended. The text states the median change and the largest change of the zero "
         "offsets. If the level is warning, the sensor was not tared because most cells are "
         "saturated without contact.",
         "If the level is warning, check the board's gain and `tactile.full_count`. If the "
@@ -296,7 +300,7 @@ KINDS: dict[str, EventKind] = {
         "error",
         "The measured width of the held object has changed, which means that a sensor or a "
         "joint's zero has shifted.",
-        f"Fasten it. {_CALIBRATE_JOINTS}",
+        f"Check the mounting of the sensors. {_CALIBRATE_JOINTS}",
     ),
     "hand.force": EventKind(
         "warning", "The two tips measure different forces in the same grip.", _CHECK_SENSOR
@@ -313,12 +317,12 @@ KINDS: dict[str, EventKind] = {
     ),
     "consistency.left_current": EventKind(
         "warning",
-        "The left joint's measured current differs from its goal.",
+        "The left joint's measured current differs from its goal current.",
         "Check the supply and the current sensor of the servo.",
     ),
     "consistency.right_current": EventKind(
         "warning",
-        "The right joint's measured current differs from its goal.",
+        "The right joint's measured current differs from its goal current.",
         "Check the supply and the current sensor of the servo.",
     ),
     "consistency.force": EventKind(

@@ -166,7 +166,8 @@ def load_server(folder: Path) -> ServerKeys:
     clients = {_keys(path)[0]: path.stem for path in files}
     if not clients:
         raise KeyFileError(
-            f"{place / 'clients'}: found no client keys; create client keys with `softfinger keys`"
+            f"{place / 'clients'}: the folder does not contain client keys; create keys with "
+            "`softfinger keys`"
         )
     return ServerKeys(public, secret, clients)
 

@@ -92,8 +92,8 @@ def tare(frames: ArrayLike) -> Tare:
     restless = np.count_nonzero(noise > _UNREST_SIGMA * max(float(np.median(noise)), 0.5))
     if restless >= _UNREST_CELL_COUNT:
         raise CalibrationError(
-            f"tare: found changing readings in {restless} cells, expected constant readings; "
-            "check that the tip is not in contact"
+            f"tare: the readings of {restless} cells change, expected constant readings; check "
+            "that the tip is not in contact"
         )
     zero = stack.mean(axis=0)
     excess = float(np.maximum(stack - zero, 0.0).mean())
@@ -157,12 +157,14 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     if the frames show no pressure.
     """
     if not loads:
-        raise CalibrationError("equilibrate: found no uniform pressure, expected at least one")
+        raise CalibrationError("equilibrate: expected at least one uniform pressure")
     readings = np.stack([_stack(load, "equilibrate").mean(axis=0) - zero for load in loads])
     response = readings.sum(axis=0)
     typical = float(np.median(response))
     if not typical > 0.0:
-        raise CalibrationError("equilibrate: most cells read no pressure above their zero offset")
+        raise CalibrationError(
+            "equilibrate: the readings of most cells do not exceed their zero offset"
+        )
     active = response > DEAD_RESPONSE * typical
     target = np.array([reading[active].mean() for reading in readings])
     if (target <= 0.0).any():
@@ -393,12 +395,10 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
-        raise CalibrationError("modulus: expected a d and a force for each frame")
+        raise CalibrationError("modulus: expected values of d and force for each frame")
     used = (depth > 0.0) & (load > 0.0)
     if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
-        raise CalibrationError(
-            "modulus: expected at least three frames in contact with different d"
-        )
+        raise CalibrationError("modulus: expected at least three frames in contact at different d")
     depth, tilt, load = depth[used], tilt[used], load[used]
     if not np.polyfit(depth, load, 1)[0] > 0.0:
         raise CalibrationError("modulus: the force does not increase with d")
@@ -464,16 +464,15 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
     """
     at, load = np.asarray(t, np.float64), np.asarray(force, np.float64)
     if at.size < 8 or not load.max() > 0.0:
-        raise CalibrationError(
-            "relaxation: expected at least eight frames of a single press that is held"
-        )
+        raise CalibrationError("relaxation: expected at least eight frames of a press that is held")
     noise = float(np.std(np.diff(load[at.size // 2 :]))) / math.sqrt(2.0)
     held = int(np.argmax(load >= load.max() - _SIGNIFICANT_SIGMA * noise))  # start of the hold
     told = [k for k, time in enumerate(times) if time > 2.0 * (at[-1] - at[0]) / (at.size - 1)]
     if told and at[-1] - at[held] < _HOLD_RATIO_MIN * max(times[k] for k in told):
         raise CalibrationError(
-            f"relaxation: found {at[-1] - at[held]:.1f} s of holding, expected at least "
-            f"{_HOLD_RATIO_MIN:g} times the longest of tip.relaxation_times, {max(times):g} s"
+            f"relaxation: the press was held for {at[-1] - at[held]:.1f} s, expected at least "
+            f"{_HOLD_RATIO_MIN * max(times):g} s ({_HOLD_RATIO_MIN:g} times the longest time in "
+            "tip.relaxation_times)"
         )
     lasting = np.maximum(load, 0.0)
     lasting[held:] = load[-1]
@@ -501,7 +500,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
 def _stack(frames: ArrayLike, step: str) -> FloatArray:
     stack = np.asarray(frames, np.float64)
     if stack.ndim != 3 or not len(stack):
-        raise CalibrationError(f"{step}: expected frames [n, rows, cols], got {stack.shape}")
+        raise CalibrationError(f"{step}: found shape {stack.shape}, expected [n, rows, cols]")
     if not np.isfinite(stack).all():
         raise CalibrationError(f"{step}: found readings that are not finite")
     return stack

@@ -115,8 +115,9 @@ def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
         )
     if np.ptp(run.force[run.pressed]) < _LOADED * _noise([run]):
         raise CalibrationError(
-            f"found a force of {np.ptp(run.force):.3g} N with a scatter of {_noise([run]):.2g} N, "
-            f"expected {_LOADED:g} times the scatter: check that the tip was loaded"
+            f"found a force of {np.ptp(run.force[run.pressed]):.3g} N, expected at least "
+            f"{_LOADED * _noise([run]):.2g} N ({_LOADED:g} times the scatter of the force): check "
+            "that the tip was loaded"
         )
     return run
 
@@ -141,7 +142,7 @@ def rising(d: FloatArray) -> tuple[slice, int]:
     found = [(i, j) for i, j in itertools.pairwise(turns) if d[j] > d[i] and d[j] >= top]
     if not found:
         raise CalibrationError(
-            "found only decreasing d, which is unloading; expected d to increase during compression"
+            "d only decreases, as it does during unloading; expected a run in which d increases"
         )
     start, peak = found[-1]
     reached = np.argmax(d[start : peak + 1] >= d[peak] - 0.25 * _SLACK * span)
@@ -172,7 +173,7 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
     most = float(rise.max())
     if most <= 0.0 or rise[np.argmax(d)] < 0.5 * most:
         raise CalibrationError(
-            "found no force that increases with d, expected positive d and F in compression"
+            "the force does not increase with d; expected positive d and F in compression"
         )
     begin = float(d[0])
     for _ in range(4):  # Each pass improves the zero of F from the rows before contact, if any.
@@ -185,7 +186,7 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
         slope, start = np.polyfit(d[steep], rise[steep] ** _POWER, 1)
         if not slope > 0.0:
             raise CalibrationError(
-                "found a force that decreases with d, expected a force that increases with d"
+                "the force decreases with d; expected positive d and F in compression"
             )
         begin = float(-start / slope)
         before = d < begin - TOE * (d.max() - begin)
@@ -295,7 +296,7 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
         raise CalibrationError(_TOO_DEEP)
     strains = np.linspace(0.0, deepest / tip.radius, 50)
     if not (_power_law(factors, strains, 1) > 0.0).all():
-        raise CalibrationError("its modulus would not be positive")
+        raise CalibrationError("the modulus of this model would not be positive")
     left = force - jacobian @ np.concatenate([factors, np.zeros(len(runs)), zeros])
     freedom = max(len(force) - jacobian.shape[1], 1)
     variance = float(left @ left) / freedom

@@ -122,9 +122,8 @@ def duration_error(seconds: float) -> str:
 
 def _too_little(closing: float, opening: float) -> str:
     return (
-        f"found {closing:.1f} s of closing and {opening:.1f} s of opening above "
-        f"{_SLIDING_SPEED:g} rad/s without contact, expected at least {_MOTION_TIME_MIN:g} s of "
-        "each"
+        f"found {closing:.1f} s of closing and {opening:.1f} s of opening without contact at more "
+        f"than {_SLIDING_SPEED:g} rad/s, expected at least {_MOTION_TIME_MIN:g} s in each direction"
     )
 
 

@@ -64,7 +64,7 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
     if warmed < _RISE_MIN:
         raise CalibrationError(
-            f"heat: found {warmed:.0f} °C of temperature rise, expected at least {_RISE_MIN:g} "
+            f"heat: found a temperature rise of {warmed:.0f} °C, expected at least {_RISE_MIN:g} "
             "°C: hold the grip longer, or use more force"
         )
     grid = np.arange(at[0], at[-1], _STEP)

@@ -146,8 +146,8 @@ def _fit(
 
 def _too_little(widest: float) -> str:
     return (
-        f"found a d ramp of {widest * 1e3:.1f} mm computed from the joints, expected at least "
-        f"{_CLOSING_MIN * 1e3:g} mm while both tips are in contact"
+        f"found a change of d of {widest * 1e3:.1f} mm (computed from the joints), expected at "
+        f"least {_CLOSING_MIN * 1e3:g} mm while both tips are in contact"
     )
 
 

@@ -68,8 +68,8 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     ):
         raise CurvesError(
             f"found {len(d)} presses at {len(np.unique(d))} depths, {tilted.sum()} of them "
-            f"tilted; expected at least {_PRESS_COUNT_MIN} at 3 depths, including upright presses "
-            "and 2 presses tilted by 5° or more"
+            f"tilted; expected at least {_PRESS_COUNT_MIN} presses at 3 depths, including upright "
+            "presses and 2 presses tilted by 5° or more"
         )
     frames = [each for each, use in zip(presses.frames, used, strict=True) if use]
     first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
@@ -99,7 +99,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
             (t, q, times), y, np.hypot(sigma, _STAGE_ERROR * np.abs(y)), powers, squares, valid
         )
         if best is None:
-            raise CurvesError(f"no smooth increasing curve fits the {name} of the presses")
+            raise CurvesError(f"no smooth increasing curve fits the presses ({name})")
         return tuple(map(tuple, best.tolist()))
 
     one = np.ones(len(d))
@@ -138,8 +138,8 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     force_error, lever_error = max(missed[:2]), max(missed[2:])
     if max(force_error, lever_error / radius) > _CURVE_ERROR_MAX:
         raise CurvesError(
-            "the best smooth increasing curve deviates from the presses' force by "
-            f"{force_error:.1%} or from their centroid by {lever_error * 1e3:.2f} mm"
+            "the best smooth increasing curves deviate from the presses by "
+            f"{force_error:.1%} of the force and {lever_error * 1e3:.2f} mm of the centroid"
         )
     return replace(law, force_error=force_error, lever_error=lever_error)
 
@@ -159,7 +159,9 @@ def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """Return the covariance [4, 4] of one frame's sums, from the frames of each press."""
     if min(map(len, frames)) < 5:
-        raise CurvesError("expected at least five frames of each press to measure the noise")
+        raise CurvesError(
+            "expected at least five frames for each press, which are needed to measure the noise"
+        )
     each = [weights @ every.reshape(len(every), -1).T for every in frames]
     return np.asarray(np.mean([np.cov(sums) for sums in each], axis=0))
 

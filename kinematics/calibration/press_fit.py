@@ -80,9 +80,9 @@ class Trend:
     def cause(self) -> str:
         """Probable cause of the drift."""
         if self.drift > 0.0:
-            return "the tip stiffens more than this model; try a different base or face, or springs"
+            return "the tip stiffens more than the model; try a different base or face, or springs"
         return (
-            "the tip stiffens less than this model or softens; try a different base or face, or "
+            "the tip softens, or stiffens less than the model; try a different base or face, or "
             "solid"
         )
 

@@ -41,7 +41,7 @@ def _chosen_compiler() -> tuple[ModuleType, str]:
     """Return the compiler module and the reason for using `plain`, or an empty string."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         raise JitDisabled(
-            "NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset this variable"
+            "NUMBA_DISABLE_JIT is set, but the kernels must be compiled; unset this variable"
         )
     if ".".join(numba.__version__.split(".")[:2]) not in TESTED_NUMBA:
         return plain, (

@@ -94,7 +94,9 @@ def kept(folder: OwnFolder, name: str) -> bytes | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        warnings.warn(f"{folder.path}: compiling again: {error}", RuntimeWarning, stacklevel=2)
+        warnings.warn(
+            f"{folder.path}: the kernel will be recompiled: {error}", RuntimeWarning, stacklevel=2
+        )
         return None
 
 

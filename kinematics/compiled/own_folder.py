@@ -35,7 +35,7 @@ def fault(path: Path, found: os.stat_result) -> str:
     if not HAS_OWNERS:
         return ""
     if found.st_uid not in (0, os.geteuid()):
-        return f"{path}: belongs to user {found.st_uid}, expected the current user {os.geteuid()}"
+        return f"{path}: is owned by user {found.st_uid}, expected the current user, {os.geteuid()}"
     if found.st_mode & stat.S_ISVTX and stat.S_ISDIR(found.st_mode):
         return ""
     return _written_by_others(path, found)

@@ -76,22 +76,22 @@ class Fingertip:
             known = get_args(kind)
             if getattr(self, name) not in known:
                 expected = " or ".join(map(repr, known))
-                raise ValueError(f"{name} must be {expected}, not {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be {expected}, got {getattr(self, name)!r}")
         if not POISSON[0] <= self.poisson <= POISSON[1]:
             low, high = POISSON
-            raise ValueError(f"poisson must be between {low} and {high}, not {self.poisson!r}")
+            raise ValueError(f"poisson must be between {low} and {high}, got {self.poisson!r}")
         if (self.physics == "measured") != (self.law is not None):
             raise ValueError(
-                "law must be given if and only if physics is 'measured'; found physics "
+                "law must be given if and only if physics is 'measured', got physics "
                 f"{self.physics!r}"
             )
         radius = float(self.radius)
         if not (radius > 0.0 and math.isfinite(radius)):
-            raise ValueError(f"the tip's radius must be positive and finite, not {self.radius!r}")
+            raise ValueError(f"the tip's radius must be positive and finite, got {self.radius!r}")
         if radius > RADIUS_MAX:
             raise ValueError(
-                f"the tip's radius must be in metres, at most {RADIUS_MAX:g}, not {radius:g}; "
-                f"{radius:g} mm is {radius * 1e-3:g}"
+                f"the tip's radius must be in metres, at most {RADIUS_MAX:g}, got {radius:g}; "
+                f"{radius:g} mm is {radius * 1e-3:g} m"
             )
         object.__setattr__(self, "radius", radius)
 
@@ -144,7 +144,7 @@ def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
 def _real(value: ArrayLike) -> FloatArray:
     array = np.asarray(value)
     if array.dtype.kind not in "iuf":
-        raise TypeError(f"d and θ must be real numbers, not {value!r} ({array.dtype})")
+        raise TypeError(f"d and θ must be real numbers, got {value!r} ({array.dtype})")
     return np.asarray(array, dtype=np.float64)
 
 

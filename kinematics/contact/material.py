@@ -96,7 +96,7 @@ class Material:
         """Return Hooke's law with modulus E [Pa]. Raises MaterialError unless 0 < E < ∞."""
         value = float(modulus)
         if not (value > 0.0 and math.isfinite(value)):
-            raise MaterialError(f"the modulus must be positive and finite, not {modulus!r}")
+            raise MaterialError(f"the modulus must be positive and finite, got {modulus!r}")
         return cls((Fraction(value),), name="constant")
 
     @classmethod

@@ -39,7 +39,7 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
     y = np.asarray(stress, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape:
         raise MaterialError(
-            f"strain and stress must be two lists of equal length, not {x.shape} and {y.shape}"
+            f"strain and stress must be two lists of equal length, got {x.shape} and {y.shape}"
         )
     wrong = []
     bad = np.flatnonzero(~(np.isfinite(x) & np.isfinite(y)))
@@ -104,7 +104,7 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
     if misfit > _MISFIT_MAX:
         raise MaterialError(
             "no smooth monotonic law fits the points: the best law deviates from a point by "
-            f"{misfit * top:.4g} Pa of {top:.4g} Pa"
+            f"{misfit * top:.4g} Pa, and the maximum stress is {top:.4g} Pa"
         )
     rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])
     misses = np.abs(_integrals(x, len(modulus) - 1) @ modulus - y / top) * top

@@ -149,8 +149,8 @@ class ContactTable:
             return cls(solid_table(tip, material))
         if material.worst_force_error > _LAW_ERROR:
             warnings.warn(
-                "the smooth law deviates from the measured points by up to "
-                f"{material.fit_error:.4g} Pa, {material.worst_force_error:.1%} of the force; "
+                "the material law deviates from the measured points by up to "
+                f"{material.fit_error:.4g} Pa ({material.worst_force_error:.1%} of the force); "
                 f"expected at most {_LAW_ERROR:.0%}",
                 RuntimeWarning,
                 stacklevel=2,

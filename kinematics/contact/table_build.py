@@ -90,7 +90,7 @@ class LawTerms:
 def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
     """Build the smallest table that meets ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
-        raise TableError(f"the tolerance must be between 0 and 1, not {tolerance!r}")
+        raise TableError(f"the tolerance must be between 0 and 1, got {tolerance!r}")
     law, splits = LawTerms.of(material), 1
     while True:
         last = material.is_linear or splits == SPLITS_MAX
@@ -101,8 +101,8 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
             break
         splits *= 2
     raise TableError(
-        f"no contact table of this material meets {tolerance:.3g}; the lowest error is "
-        f"{table.max_error:.4g}"
+        f"no contact table for this material meets the tolerance {tolerance:.3g}; the lowest error "
+        f"is {table.max_error:.4g}"
     )
 
 

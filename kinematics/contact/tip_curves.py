@@ -62,11 +62,13 @@ class TipCurves:
         if not all(np.isfinite(getattr(self, each.name)).all() for each in fields(self)):
             raise ValueError("all numbers of a measured law must be finite")
         if not (0.0 < self.deepest <= self.radius and 0.0 < self.tilt < 0.5 * math.pi):
-            raise ValueError("a measured law must have a depth and a tilt range above 0")
+            raise ValueError("the maximum depth and tilt of a measured law must be above 0")
         shapes = dict.fromkeys(("push", "shown", "lever", "extent"), (POWERS, SQUARES))
         for name, shape in (shapes | {"rest": (4,), "noise": (4, 4)}).items():
             if np.shape(getattr(self, name)) != shape:
-                raise ValueError(f"{name}: expected the shape {shape}")
+                raise ValueError(
+                    f"{name} must have shape {shape}, got {np.shape(getattr(self, name))}"
+                )
         for name in ("push", "shown"):
             if not rises(getattr(self, name), self.root, self.square):
                 raise ValueError(f"{name} must increase with d")

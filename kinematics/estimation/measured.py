@@ -97,7 +97,7 @@ class MeasuredEstimator:
     ) -> None:
         law = tip.law
         if law is None or law.radius != tip.radius:
-            raise ValueError(f"expected a tip measured at its radius {tip.radius:g} m")
+            raise ValueError(f"tip must have a measured law for its radius, {tip.radius:g} m")
         alive = np.ones(grid.shape, np.bool_) if active is None else active
         self.grid = grid
         self._law = law

@@ -76,9 +76,9 @@ class HandGeometry:
         for name in ("pivot_separation", "finger_length", "tip_radius"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} must be a positive length, not {value!r}")
+                raise ValueError(f"{name} must be a positive length, got {value!r}")
         if not math.isfinite(self.finger_offset):
-            raise ValueError(f"finger_offset must be finite, not {self.finger_offset!r}")
+            raise ValueError(f"finger_offset must be finite, got {self.finger_offset!r}")
 
     @property
     def half_separation(self) -> float:
@@ -114,5 +114,5 @@ def vector(values: ArrayLike, length: int, name: str) -> FloatArray:
     """Return ``values`` as float64 (length,). Raises ValueError for a different shape."""
     out = np.asarray(values, dtype=np.float64)
     if out.shape != (length,):
-        raise ValueError(f"{name} must have shape ({length},), not {out.shape}")
+        raise ValueError(f"{name} must have shape ({length},), got {out.shape}")
     return out

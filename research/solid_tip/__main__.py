@@ -78,18 +78,18 @@ def main() -> None:
     """Compute the presses, fit the model, write the file and print its errors."""
     parser = argparse.ArgumentParser(prog="python -m research.solid_tip", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write, .npz")
-    parser.add_argument("--rings", type=int, default=64, help="elements along the arc")
+    parser.add_argument("--rings", type=int, default=64, help="number of elements along the arc")
     parser.add_argument(
-        "--sticking", type=int, default=48, help="elements along the face if it sticks"
+        "--sticking", type=int, default=48, help="number of elements along a sticking face"
     )
     parser.add_argument(
-        "--coarser", type=int, default=32, help="elements for estimating the error of the mesh"
+        "--coarser", type=int, default=32, help="number of elements for estimating the mesh error"
     )
     parser.add_argument(
-        "--held-out", type=int, default=32, help="elements of presses that are not fitted"
+        "--held-out", type=int, default=32, help="number of elements for unfitted presses"
     )
-    parser.add_argument("--nodes", type=int, default=4, help="values of ν")
-    parser.add_argument("--tolerance", type=float, default=1.2e-3, help="of the modes")
+    parser.add_argument("--nodes", type=int, default=4, help="number of values of ν")
+    parser.add_argument("--tolerance", type=float, default=1.2e-3, help="tolerance of the modes")
     parser.add_argument(
         "--folder", type=Path, required=True, help="folder for the results of presses"
     )

@@ -42,20 +42,21 @@ IN_ROOT = 5  # number of terms in √(d/a) for the effect of strain; the lowest 
 
 
 NOTES = """Hemisphere of neo-Hookean rubber, W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², pressed
-by a rigid plane: python -m research.solid_tip.strain. The plane is without friction, or sticks: it
-holds each point where it touched, coming straight along its normal from first touch on:
-T = N sin θ cos θ P[coef_0] is the force along (cos θ, 0, −sin θ) against the tip.
-Lengths in a, stresses in E; d ≤ 0.4 a, θ ≤ 36°, ν 0.45 … 0.4995. s = √(d/a), P a product of
-Chebyshev series in 2 s/s_max − 1, 2 (sin θ/sin theta_max)² − 1, and ν on nu_range:
+by a rigid plane, computed by python -m research.solid_tip.strain. The plane either has no friction
+or sticks. It moves along its normal, and a sticking plane holds each point where it first touched
+it; T = N sin θ cos θ P[coef_0] is then the force along (cos θ, 0, −sin θ) on the tip.
+Lengths are in units of a, stresses in units of E; d ≤ 0.4 a, θ ≤ 36°, ν 0.45 … 0.4995. s = √(d/a).
+P is a product of Chebyshev series in 2 s/s_max − 1, 2 (sin θ/sin theta_max)² − 1 and ν (nu_range):
 N = 4/(3 (1 − ν²)) s³ (1 + s P[push]), U = 8/(15 (1 − ν²)) s⁵ (1 + s P[energy]);
 p = F B_0(r) + N Σ P[coef_k] sin^m_k θ B_k(r) cos m_k φ; basis: means of B_k over rings;
 F = N cos θ (1 − sin² θ P[coef_0]), with coef_0 = 0 unless the face sticks.
-A shear force T on the face adds T B_T(r) cos(φ − φ_T); shear holds B_T's means over the rings
-(for a force at the pole of rubber at rest), as Chebyshev coefficients in ν.
-Base bonded: u = 0. Lying: u_z = 0 (held down: it may pull), free to slide but for a uniform shear
-that carries the tip's own; it presses where it has slid to, beyond 1, too. force_error,
-pressure_error: of N, and of the base pressure where it is smooth (within 0.95 a), against elements
-of other meshes, d to 0.35 a, θ to 20°. Largest and rms differences of what was fitted:
+A shear force T on the face adds T B_T(r) cos(φ − φ_T). shear contains the means of B_T over the
+rings (for a force at the pole of undeformed rubber), as Chebyshev coefficients in ν.
+Bonded base: u = 0. Lying base: u_z = 0 (held down, so tension is possible); it slides freely,
+except that a uniform shear carries the tip's own shear. The pressure also acts outside the radius 1
+where the base has slid. force_error and pressure_error are the errors of N and of the base pressure
+where the pressure is smooth (within 0.95 a), compared with other meshes, for d up to 0.35 a and θ
+up to 20°. Maximum and rms errors of the fit:
 {errors}"""
 # Errors determined from the presses in tests/harness/solid_reference.py. A coarse mesh hardly
 # resolves the rim of a tilted bonded base.
@@ -222,7 +223,7 @@ def main() -> None:
     parser.add_argument(
         "--folder", type=Path, required=True, help="folder for the results of presses"
     )
-    parser.add_argument("--tolerance", type=float, default=3e-3, help="of the modes")
+    parser.add_argument("--tolerance", type=float, default=3e-3, help="tolerance of the modes")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     nodes = fit.chebyshev_nodes(*fit.NU, 4)

@@ -63,9 +63,9 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
             "found a frame with an arrival time in the future"
         )
         if last is not None:
-            assert frame.seq > last.seq, f"found seq {frame.seq} after {last.seq}"
+            assert frame.seq > last.seq, f"found seq {frame.seq} after seq {last.seq}"
             assert frame.t_arrival >= last.t_arrival, (
-                "found a frame that arrived before the last one"
+                "found a frame that arrived before the previous frame"
             )
             assert (last.data == kept).all(), (
                 "found a frame that was modified after it was returned"
@@ -89,7 +89,7 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
             _read(servos, reading, patience)
             first, seq = list(reading.q), reading.seq
             _read(servos, reading, patience)
-            assert reading.seq > seq, f"found seq {reading.seq} after {seq}"
+            assert reading.seq > seq, f"found seq {reading.seq} after seq {seq}"
             assert reading.t <= time.monotonic(), "found a reading with a time in the future"
             assert np.isfinite([*reading.q, *reading.dq, *reading.current]).all(), "found NaN"
             _check_counters(servos)

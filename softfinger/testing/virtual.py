@@ -150,8 +150,8 @@ class VirtualTimeHand(Hand):
         """Advance by the smallest step: a tick, or a recorded message."""
         if self._serving:
             raise RuntimeError(
-                "found a call that advances the time inside serve(), which advances the time "
-                "itself: use a client, such as Hand(hand.address)"
+                "serve() is running and advances the time itself, so this call must not advance "
+                "the time: use a client, such as Hand(hand.address)"
             )
         self._step()
 
@@ -408,7 +408,7 @@ class RecordedHand(VirtualTimeHand):
     def _step(self) -> None:
         found = next(self._messages, None)
         if found is None:
-            raise RecordingOver(f"{self._recording.path}: over after {self.t:.3f} s")
+            raise RecordingOver(f"{self._recording.path}: the recording ended after {self.t:.3f} s")
         topic, message = found
         stamp = message.get("timestamp")
         if isinstance(stamp, float) and message.get("again") is not True:

@@ -123,7 +123,9 @@ def test_frames_without_settings_need_matching_settings(inline, counts, tmp_path
     )
     done = inline("analyse", path, "--config", "paper")
     assert done.returncode == 2
-    assert "small.npy: frames of 5 × 5 cells, expected 44 × 44: set tactile.rows" in done.stderr
+    assert (
+        "small.npy: found frames of 5 × 5 cells, expected 44 × 44: set tactile.rows" in done.stderr
+    )
     assert list(tmp_path.iterdir()) == [path]
     assert inline("analyse", path, "--set", "tip.radius=0").returncode == 2
 

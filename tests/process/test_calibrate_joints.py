@@ -86,15 +86,15 @@ def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
     try:
         assert calibrate(folder, *words) == 1
         assert "servo 2: torque is on" in capsys.readouterr().err
-        assert "torque is on in the left servo" in emulator.turn(["left=open"])
+        assert "torque of the left servo is on" in emulator.turn(["left=open"])
     finally:
         servos.write(2, reg.TORQUE_ENABLE, 1, 0)
         servos.close()
     assert calibrate(folder, *words) == 1
-    assert "left finger: found 0.0° between closed and open" in capsys.readouterr().err
+    assert "left finger: found a range of 0.0° between closed and open" in capsys.readouterr().err
     monkeypatch.setattr(emulator._servos.bus.servos[0]._joint, "shift", 4000)
     assert calibrate(folder, *words) == 1
-    assert "(one turn), because the position changes" in capsys.readouterr().err
+    assert "(one turn), because a servo loses its full turns" in capsys.readouterr().err
 
 
 def test_only_calibrated_values_change_in_a_profile():

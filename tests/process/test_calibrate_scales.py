@@ -67,4 +67,4 @@ def test_factors_can_be_taken_from_the_last_state_of_a_recording(tmp_path, capsy
     without = tmp_path / "without.mcap"
     record_hand(without, {}, 0.1, ("stream.state_rate=1",))
     assert main([*words, str(without)]) == 1
-    assert f"{without}: contains no hand/state" in capsys.readouterr().err
+    assert f"{without}: the recording does not contain hand/state" in capsys.readouterr().err

@@ -79,7 +79,7 @@ def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
     assert f"send: no reply to arm from {addresses[1]} within 0.1 s" in done.stderr
     assert "is softfinger running, or still starting?" in done.stderr
     done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "3")
-    assert f"no reply to arm from {addresses[1]} yet, waiting up to 3 s" in done.stderr
+    assert f"no reply to arm from {addresses[1]} yet; waiting up to 3 s" in done.stderr
     done = inline("send", "grasp", "force:5", "--address", addresses[1])
     assert done.returncode == 2
     assert "found 'force:5', expected key=number" in done.stderr
@@ -205,5 +205,5 @@ def test_a_disabled_compiler_is_reported_in_one_line():
     assert done.returncode == 1
     assert done.stdout == ""
     assert done.stderr == (
-        "limits: NUMBA_DISABLE_JIT is set, but the kernels must be compiled: unset this variable\n"
+        "limits: NUMBA_DISABLE_JIT is set, but the kernels must be compiled; unset this variable\n"
     )

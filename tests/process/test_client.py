@@ -130,8 +130,8 @@ def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
             hand.arm()
     asyncio.run(ask())
     said = [
-        f"no hand/state from {stream} yet, waiting up to 1.05 s",
-        f"no reply to arm from {commands} yet, waiting up to 1.05 s",
+        f"no hand/state from {stream} yet; waiting up to 1.05 s",
+        f"no reply to arm from {commands} yet; waiting up to 1.05 s",
     ]
     assert caplog.messages == said + said
 
@@ -281,7 +281,7 @@ def test_an_unknown_schema_is_reported_once_and_known_fields_are_kept(fake, hand
     fake.changes = {"schema": 7, "news": [1, 2], "overruns": "many"}
     until(lambda: fake.published > 2)
     with hand.stream(timeout=60.0) as states:
-        with pytest.warns(UserWarning, match="schema 7, this client supports 1") as told:
+        with pytest.warns(UserWarning, match="schema 7, but this client supports schema 1") as told:
             state = [next(states), next(states)][-1]
         assert len(told) == 1
         assert (state.schema, state.mode, state.overruns) == (7, "holding", 0)
@@ -429,7 +429,7 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
             Hand()
 
 
-UNKNOWN = "found unknown host 'no..host' (not a host name), expected an IP address or a"
+UNKNOWN = "found the unknown host 'no..host' (not a host name), expected an IP address or a"
 
 
 @pytest.mark.parametrize("cls", [Hand, AsyncHand])
@@ -490,8 +490,9 @@ def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     ):
         error = in_a_thread(use)
         assert isinstance(error, WrongThread), use
-        assert "thread other_0: found a Hand whose stream is used by thread MainThread" in str(
-            error
+        assert (
+            "thread other_0: the stream of this Hand is already used by thread MainThread"
+            in str(error)
         )
     assert next(states).mode == hand.state().mode == "holding"
 

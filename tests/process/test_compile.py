@@ -65,7 +65,7 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     rest = compiled(tmp_path)
     assert rest.returncode == 0
     first, part, last = rest.stderr.splitlines()
-    assert first == "compiling kernels, on the first start only: contact table"
+    assert first == "compiling kernels (only on the first start): contact table"
     assert part.startswith("contact table: ")
     assert last.startswith("compiled in ")
     # The output and the exit status report a failed compilation.
@@ -100,7 +100,7 @@ def test_compilation_by_plain_numba_is_explained_in_one_line(monkeypatch):
 
 def test_ctrl_c_ends_every_compiler_process(tmp_path):
     with ending(started("compile", env=environment(tmp_path))) as process:
-        assert process.stderr.readline().startswith("compiling kernels, on the first start only:")
+        assert process.stderr.readline().startswith("compiling kernels (only on the first start):")
         until(psutil.Process(process.pid).children)
         compilers = psutil.Process(process.pid).children()
         process.send_signal(signal.SIGINT)

@@ -20,7 +20,7 @@ def test_grasp_and_turn_example(start, profile, addresses, tmp_path):
     where = ("--stream", stream, "--commands", commands, "--picture", picture)
     done = python("-m", "softfinger.tools.examples.grasp_and_turn", *where)
     assert done.returncode == 0, done.stderr
-    assert re.sub(r"no .* from .* yet, waiting up to .* s\n", "", done.stderr) == ""
+    assert re.sub(r"no .* from .* yet; waiting up to .* s\n", "", done.stderr) == ""
     ((states, lost),) = re.findall(r"(\d+) states, (\d+) lost", done.stdout)
     assert int(states) > 50
     assert int(lost) < int(states)  # A gateway without processor time drops messages.

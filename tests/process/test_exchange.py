@@ -59,7 +59,10 @@ def test_late_replies_fail_with_timings_and_suggested_settings(bus):
     bus.fault("delay=0.02")
     found = exchange(bus, 100.0, reply_timeout=1.0)
     assert found.status == "FAIL"
-    assert "expected at most one tick of 10 ms (loop.rate = 100) and at most 1000 ms" in found.text
+    assert (
+        "expected at most 10 ms, the period of a tick (loop.rate = 100), and at most 1000 ms"
+        in found.text
+    )
     assert found.fix.startswith("set loop.rate = ")
     assert float(found.fix.split()[3].rstrip(";,")) < 50.0
     found = exchange(bus, 5.0, reply_timeout=0.005)
@@ -75,10 +78,15 @@ def test_assessment_of_exchange_times():
     assert judged(0.0004, 0.0009).text == "50: p50 0.4 ms, p99 0.9 ms, 0% failed"
     near = judged(0.0017, 0.0018)  # `run` issues the same warning.
     assert (near.status, near.fix.split(",")[0]) == ("warn", "set loop.rate = 440")
-    assert near.text.endswith("too much of a tick of 2 ms (loop.rate = 500): ticks will be late")
+    assert near.text.endswith(
+        "this takes most of a tick of 2 ms (loop.rate = 500), so ticks will be late"
+    )
     both = judged(0.0028, 0.003)  # This time is shorter than reply_timeout and longer than a tick.
     assert (both.status, both.fix.split(",")[0]) == ("FAIL", "set loop.rate = 260")
-    assert "expected at most one tick of 2 ms (loop.rate = 500) and at most 4 ms" in both.text
+    assert (
+        "expected at most 2 ms, the period of a tick (loop.rate = 500), and at most 4 ms"
+        in both.text
+    )
     slow = judged(0.016, 0.016)
     assert slow.fix.startswith("set servos.reply_timeout = 0.024 and loop.rate = 50, or")
     assert judged(0.0004, 0.01).status == "FAIL"
@@ -123,7 +131,7 @@ def test_slow_replies_are_reported_at_start_up(bus):
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "ticks will be late" in each.text]
     assert "of a tick of 2 ms (loop.rate = 500)" in notice.text
-    assert "`softfinger doctor`, which times 50 exchanges" in notice.fix
+    assert "`softfinger doctor` to measure the reply times of 50 exchanges" in notice.fix
     backend.close()
 
 

@@ -76,9 +76,9 @@ def test_frames_do_not_depend_on_how_the_stream_is_split(seeds, start, cuts):
     ("spoil", "told"),
     [
         (lambda data: data[:7] + data[8:], "lines of 24 bytes"),
-        (lambda data: data[:7] + b"\x05" + data[8:], "not half of a count"),
-        (lambda data: data[:7] + b"\x2b" + data[8:], "not half of a count"),
-        (lambda data: b"\x03" + data[1:], "not half of a count"),
+        (lambda data: data[:7] + b"\x05" + data[8:], "not a valid half of a count"),
+        (lambda data: data[:7] + b"\x2b" + data[8:], "not a valid half of a count"),
+        (lambda data: b"\x03" + data[1:], "not a valid half of a count"),
     ],
 )
 def test_a_corrupted_frame_is_dropped_and_reported(spoil, told):

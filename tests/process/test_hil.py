@@ -165,7 +165,7 @@ def test_start_up_waits_for_servos_that_have_not_responded_yet(tmp_path, address
         refused = softfinger(*words, "servos.open_timeout=0.1")
         assert refused.returncode == 1
         assert "servo 2 (right): no reply at 2000000 baud" in refused.stderr
-        assert refused.stderr.rstrip().endswith("waited servos.open_timeout = 0.1 s")
+        assert refused.stderr.rstrip().endswith("gave up after servos.open_timeout = 0.1 s")
         waiting = started(*words, "servos.open_timeout=60", stdout=None)
         with ending(waiting):
             text = "waiting for up to servos.open_timeout = 60 s"
@@ -299,6 +299,6 @@ def test_swapped_ids_are_a_fault_during_the_approach(tmp_path, addresses):
         until(lambda: ask(addresses[1], "status")["fault"])
         status = ask(addresses[1], "status")
         assert status["fault_name"] == "joint.swapped"
-        assert status["fault"].endswith("check whether servos.ids are swapped")
+        assert status["fault"].endswith("check whether the servo IDs are swapped (servos.ids)")
         assert daemon.end() == 1
         emulator.end()

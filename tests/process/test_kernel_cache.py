@@ -134,7 +134,7 @@ def test_own_folder_refuses_links_files_and_other_users(tmp_path, monkeypatch):
     if os.geteuid() == 0:
         os.chown(tmp_path / "new", 54321, 54321)
     monkeypatch.setattr(own_folder.os, "geteuid", lambda: 12345)
-    with pytest.raises(PermissionError, match="expected the current user 12345"):
+    with pytest.raises(PermissionError, match="expected the current user, 12345"):
         OwnFolder(tmp_path / "new")
 
 
@@ -195,7 +195,7 @@ def test_a_damaged_kernel_is_recompiled_with_a_warning(package, tmp_path):
     (file,) = package.cache.rglob("*.kernel")
     flipped(file)
     found, told = package.run()
-    assert (found, told.count("compiling again")) == (["3.0", "0"], 1)
+    assert (found, told.count("will be recompiled")) == (["3.0", "0"], 1)
     assert package.run() == (["3.0", "1"], "")
     with OwnFolder(tmp_path / "kept") as folder:
         for name, spoil in SPOILT.items():
@@ -204,7 +204,7 @@ def test_a_damaged_kernel_is_recompiled_with_a_warning(package, tmp_path):
             kernel_folder.keep(folder, "one", b"machine code")
             assert kernel_folder.kept(folder, "one") == b"machine code"
             spoil(folder.path / "one.kernel")
-            with pytest.warns(RuntimeWarning, match="compiling again"):
+            with pytest.warns(RuntimeWarning, match="will be recompiled"):
                 assert kernel_folder.kept(folder, "one") is None, name
 
 
@@ -231,5 +231,5 @@ def test_a_folder_that_is_renamed_is_still_used_as_opened(tmp_path):
         theirs.rename(path)
         assert kernel_folder.kept(folder, "one") == b"ours"
         (tmp_path / "away" / "two.kernel").symlink_to(path / "one.kernel")
-        with pytest.warns(RuntimeWarning, match="compiling again"):
+        with pytest.warns(RuntimeWarning, match="will be recompiled"):
             assert kernel_folder.kept(folder, "two") is None

@@ -224,7 +224,7 @@ def test_the_page_shows_another_commander_of_a_real_daemon(start, profile, addre
 def test_commands_without_a_daemon():
     where = ["--address", NOBODY]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
-        page.shows("waiting for a daemon", "no stream has arrived yet", "—")
+        page.shows("waiting for a daemon", "waiting for the stream", "—")
         page.type(b"a" * 12 + b" ")
         page.shows("stop: no reply")
         page.type(b"\x1b[C")

@@ -100,7 +100,7 @@ def test_time_page_shows_every_value_and_its_goal(run):
     assert np.nanmax(angle.lines[1].get_ydata()) == pytest.approx(math.degrees(0.1), abs=0.2)
     assert angle.get_xlim()[1] > 3.0
     empty = replace(run, states={name: values[:0] for name, values in run.states.items()})
-    with pytest.raises(Missing, match="no hand/state"):
+    with pytest.raises(Missing, match="does not contain hand/state"):
         plot.PAGES["time"](empty)
 
 
@@ -144,7 +144,7 @@ def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
     RecordingWriter(tmp_path / "nothing.mcap").close()
     status, said = call(tmp_path / "nothing.mcap", "--out", tmp_path / "none")
     assert status == 1
-    assert "plot: contains no hand/state" in said
+    assert "plot: the recording does not contain hand/state" in said
 
 
 def test_without_settings_no_model_is_drawn(path, run):

@@ -72,5 +72,5 @@ def test_a_stage_is_moved_by_a_program(rubber, capsys):
     for words in ("press depth=3", "press tip=left", "press depth=9mm"):
         assert main(["emulate", "--dir", str(folder), "--send", words]) == 1
     told = capsys.readouterr().err
-    assert "depth=3: expected a number with mm or m" in told
+    assert "depth=3: expected a number in mm or m" in told
     assert "expected at most 7.99 mm" in told

@@ -135,7 +135,7 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)
         assert rig.does("clear")["mode"] == "disarmed"
-        assert ("info", "tactile", "left sensor reopened") in rig.events
+        assert ("info", "tactile", "the left sensor was reopened") in rig.events
         seq = loop.state.contacts[0].seq
         rig.until(lambda: loop.state.contacts[0].seq > seq and loop.state.contacts[0].valid)
 

@@ -95,7 +95,7 @@ def test_states_of_a_recording_are_columns(tmp_path):
     writer = RecordingWriter(tmp_path / "b.mcap")
     writer.add(schema.TACTILE, {**frame(0.0, 0), "timestamp": 1e9})
     writer.close()
-    with pytest.raises(RecordingError, match=r"b\.mcap: contains no hand/state"):
+    with pytest.raises(RecordingError, match=r"b\.mcap: the recording does not contain hand/state"):
         read_recording(str(tmp_path / "b.mcap"))
 
 

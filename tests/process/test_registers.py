@@ -186,13 +186,15 @@ def test_invalid_register_files_are_refused(bus, tmp_path):
     strange = '{"servos": [{"id": 1, "model": "X", "firmware": 1, "registers": {"a": 1}}]}'
     for text in ("{}", "[", strange):
         path.write_text(text, encoding="utf-8")
-        with pytest.raises(ServoError, match="expected a file of `softfinger doctor --save`"):
+        with pytest.raises(
+            ServoError, match="expected a file written by `softfinger doctor --save`"
+        ):
             restore_registers(settings, path)
     save_registers(settings, path)
     other = path.read_text(encoding="utf-8").replace("XM430-W350", "XM430-W210", 1)
     path.write_text(other, encoding="utf-8")
     left, *right = restore_registers(settings, path)
-    assert left.text.endswith("was saved from an XM430-W210, found XM430-W350")
+    assert left.text.endswith("contains the registers of an XM430-W210, found XM430-W350")
     assert right == []
 
 

@@ -128,7 +128,7 @@ def test_missing_servos_are_reported(bus, silent):
     for servo in silent:
         bus.fault(f"silent={servo}")
     (line,) = refusal(bus.port, reply_timeout=0.5)
-    missing = "servo 2 (right): no reply at 2000000 baud: check its cable"
+    missing = "servo 2 (right): no reply at 2000000 baud: check its power supply"
     nothing = f"{bus.port}: no servo replies at 2000000 baud (IDs 1, 2): check the power"
     assert line.startswith(missing if silent == (2,) else nothing)
 
@@ -195,7 +195,7 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     place.write_text("16\n")
     monkeypatch.setattr(checks, "latency_file", lambda path: latency_file(path, tmp_path))
     # The low-latency mode is not available, as on this pseudo-terminal.
-    text = "16 ms, expected 1 ms: every read takes at least this long"
+    text = "16 ms, expected 1 ms: every read waits for this timer"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     assert refusal(bus.port, reply_timeout=0.004)[0] == f"{bus.port} latency timer: {text}: {fix}"
     backend = connected(bus)  # The timeout is longer than the latency timer.

@@ -237,7 +237,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
-    assert "the stream has schema 2, this page supports 1" in picture["notes"]
+    assert "the stream uses schema 2, but this page supports schema 1" in picture["notes"]
     assert "0 messages could not be read" in said
 
 
@@ -507,12 +507,12 @@ def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline)
     with pytest.raises(ViewError, match="No such file or directory"):
         save(tmp_path / "none" / "a.svg", Recording(recorded), 0.1, print)
     RecordingWriter(tmp_path / "empty.mcap").close()
-    with pytest.raises(ViewError, match="received nothing to show"):
+    with pytest.raises(ViewError, match="received no hand/state"):
         save(tmp_path / "a.html", Recording(tmp_path / "empty.mcap"), 0.1, print)
     assert not (tmp_path / "a.html").exists()
     for words, message in (
         ((recorded, "--save", "a.gif"), "expected a name ending in .html or .svg, found 'a.gif'"),
-        (("--save", "a.html"), "--save needs a recording"),
+        (("--save", "a.html"), "--save requires a recording"),
     ):
         done = inline("view", *words)
         assert done.returncode == 2
@@ -593,7 +593,7 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
         (("text.mcap",), "not an MCAP file"),
         (("text.mcap", "--port", "-1"), "expected a port"),
         (("--address", "nowhere"), "nowhere: Invalid"),
-        (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "received nothing to show"),
+        (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "received no hand/state"),
         (("--address", "tcp://127.0.0.1:9", "--no-wait"), "no stream from tcp"),
         (("--rate", "fast"), "expected 0.1 to 100 Hz"),
     ],

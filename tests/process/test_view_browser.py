@@ -267,7 +267,7 @@ def test_stale_data_are_marked(page, fake):
         until(lambda: page.text(".mode") == "holding" and not old())
         viewed.process.kill()
         until(lambda: old() == everything)
-        until(lambda: "server doesn't answer" in page.text(".stream"))
+        until(lambda: "server does not respond" in page.text(".stream"))
 
 
 def test_plots_have_axes_cursor_zoom_and_pause(page, fake):

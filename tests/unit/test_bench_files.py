@@ -251,7 +251,7 @@ def test_commas_as_separator_and_decimal_sign_are_reported_if_ambiguous(tmp_path
     text = "ROWS 1\nCOLS 3\nUNITS kPa\nASCII_DATA @@\nFrame 1\n0,0,0\nFrame 2\n0,1,25,0\n@@\n"
     (tmp_path / "a.asf").write_text(text)
     with pytest.raises(
-        RecordingError, match="line 8: 4 cells, expected 3: the comma is both the separator"
+        RecordingError, match="line 8: found 4 cells, expected 3: the comma is both the separator"
     ):
         load_recording(tmp_path / "a.asf", SCALE, 100.0)
 
@@ -379,9 +379,9 @@ def test_frames_without_contact_are_reported_with_the_maximum_reading(
     done = inline("analyse", path, "--config", "paper")
     (line,) = [each for each in done.stdout.splitlines() if "no contact in any frame" in each]
     assert cause in line
-    assert "threshold 4560 Pa (3 times tactile.noise)" in line
+    assert "threshold is 4560 Pa (3 times tactile.noise)" in line
     with np.load(path) as held:
-        assert f"largest reading {held['frames'].max():.4g} " in line
+        assert f"largest reading is {held['frames'].max():.4g} " in line
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.uint16])
@@ -394,7 +394,7 @@ def test_noise_above_its_setting_is_reported_with_both(tmp_path, inline, kind):
         for each in inline("analyse", tmp_path / "a.npz", "--config", "paper").stdout.splitlines()
         if "no contact in any frame" in each
     ]
-    found = re.search(r"threshold 4560 Pa .*the measured cell noise is (\d+) Pa: set", line)
+    found = re.search(r"threshold is 4560 Pa .*the measured cell noise is (\d+) Pa: set", line)
     assert float(found[1]) == pytest.approx(4000.0, rel=0.03)
 
 
@@ -415,18 +415,21 @@ def test_the_only_stack_of_an_archive_is_used_and_reported(press, tmp_path, name
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t == pytest.approx(STEPS * 1e-3)
     assert read.notes == (
-        f"found no array 'frames'; using {name!r}, the only three-dimensional array",
+        f"the file does not contain an array 'frames'; using {name!r}, the only three-dimensional "
+        "array",
     )
     check(tmp_path / "a.npz")
 
 
 def test_the_contents_of_an_archive_without_frames_are_listed(press, tmp_path):
     np.savez(tmp_path / "a.npz", left=press, right=press, note=np.array("x"))
-    with pytest.raises(RecordingError, match=r"but left \(8, 44, 44\), right .*, note \(\)"):
+    with pytest.raises(
+        RecordingError, match=r"found left \(8, 44, 44\), right .*, note \(\), expected"
+    ):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
     many = {f"a{k}": np.zeros(k + 1) for k in range(30)}
     np.savez(tmp_path / "b.npz", **many)
-    with pytest.raises(RecordingError, match=r"a7 \(8,\), …; rename the array"):
+    with pytest.raises(RecordingError, match=r"a7 \(8,\), …, expected an array 'frames'"):
         load_recording(tmp_path / "b.npz", SCALE, 100.0)
 
 
@@ -438,13 +441,13 @@ def test_a_pitch_that_contradicts_the_header_is_reported(press, tmp_path, inline
     path.write_bytes(export(press))
     tactile = {"rows": 44, "cols": 44, "recording": (str(path), ""), "pitch": 0.00127}
     wanted = (
-        r"cells of 1\.318 × 1\.318 mm in its header, expected 1\.27 × 1\.27 mm as in "
+        r"cells of 1\.318 × 1\.318 mm in the header, expected 1\.27 × 1\.27 mm as in "
         r"tactile\.pitch: set tactile\.pitch"
     )
     with pytest.raises(TactileError, match=wanted):
         ReplayTactile(TactileSettings.model_validate(tactile), VirtualClock(), 0)
     done = inline("analyse", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
-    assert "found cells of 1.318 × 1.318 mm in its header" in done.stderr
+    assert "found cells of 1.318 × 1.318 mm in the header" in done.stderr
     assert "6 with contact, 0 invalid" in done.stdout
     words = ("--recording", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words, "--no-plot")
@@ -456,7 +459,7 @@ def test_a_calibration_reports_suspicious_recordings(tared, tmp_path, inline):
     words = ("--recording", tmp_path / "a.npy", "--config", "paper", "--no-plot")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words)
     assert done.returncode == 0
-    assert "this is noise after a tare, and these readings are set to 0" in done.stderr
+    assert "they are treated as noise after a tare and set to 0" in done.stderr
 
 
 def test_generators_differ():
@@ -474,17 +477,17 @@ def test_generators_differ():
     ("changes", "told"),
     [
         ({}, ""),
-        ({"tip.radius": 0.010}, "sensor area of 58 × 58 mm for a tip of 20 mm diameter"),
+        ({"tip.radius": 0.010}, "sensor area of 58 × 58 mm for a tip with a diameter of 20 mm"),
         (
             {"tactile.rows": 26},
-            r"smaller than the tip's footprint at safety\.d_max = 12 mm, 36\.7 mm wide",
+            r"but the tip's footprint at safety\.d_max = 12 mm is 36\.7 mm wide",
         ),
         (
             {"tactile.rows": 20, "control.force_default": 24.0},
-            r"smaller than the tip's footprint at control\.force_default = 24 N, 30\.9 mm wide",
+            r"but the tip's footprint at control\.force_default = 24 N is 30\.9 mm wide",
         ),
-        ({"tactile.centre": (0.02, 0.0)}, "smaller than the tip's footprint"),
-        ({"tactile.pitch_y": 0.0006}, "sensor area of 58 × 26.4 mm, smaller than"),
+        ({"tactile.centre": (0.02, 0.0)}, "but the tip's footprint"),
+        ({"tactile.pitch_y": 0.0006}, "sensor area of 58 × 26.4 mm, but the tip's"),
     ],
 )
 def test_a_sensor_size_that_does_not_fit_the_tip_is_reported(changes, told):
@@ -506,7 +509,7 @@ def test_the_sensor_of_a_solid_tip_covers_its_base():
     solid = {"tip": {"physics": "solid"}, "material": {"law": "constant"}}
     settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
     (doubt,) = plausibility_warnings(settings)
-    assert "smaller than the tip's base, 40 mm wide" in doubt
+    assert "but the tip's base is 40 mm wide" in doubt
 
 
 @pytest.mark.parametrize("zero", [0.0, 50.0, 3000.0])

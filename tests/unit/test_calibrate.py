@@ -204,9 +204,9 @@ def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
 @pytest.mark.parametrize(
     ("tactile", "told"),
     [
-        ({"sensor": ("B2", "")}, "sensor A17, here B2"),
-        ({"pitch": 0.001}, "pitch 1.812 × 1.812 mm, here 1 × 1 mm"),
-        ({"full_count": 255}, "full_count 4095, here 255"),
+        ({"sensor": ("B2", "")}, "sensor: found A17, expected B2"),
+        ({"pitch": 0.001}, "pitch: found 1.812 × 1.812 mm, expected 1 × 1 mm"),
+        ({"full_count": 255}, "full_count: found 4095, expected 255"),
     ],
 )
 def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, told):
@@ -225,7 +225,10 @@ def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, 
         (["modulus", "--recording", "rest.npz"], "expected --d"),
         (["centre", "--recording", "rest.npz"], "press 1 does not give a valid contact"),
         (["tare", "--recording", "none.npz"], "No such file"),
-        (["tare", "--recording", "rest.npz", "--finger", "right"], "finger left, here right"),
+        (
+            ["tare", "--recording", "rest.npz", "--finger", "right"],
+            "finger: found left, expected right",
+        ),
     ],
 )
 def test_impossible_steps_are_reported_and_change_nothing(bench, capsys, words, told):
@@ -275,18 +278,18 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
 @pytest.mark.parametrize(
     ("step", "known", "told"),
     [
-        ("curve", {"d": [0.002, 0.03]}, "d: found 30 mm, expected at most the tip's radius, 20 mm"),
+        ("curve", {"d": [0.002, 0.03]}, "d: found 30 mm, expected at most 20 mm, the tip's radius"),
         (
             "modulus",
             {"d": [0.002, 0.03]},
-            "d: found 30 mm, expected at most the tip's radius, 20 mm",
+            "d: found 30 mm, expected at most 20 mm, the tip's radius",
         ),
         (
             "modulus",
             {"d": [0.002, 0.004], "theta": [0.0, -1.6]},
             "theta: found 91.6732°, expected less than 90°",
         ),
-        ("modulus", {"d": [-0.001, 0.0]}, "no frame with d above 0"),
+        ("modulus", {"d": [-0.001, 0.0]}, "the run does not contain any frames with d above 0"),
         ("centre", {"words": ["--theta", "nan"]}, "theta: found a value that is not finite"),
         ("curve", {"words": ["--d", "inf"]}, "d: found a value that is not finite"),
     ],

@@ -50,7 +50,7 @@ def test_a_tare_under_load_is_refused():
     frames[:, 2:4, 3] *= 20.0  # The tare ignores two faulty cells.
     tare(frames)
     frames[10:, 4:6, 4:7] += 100.0
-    with pytest.raises(CalibrationError, match="found changing readings in 8 cells"):
+    with pytest.raises(CalibrationError, match="the readings of 8 cells change"):
         tare(frames)
 
 
@@ -156,8 +156,11 @@ def test_clipped_noise_far_from_the_contact_is_removed():
         (lambda: tare(np.zeros((1, 4, 4))), "found one frame"),
         (lambda: tare(np.zeros((4, 4))), r"\[n, rows, cols\]"),
         (lambda: tare(np.full((3, 4, 4), np.nan)), "not finite"),
-        (lambda: equilibrate([], np.zeros((4, 4))), "found no uniform pressure"),
-        (lambda: equilibrate([np.zeros((2, 4, 4))], np.zeros((4, 4))), "read no pressure"),
+        (lambda: equilibrate([], np.zeros((4, 4))), "expected at least one uniform pressure"),
+        (
+            lambda: equilibrate([np.zeros((2, 4, 4))], np.zeros((4, 4))),
+            "the readings of most cells do not exceed",
+        ),
         (lambda: fit_curve("cubic", np.ones((2, 4, 4)), [1, 2], 1e-6, 10), "at least 3"),
         (lambda: fit_curve("power", np.ones((2, 4, 4)), [1, -2], 1e-6, 10), "above 0"),
         (lambda: fit_curve("power", np.zeros((2, 4, 4)), [1, 2], 1e-6, 10), "gives no reading"),

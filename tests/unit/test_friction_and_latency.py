@@ -121,7 +121,7 @@ def test_impossible_times_are_refused():
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (["--set", "servos.model=XL430-W250"], "one that measures its current"),
+        (["--set", "servos.model=XL430-W250"], "a model that measures its current"),
         (["--recording", "a.mcap", "b.mcap"], "expected at most one --recording"),
     ],
 )
@@ -176,9 +176,9 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
 @pytest.mark.parametrize(
     ("profile", "due", "hand", "why"),
     [
-        (None, ARM, (), "found a d ramp of 0.0 mm computed from the joints"),
+        (None, ARM, (), "found a change of d of 0.0 mm (computed from the joints)"),
         (None, FORCES, ("simulation.object_angle=0.3",), "neither slides nor tilts"),
-        (VELOSTAT, GRASP, (), "found a standard deviation of 1"),
+        (VELOSTAT, GRASP, (), "found a latency uncertainty of 1"),
     ],
 )
 def test_a_grip_that_does_not_show_the_latency_is_refused(

@@ -123,7 +123,7 @@ def test_systematic_errors_do_not_average_out():
     assert contact.force_std == pytest.approx(math.hypot(by_d, by_theta, by_modulus), rel=0.02)
 
 
-@pytest.mark.filterwarnings("ignore:the smooth law deviates")
+@pytest.mark.filterwarnings("ignore:the material law deviates")
 def test_the_misfit_of_the_material_law_is_part_of_the_force_error(estimator):
     contacts, pose = [Contact(), Contact()], ObjectPose()
     strain = np.linspace(0.025, 1.0, 40)

@@ -33,16 +33,24 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
     "stale": ({"reading.t": 4.9}, "servos.silent", "no valid reading for 0.100 s"),
     "never read": ({"reading.t": -math.inf}, "servos.silent", "no valid reading yet"),
     "alert": ({"reading.alert": 2, "reading.hardware.1": 4}, "servos.alert", "right (overheating)"),
-    "past": ({"reading.q.0": 1.2}, "joint.angle", "left joint is at 1.200 rad, outside"),
-    "no angle": ({"reading.q.0": math.nan}, "joint.angle", "left joint is at nan rad"),
+    "past": ({"reading.q.0": 1.2}, "joint.angle", "the left joint is at 1.200 rad, expected"),
+    "no angle": ({"reading.q.0": math.nan}, "joint.angle", "the left joint is at nan rad"),
     "fast": ({"reading.dq.1": -7.0}, "joint.velocity", "at -7.00 rad/s, above 6 rad/s"),
-    "current": ({"reading.current.1": -1.9}, "joint.current", "right joint draws -1.90 A"),
+    "current": ({"reading.current.1": -1.9}, "joint.current", "the right joint draws -1.90 A"),
     "stalled": ({"mode": Mode.MOVING} | STALLED, "joint.stall", "17.2° from its goal at 0.39 A"),
-    "dead": (TOWARDS, "joint.dead", "left joint is stationary 17.2° from its goal and draws"),
-    "pulled away": (TOWARDS | {"reading.current.0": -0.4}, "joint.dead", "only -0.40 A of 0.40 A"),
-    "frozen": ({"reading.frozen": 0b01}, "servos.frozen", "servos: the readings are old (left)"),
-    "deaf": ({"reading.lost": 0b11}, "goal.lost", "goals are not being received (left and right)"),
-    "hot": ({"reading.temperature.0": 71.0}, "servos.temperature", "left servo is at 71 °C"),
+    "dead": (TOWARDS, "joint.dead", "the left joint is stationary 17.2° from its goal and draws"),
+    "pulled away": (
+        TOWARDS | {"reading.current.0": -0.4},
+        "joint.dead",
+        "only -0.40 A (maximum 0.40 A)",
+    ),
+    "frozen": (
+        {"reading.frozen": 0b01},
+        "servos.frozen",
+        "servos: old readings from the left servo",
+    ),
+    "deaf": ({"reading.lost": 0b11}, "goal.lost", "goals do not reach the left and right servo"),
+    "hot": ({"reading.temperature.0": 71.0}, "servos.temperature", "the left servo is at 71 °C"),
     "brown-out": ({"reading.voltage.1": 9.2}, "servos.voltage", "9.2 V, expected 9.5 to 16.0 V"),
     "no frames": (
         {"contacts.0.t_arrival": OLD, "contacts.0.t_valid": OLD},
@@ -54,15 +62,15 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
         "tactile.silent",
         "no valid estimate from the left",
     ),
-    "force": ({"contacts.1.force": 31.0}, "tip.force", "right tip force is 31.0 N, above 30 N"),
+    "force": ({"contacts.1.force": 31.0}, "tip.force", "the right tip force is 31.0 N, above 30 N"),
     "depth": ({"contacts.1.d": 0.013}, "tip.displacement", "displacement is 13.00 mm, above 12"),
     "rim": (
         {"contacts.0.theta": -math.asin(0.8) + 0.04},
         "tip.tilt",
-        "left tip tilt is -50.8°, above 5",
+        "the left tip tilt is -50.8°, above 5",
     ),
     "late": ({"timing.late_in_row": 100}, "loop.overruns", "loop: 100 consecutive ticks were late"),
-    "outside": ({"contacts.0.inside": False}, "tip.tilt", "left tip tilt is 5.7°, above"),
+    "outside": ({"contacts.0.inside": False}, "tip.tilt", "the left tip tilt is 5.7°, above"),
 }
 THINNER: Changes = {"object.width": 0.0355}
 
@@ -186,9 +194,9 @@ STRONG = {"contacts.0.force": 27.5, "contacts.1.force": 27.5}
 WARNINGS: dict[str, tuple[Changes, str]] = {
     "hand.force": ({"contacts.0.force": 12.0}, "left 12.0 N, right 5.0 N"),
     "joint.strained": ({"reading.current": [1.19, 0.3]}, "requires the maximum current of 1.2 A"),
-    "tactile.misfit": ({"contacts.0.misfit": True}, "left sensor's frames do not fit"),
-    "servos.heat": ({"heat.1.time_to_limit": 42.0}, "right servo will reach 70 °C in 42 s"),
-    "tip.force": (STRONG, "left tip force is 27.5 N, above 27 N"),
+    "tactile.misfit": ({"contacts.0.misfit": True}, "left sensor's frames do not match"),
+    "servos.heat": ({"heat.1.time_to_limit": 42.0}, "the right servo will reach 70 °C in 42 s"),
+    "tip.force": (STRONG, "the left tip force is 27.5 N, above 27 N"),
 }
 
 
@@ -265,10 +273,10 @@ def test_each_faulty_channel_is_named():
         "consistency.right_current",
     }
     assert told["consistency.left_sensor"].startswith(
-        "left sensor reports a jump of 11° in the object's angle"
+        "the left sensor reports a jump of 11° in the object's angle"
     )
-    assert told["consistency.right_sensor"].startswith("right sensor reads 50% of the pressure")
-    assert "current is 0.10 A, but its goal is 0.20 A" in told["consistency.right_current"]
+    assert told["consistency.right_sensor"].startswith("the right sensor reads 50% of the pressure")
+    assert "current is 0.10 A, but its goal current is 0.20 A" in told["consistency.right_current"]
 
 
 def test_a_force_that_does_not_increase_as_commanded_is_a_fault():
@@ -308,7 +316,7 @@ def test_a_frozen_sensor_is_a_fault_during_contact():
             later(state, 0.002)
         assert (found is not None) is fault
     assert found.name == "tactile.frozen"
-    assert "right sensor is frozen" in found.text
+    assert "the right sensor has sent the same frame" in found.text
     state.contacts[1].contact = False  # Without contact, repeated frames are normal.
     assert judged(judge, state) == ("", "")
 

@@ -65,7 +65,7 @@ def test_move_reaches_its_goal_within_the_limits(make):
     assert daemon.loop.state.reading.q == pytest.approx([-0.2, -0.3], abs=0.04)
     with pytest.raises(
         Refused,
-        match=r"left: found 286\.5° \(5 rad\), expected -28\.6° to 57\.3° \(-0\.50 to 1\.00\)",
+        match=r"left: found 286\.5° \(5 rad\), expected -28\.6° to 57\.3° \(-0\.50 to 1\.00 rad\)",
     ):
         command(daemon, "move", left=5.0)
 
@@ -195,7 +195,8 @@ def test_the_state_contains_the_goals_of_the_grip(make):
 def test_an_unreachable_angle_is_refused(make):
     daemon = grasped(make(), 8.0)
     with pytest.raises(
-        Refused, match=r"found 34\.4° \(0\.6 rad\), expected .*° to .*° \(-0\.\d\d to 0\.\d\d\) in"
+        Refused,
+        match=r"found 34\.4° \(0\.6 rad\), expected .*° to .*° \(-0\.\d\d to 0\.\d\d rad\) in",
     ):
         command(daemon, "rotate", angle=0.6)
     found = re.search(r"to (0\.\d+)", refusal(daemon, "rotate", angle=2.0))
@@ -230,20 +231,20 @@ def test_a_tare_reports_the_change_of_the_zero(make):
         command(daemon, "tare")
         daemon.loop.advance(0.5)
         [text] = [text for level, kind, text in events
-                  if (level, kind) == ("info", "tare") and text.startswith("left")]  # fmt: skip
+                  if (level, kind) == ("info", "tare") and text.startswith("the left")]  # fmt: skip
         return text
 
     pascal = daemon.settings.tactile.pascal_per_count
     found = tared(0, 0)
     assert found.startswith(
-        f"left sensor's zero offsets changed by +100.0 counts ({100 * pascal:+.0f} Pa)"
+        f"the left sensor's zero offsets changed by +100.0 counts ({100 * pascal:+.0f} Pa)"
     )
     assert tared(30, 50) == (
-        f"left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa), "
-        "in one cell by +80.0 counts"
+        f"the left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa); "
+        "the largest change was +80.0 counts"
     )
     # The warning compares with the last zero offset, not with the first one.
-    assert tared(-10, -60).endswith("one cell by -150.0 counts")
+    assert tared(-10, -60).endswith("the largest change was -150.0 counts")
 
 
 def test_a_tare_of_saturated_sensors_keeps_the_zero_offset_and_is_reported(make):
@@ -256,7 +257,7 @@ def test_a_tare_of_saturated_sensors_keeps_the_zero_offset_and_is_reported(make)
     daemon.loop.advance(0.5)
     assert not perception.is_taring
     assert perception._estimator.saturation == before
-    text = "right sensor was not tared: most cells are saturated without contact"
+    text = "the right sensor was not tared: most cells are saturated without contact"
     assert events.count(("warning", "tare", text)) == 1
 
 
@@ -280,7 +281,7 @@ def test_a_sensor_that_shifts_during_a_grip_is_a_fault(make):
     change_frames(daemon, 1, lambda frame: replace(frame, data=np.roll(frame.data, 4, axis=1)))
     advance_to(daemon, "fault", 1.0)
     assert state.fault_name == "tactile.silent"
-    assert state.fault.startswith("right sensor reports a jump of")
+    assert state.fault.startswith("the right sensor reports a jump of")
     warning = next(event for event in events if event[1].startswith("consistency"))
     assert warning[:2] == ("warning", "consistency.right_sensor")
     assert not torque_of(daemon).any()
@@ -294,8 +295,8 @@ def test_a_frozen_sensor_is_a_fault_until_it_recovers(make):
     change_frames(daemon, 0, lambda frame: replace(frame, data=frozen))
     advance_to(daemon, "fault", 1.0)
     assert daemon.loop.state.fault_name == "tactile.frozen"
-    assert "left sensor is frozen" in daemon.loop.state.fault
-    assert "clear: tactile: left sensor is frozen" in refusal(daemon, "clear")
+    assert "the left sensor has sent the same frame" in daemon.loop.state.fault
+    assert "clear: tactile: the left sensor has sent the same frame" in refusal(daemon, "clear")
     del left.sensor.latest  # This line restores the method of the class.
     daemon.loop.advance(0.2)
     command(daemon, "clear")
@@ -342,8 +343,8 @@ def test_a_hot_servo_is_a_fault_that_remains_until_it_has_cooled(make):
     heat = daemon.hand.servo_heat[1]
     heat.warm(70.6)
     advance_to(daemon, "fault", 1.0)
-    assert daemon.loop.state.fault == "right servo is at 71 °C, above 70 °C"
-    assert "clear: right servo is at 7" in refusal(daemon, "clear")
+    assert daemon.loop.state.fault == "the right servo is at 71 °C, above 70 °C"
+    assert "clear: the right servo is at 7" in refusal(daemon, "clear")
     heat.warm(50.0)
     daemon.loop.advance(1.0)
     command(daemon, "clear")

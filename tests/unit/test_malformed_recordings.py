@@ -91,7 +91,7 @@ def test_settings_without_text_are_reported(tmp_path, name):
     del message[name]
     writer.add(schema.SETTINGS, message)
     writer.close()
-    with pytest.raises(RecordingError, match="its hand/settings message lacks"):
+    with pytest.raises(RecordingError, match="hand/settings does not contain"):
         recorded_settings(Recording(path))
 
 

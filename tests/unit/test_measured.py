@@ -153,10 +153,10 @@ def test_unsuitable_contacts_are_refused():
         fit_measured(presses(count=5), A, GRID)
     falls = presses()
     softer = [each / (1.0 + (d / 2e-3) ** 3) for each, d in zip(falls.frames, D, strict=True)]
-    with pytest.raises(CurvesError, match="the best smooth increasing curve deviates"):
+    with pytest.raises(CurvesError, match="the best smooth increasing curves deviate"):
         fit_measured(replace(falls, frames=softer), A, GRID)
     single = replace(falls, frames=[each[:1] for each in falls.frames])
-    with pytest.raises(CurvesError, match="five frames of each press"):
+    with pytest.raises(CurvesError, match="five frames for each press"):
         fit_measured(single, A, GRID)
 
 
@@ -183,7 +183,7 @@ def test_a_finger_uses_the_curves_of_its_file(law, tmp_path):
     with pytest.raises(SettingsError, match=r"safety.d_max: found 0.012 m, expected at most 0.006"):
         make_models(load(HIL, tmp_path, profile(file)))
     save_calibration(other, empty)
-    with pytest.raises(SettingsError, match=r"other.json has no curves for the left tip"):
+    with pytest.raises(SettingsError, match=r"other.json does not contain curves for the left tip"):
         make_models(load(HIL, tmp_path, profile(other)))
     with pytest.raises(SettingsError, match=r'tactile.calibration: found "" for left'):
         load(HIL, tmp_path, ["tip.physics=measured", "safety.d_max=0.006"])

@@ -81,7 +81,7 @@ def test_friction_is_a_cone_including_the_lateral_direction(used):
 def test_unsupported_options_are_refused():
     with pytest.raises(SettingsError, match="found RK4"):
         SoftTips(*scene(integrator="RK4"), SETTINGS, ("tip",), ("wall",))
-    with pytest.raises(SettingsError, match=r"tip: expected a sphere of 0\.02 m"):
+    with pytest.raises(SettingsError, match=r"tip: expected a sphere of radius 0\.02 m"):
         SoftTips(*scene(radius=0.01), SETTINGS, ("tip",), ("wall",))
     refused = {"object_shape": "disc", "tip_creep_time": 1.0, "joint_stribeck": 0.01}
     for key, value in refused.items():

@@ -54,7 +54,7 @@ def test_foreign_links_and_files_in_a_shared_folder_are_not_used(shared, strange
         named.symlink_to(victim)
     strangers(named)
     with pytest.raises(
-        PermissionError, match="a link owned by" if linked else "owned by another user"
+        PermissionError, match="this link is owned by" if linked else "is owned by another user"
     ):
         write(named)
     assert victim.read_text() == "precious"
@@ -92,7 +92,7 @@ def test_a_file_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
     [
         (0o777, "other users can write to it"),
         (0o1777, "other users can write to it"),
-        (0o700, "belongs to user"),
+        (0o700, "is owned by user"),
         (None, "found a link"),
     ],
 )

@@ -235,6 +235,6 @@ def test_a_long_wedge_whose_faces_meet_is_refused():
     assert "object_taper" in found(object_taper=1.2)[0]
     assert "object_taper" in found(object_taper=0.5, object_height=0.3)[0]
     with pytest.raises(
-        ValueError, match=r"found simulation\.object_width 0\.002 m, expected above"
+        ValueError, match=r"simulation\.object_width: found 0\.002 m, expected more than"
     ):
         shape(object_shape="wedge", object_width=0.002)

@@ -64,9 +64,9 @@ def test_a_plate_lifts_off_before_tilting_and_the_last_press_remains():
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("depth=4", "expected a number with mm or m"),
-        ("depth=4deg", "expected a number with mm or m"),
-        ("depth=-1mm", "expected a number with mm or m"),
+        ("depth=4", "expected a number in mm or m"),
+        ("depth=4deg", "expected a number in mm or m"),
+        ("depth=-1mm", "expected a number in mm or m"),
         ("tilt=10deg", "expected one of depth, force, pressure"),
         ("depth=1mm force=2N", "expected one of depth, force, pressure"),
         ("depht=4mm", "found 'depht'"),

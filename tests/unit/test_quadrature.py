@@ -198,5 +198,5 @@ def test_a_tip_needs_a_radius(radius):
 
 
 def test_a_radius_in_millimetres_is_refused_with_the_value_in_metres():
-    with pytest.raises(ValueError, match=r"in metres, at most 1, not 20; 20 mm is 0\.02"):
+    with pytest.raises(ValueError, match=r"in metres, at most 1, got 20; 20 mm is 0\.02 m"):
         Fingertip(20.0)

@@ -89,10 +89,13 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("held", "told"),
     [
-        ({"other": FRAMES[0]}, r"no array 'frames', but other \(4, 6\)"),
-        ({"a": FRAMES, "b": FRAMES}, r"but a \(5, 4, 6\), b \(5, 4, 6\); rename the array"),
-        ({"other": np.array(["x"])}, "no array 'frames'"),
-        ({}, "found no array"),
+        ({"other": FRAMES[0]}, r"found other \(4, 6\), expected an array 'frames'"),
+        (
+            {"a": FRAMES, "b": FRAMES},
+            r"found a \(5, 4, 6\), b \(5, 4, 6\), expected an array 'frames'",
+        ),
+        ({"other": np.array(["x"])}, "expected an array 'frames'"),
+        ({}, "found no arrays, expected an array 'frames'"),
         ({"frames": FRAMES[0]}, r"expected \[n, rows, cols\]"),
         ({"frames": FRAMES[:0]}, "shape"),
         ({"frames": FRAMES.astype(complex)}, "expected numbers"),
@@ -101,7 +104,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
         ({"frames": FRAMES * 1e305}, "outside 0 to 65535"),
         ({"frames": FRAMES, "t": np.zeros(5)}, "expected increasing times"),
         ({"frames": FRAMES, "t": np.arange(4)}, "5 numbers"),
-        ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: not finite"),
+        ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: found a number that is not finite"),
         ({"frames": FRAMES, "live": np.ones(3)}, "live: found shape"),
         ({"frames": np.array([{}], dtype=object)}, "run.npz"),
     ],
@@ -119,7 +122,7 @@ def test_unreadable_files_are_reported(tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no zip")
     with pytest.raises(RecordingError, match=r"bad\.npz"):
         load_recording(tmp_path / "bad.npz", 1.0, 1.0)
-    with pytest.raises(RecordingError, match=r"no \.npy file"):
+    with pytest.raises(RecordingError, match=r"does not contain an \.npy file"):
         load_recording(tmp_path, 1.0, 1.0)
     with pytest.raises(TactileError, match="found no file for the left finger"):
         replay("", VirtualClock())

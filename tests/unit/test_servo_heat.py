@@ -149,7 +149,7 @@ def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
     profile = tmp_path / "my.toml"
     profile.write_text("")
     assert main(["calibrate", "heat", str(profile), "--recording", str(RECORDING)]) == 1
-    assert "found 0 °C of temperature rise, expected at least 8 °C" in capsys.readouterr().err
+    assert "found a temperature rise of 0 °C, expected at least 8 °C" in capsys.readouterr().err
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
@@ -175,7 +175,7 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
         assert max(heat.sensed for heat in hand.plant.servo_heat) < LIMIT
         assert hand.plant.force.min() > 5.0
         told = heat_events(hand)
-        assert any("grip force reduced from 24.0 to" in text for _, text in told)
+        assert any("the grip force was reduced from 24.0 to" in text for _, text in told)
         assert {level for level, _ in told} == {"warning"}
         eased = hand.state.goal.force
         assert eased < 22.0

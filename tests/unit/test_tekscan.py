@@ -89,7 +89,7 @@ def test_a_single_frame_needs_no_frame_line():
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("ASCII_DATA @@", "", "no line ASCII_DATA"),
+        ("ASCII_DATA @@", "", "does not contain a line ASCII_DATA"),
         ("ROWS 2\n", "", "ROWS is missing"),
         ("ROWS 2", "ROWS two", "ROWS: found 'two'"),
         ("ROWS 2", "ROWS 99999", "ROWS: found"),
@@ -97,15 +97,15 @@ def test_a_single_frame_needs_no_frame_line():
         ("1.27 mm", "-1.27 mm", "ROW_SPACING"),
         ("UNITS RAW", "UNITS stone", "UNITS"),
         ("0.04", "-1", "SECONDS_PER_FRAME"),
-        ("Frame 6 0.08 s", "Frame 3", "line 19: frame 3 after frame 4"),
+        ("Frame 6 0.08 s", "Frame 3", "line 19: found frame 3 after frame 4"),
         ("Frame 6 0.08 s", "Frame six", "line 19"),
-        ("7,255,1", "7,255", "line 17: 2 cells, expected 3"),
+        ("7,255,1", "7,255", "line 17: found 2 cells, expected 3"),
         ("7,255,1", "7,,1", "line 17"),
         ("7,255,1", "7,nan,1", "line 17: found a cell that is not a number"),
         ("7,255,1", "7,-255,1", "row 2, cell 2 is -255"),
         ("7,255,1", "7,inf,1", "row 2, cell 2 is inf"),
-        ("7,255,1\n", "", "rows of frame 4: found 1, expected 2"),
-        ("3,4,5\n", "", "the file ends in frame 6: 1 rows of 2"),
+        ("7,255,1\n", "", "frame 4 has 1 of 2 rows"),
+        ("3,4,5\n", "", "the file ends in frame 6, which has 1 of 2 rows"),
         ("3,4,5\n", "3,4,5\n6,7,8\n", "line 22"),
     ],
 )
@@ -124,5 +124,7 @@ def test_an_export_is_read_as_a_recording(tmp_path):
     path.write_text(EXPORT.replace("RAW", "kPa"))
     assert load_recording(path, 50.0, 100.0).counts[0, 1].tolist() == [140, 5100, 20]
     path.write_text("nothing")
-    with pytest.raises(RecordingError, match=r"run\.asf: found no line ASCII_DATA"):
+    with pytest.raises(
+        RecordingError, match=r"run\.asf: the file does not contain a line ASCII_DATA"
+    ):
         load_recording(path, 4.0, 100.0)

@@ -99,7 +99,10 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
     command(daemon, "grasp", force=6.0)
     assert greatest_force(daemon, 3.0) < 4.0
     assert daemon.loop.state.fault_name == "joint.swapped"
-    assert "is stationary: check whether servos.ids are swapped" in daemon.loop.state.fault
+    assert (
+        "is stationary: check whether the servo IDs are swapped (servos.ids)"
+        in daemon.loop.state.fault
+    )
     assert not daemon.hand.torque_on.any()
 
 
@@ -113,8 +116,8 @@ def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
     assert greatest_force(daemon, 1.0) < 10.0
     assert daemon.loop.state.fault_name == "joint.swapped"
     assert (
-        "opposite to the commanded direction: check whether servos.ids are swapped"
-        in daemon.loop.state.fault
+        "in the direction opposite to the command: check whether the servo IDs are swapped "
+        "(servos.ids)" in daemon.loop.state.fault
     )
 
 
@@ -180,5 +183,5 @@ def test_fingers_that_stand_in_the_approach_are_reported(make):
         daemon.loop.advance(0.02)
     daemon.loop.advance(1.0)
     (told,) = [text for level, kind, text in events if kind == "joint.blocked"]
-    assert told.startswith("left joint has stopped at 3")
+    assert told.startswith("the left joint has stopped at 3")
     assert told.endswith("correct servos.direction")

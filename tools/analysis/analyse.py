@@ -140,8 +140,8 @@ def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
         if noise > _NOISE_RATIO * tactile.noise:
             cause = f"the measured cell noise is {noise:.0f} Pa: set tactile.noise to this value"
     return (
-        f"  no contact in any frame: largest reading {found}{pressure:.4g} Pa, threshold "
-        f"{level:.4g} Pa ({PEAK_LEVEL:g} times tactile.noise); {cause}\n"
+        f"  no contact in any frame: the largest reading is {found}{pressure:.4g} Pa, and the "
+        f"threshold is {level:.4g} Pa ({PEAK_LEVEL:g} times tactile.noise); {cause}\n"
     )
 
 
@@ -240,8 +240,8 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
         changes["pitch"], changes["pitch_y"] = recording.pitch
     elif (rows, cols) != (tactile.rows, tactile.cols):
         raise SettingsError(
-            f"{path}: frames of {rows} × {cols} cells, expected {tactile.rows} × {tactile.cols}: "
-            "set tactile.rows, tactile.cols and tactile.pitch"
+            f"{path}: found frames of {rows} × {cols} cells, expected {tactile.rows} × "
+            f"{tactile.cols}: set tactile.rows, tactile.cols and tactile.pitch"
         )
     settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
     for warning in sensor_warnings(settings):

@@ -168,7 +168,7 @@ def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None
     except RecordingError as error:
         return None, str(error).removeprefix(f"{recording.path}: ")
     except (SettingsError, TactileError, ValueError) as error:
-        return None, f"can't build the contact model of its settings: {error}"
+        return None, f"can't build the contact model from the recorded settings: {error}"
 
 
 def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
@@ -182,7 +182,7 @@ def draw_time(run: RecordedRun) -> Figure:
     The bands are one standard deviation. Grey lines are the goals.
     """
     if not run.t.size:
-        raise Missing("contains no hand/state")
+        raise Missing("the recording does not contain hand/state")
     figure = style.new_figure(7.2, 8.0)
     panels = figure.subplots(len(_AGAINST_TIME), 1, sharex=True)
     for panel, (label, factor, field, goal) in zip(panels, _AGAINST_TIME, strict=True):
@@ -202,7 +202,7 @@ def draw_time(run: RecordedRun) -> Figure:
         panel.set_ylabel(label)
         panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1)
     panels[-1].set_xlabel("time [s]")
-    _titled(figure, run, "force, angle and displacement against time")
+    _titled(figure, run, "force, angle and displacement versus time")
     return figure
 
 
@@ -300,7 +300,7 @@ def draw_landscape(run: RecordedRun) -> Figure:
         above.plot(run.t, over, label=name, **LINES[name])
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
     above.axhline(0.0, color=style.GREY, linewidth=0.6)
-    above.set_ylabel("U minus its value at θ = 0\nand the same d [mJ]")
+    above.set_ylabel("U(d, θ) − U(d, 0) [mJ]")
     above.set_xlabel("time [s]")
     _titled(figure, run, "path on the energy landscape")
     return figure

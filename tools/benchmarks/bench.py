@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 MEASUREMENTS = {
     "estimator": (
-        "run time and error of force and energy lookups and of the estimate of d and tilt from "
+        "run time and error of the force and energy lookups, and of estimating d and tilt from "
         "frames"
     ),
     "tick": "run time of ticks, in one process and over ptys",
-    "control": "remaining error of the object's angle with each grip law",
-    "reflex": "sudden load increases on a grip: success, slip distance and reaction time",
-    "faults": "true force of grips with faulty measurements (15 minutes)",
+    "control": "remaining object angle error for each grip law",
+    "reflex": "response to sudden load increases: success, slip distance and reaction time",
+    "faults": "true grip force with faulty measurements (15 minutes)",
     "robustness": "true grip force of hands that differ from their settings",
 }
 # These benchmarks run on virtual time, so other load on the machine does not affect them.
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"what to measure: {known}; if omitted, print one page with the main results, which "
+        help=f"what to measure: {known}; by default, print one page with the main results, which "
         "takes about a minute",
     )
     parser.add_argument(

@@ -182,7 +182,9 @@ def measure(
         if rows:
             note = f"  not met: {missed} of {len(rows)}"
             reports.append(
-                Report(f"force over commanded force: {aim}", rows, notes=(note,), failed=missed > 0)
+                Report(
+                    f"true force / commanded force: {aim}", rows, notes=(note,), failed=missed > 0
+                )
             )
     return reports
 

@@ -270,7 +270,7 @@ def measure(
         table = [_row(case, [next(outcomes) for _ in seeds]) for case in rows]
         failed = any(row["passed"] < trials for row in table)
         reports.append(
-            Report("true force over commanded force, one difference", table, failed=failed)
+            Report("true force / commanded force, one difference per case", table, failed=failed)
         )
     if hands:
         reports.append(_ensemble(hands, [next(outcomes) for _ in hands]))
@@ -308,12 +308,14 @@ def _ensemble(hands: list[HandCase], found: list[Outcome]) -> Report:
         share("true force within 20 %", "≥ 90 %", sum(each <= _ERROR_MAX for each in off)),
         share("within 30 %", "≥ 98 %", sum(each <= _ERROR_FAR for each in off)),
         share(
-            "above 1.4 for 0.1 s without load", "0", sum(e.above > _EXCESS_TIME_MAX for e in found)
+            "force above 1.4 for 0.1 s without a load",
+            "0",
+            sum(e.above > _EXCESS_TIME_MAX for e in found),
         ),
         share("objects lost", "≤ 1 %", sum(e.lost for e in loaded), max(len(loaded), 1)),
-        share("healthy channel reported", "≤ 2 %", sum(bool(e.accused) for e in found)),
+        share("healthy measurement channel reported", "≤ 2 %", sum(bool(e.accused) for e in found)),
         share("never held", "", sum(not each.held for each in found)),
         share("released", "", sum(math.isnan(each.settled) for each in found)),
-        share("force increased without load", "", sum(each.raised for each in found)),
+        share("force increased without a load", "", sum(each.raised for each in found)),
     ]
     return Report(f"{count} random hands", rows)

@@ -43,12 +43,12 @@ _EPILOG = """\
 steps of a hand; FILE is a profile, copied from that of --config if it does not exist:
   joints       you close, open and straighten each finger by hand, with torque off; determines the
                servo, direction, zero and range of each finger
-  heat         temperature rise and time constants of the servo of --finger, from the recording of a
-               grip of some minutes that starts with a cold servo
+  heat         temperature rise and time constants of the servo of --finger, from a recording of a
+               grip that lasts some minutes and starts with a cold servo
   friction     friction of each joint without contact; the running daemon sweeps the joint back and
                forth, or use a recording of such a motion
   latency      latency of the frames; the running daemon grasps an object with several forces
-               (--force: the first), or use a recording of such a grip
+               (--force is the first), or use a recording of such a grip
 
 steps of a tip, in this order; each step adds its result to FILE:
   tare         zero offset of each cell, noise and its correlation, drift; without load
@@ -146,7 +146,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.compression and step != "law":
         from softfinger.kinematics.calibration.calibration import CalibrationError
 
-        raise CalibrationError(f"--compression: found the step {step}, expected law")
+        raise CalibrationError(
+            f"--compression: found the step {step}, but only the step law uses this file"
+        )
     if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file
     settings = profile(arguments)
@@ -255,7 +257,7 @@ def _last_state(arguments: argparse.Namespace) -> HandState:
     path = arguments.recording[-1]
     last = deque(Recording(path).messages({STATE}), maxlen=1)
     if not last:
-        raise CalibrationError(f"{path}: contains no {STATE.decode()}")
+        raise CalibrationError(f"{path}: the recording does not contain {STATE.decode()}")
     return read(HandState, last[0][1])
 
 

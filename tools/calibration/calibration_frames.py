@@ -71,7 +71,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
             if recording.counts.shape[1:] != (sensor.rows, sensor.cols):
                 found = " × ".join(map(str, recording.counts.shape[1:]))
                 raise RecordingError(
-                    f"{path}: frames of {found} cells, expected {sensor.rows} × {sensor.cols}"
+                    f"{path}: found frames of {found} cells, expected {sensor.rows} × {sensor.cols}"
                 )
             if wrong := pitch_difference(recording, sensor.pitch):
                 raise RecordingError(f"{path}: {wrong}")

@@ -88,7 +88,7 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     try:
         text = read_file(path).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise CalibrationError(f"{path}: found no UTF-8 text, expected a CSV file") from None
+        raise CalibrationError(f"{path}: not UTF-8 text; expected a CSV file") from None
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1)
              if line.strip(" \t;,") and not line.startswith("#")]  # fmt: skip
     if not lines:
@@ -122,7 +122,8 @@ def _columns(path: Path, header: list[str], below: list[str]) -> dict[str, tuple
             continue
         if name in found:
             raise CalibrationError(
-                f"{path}: found {header[found[name][0]]!r} and {title!r}, expected one {name}"
+                f"{path}: found the columns {header[found[name][0]]!r} and {title!r}, expected one "
+                f"column with {name}"
             )
         unit = match[2] or match[3] or (below[k].strip("[]()") if k < len(below) else "")
         units = {each.replace("μ", "µ"): value for each, value in _QUANTITIES[name].units.items()}
@@ -178,8 +179,8 @@ def fit_files(
     """
     if settings.tip.physics == "measured":
         raise CalibrationError(
-            'law: found tip.physics = "measured", whose curves require frames; expected '
-            '"springs" or "solid"'
+            'law: found tip.physics = "measured", expected "springs" or "solid"; measured curves '
+            "require frames"
         )
     if theta and len(theta) != len(paths):
         raise CalibrationError(f"--theta: found {len(theta)} values for {len(paths)} files")
@@ -187,7 +188,7 @@ def fit_files(
     if any("strain" in file for file in files):
         if len(files) > 1 or settings.tip.physics != "springs":
             raise CalibrationError(
-                'law: stress and strain: expected one file, and tip.physics = "springs"'
+                'law: files with strain and stress: expected one file and tip.physics = "springs"'
             )
         return _stress_strain(calibration, paths[0], files[0])
     tilts = np.radians(theta or np.zeros(len(files))).tolist()
@@ -202,7 +203,9 @@ def _tests(path: Path, file: dict[str, FloatArray], theta: float) -> list[_Test]
     tests = []
     for rows in np.split(np.arange(len(tilt)), edges):
         if not len(rows):
-            raise CalibrationError(f"{path}: found no rows of numbers below the header")
+            raise CalibrationError(
+                f"{path}: the file does not contain any rows of numbers below the header"
+            )
         name = f"{path.name} at {math.degrees(tilt[rows[0]]):.3g}°"
         try:
             run = loading(file["displacement"][rows], file["force"][rows], float(tilt[rows[0]]))
@@ -245,7 +248,7 @@ def _force_law(
     if fits[0].score < best.score - _BETTER:
         lines.append(
             f"{_name(fits[0])} fits better, but F alone does not identify a model: compare the "
-            "models on frames of the sensor with `calibrate law --d`, then set tip.physics"
+            "models using sensor frames (`calibrate law --d`), then set tip.physics"
         )
     lines += [_run_line(test, zeros) for test, zeros in zip(tests, best.zeros, strict=True)]
     lines.append(f"for the profile: {_profile_line(wants, step)}")
@@ -286,12 +289,12 @@ def _run_line(test: _Test, zeros: FloatArray) -> str:
     before, pressed = np.count_nonzero(run.before), np.count_nonzero(run.pressed)
     told = (
         f"{test.name}: zero offset of d {zeros[0] * 1e3:.3f} ± {zeros[2] * 1e3:.3f} mm, of F "
-        f"{zeros[1]:.3f} ± {zeros[3]:.3f} N; fitted {pressed} rows to d = "
-        f"{(run.d.max() - zeros[0]) * 1e3:.2f} mm and {before} before the contact; excluded "
-        f"{len(run.d) - before - pressed} rows of the toe region"
+        f"{zeros[1]:.3f} ± {zeros[3]:.3f} N; fitted {pressed} rows up to d = "
+        f"{(run.d.max() - zeros[0]) * 1e3:.2f} mm and {before} rows before contact; excluded "
+        f"{len(run.d) - before - pressed} toe-region rows"
     )
     if run.dropped:
-        told += f", {run.dropped} of the unloading"
+        told += f" and {run.dropped} rows of the unloading"
         told += f" and of {run.cycles - 1} earlier cycles" * (run.cycles > 1)
     return told + "; the zero offset of F was not measured: start the run above the tip" * (
         not before
@@ -377,8 +380,8 @@ def _check_beginning(strain: FloatArray, stress: FloatArray) -> None:
     secant = stress[first[0]] / strain[first[0]]
     if secant < slope / _TOE or secant > slope * _TOE:
         raise CalibrationError(
-            f"found {secant / 1e3:.3g} kPa from 0 to the strain {strain[first[0]]:.3g}, then "
-            f"{slope / 1e3:.3g} kPa, which indicates a toe region or a zero offset; expected a "
-            f"curve through 0: subtract {-start / slope:.3g} from the strain, and remove the "
-            "points with negative strain"
+            f"found a modulus of {secant / 1e3:.3g} kPa up to a strain of {strain[first[0]]:.3g} "
+            f"and {slope / 1e3:.3g} kPa above it, which indicates a toe region or a zero offset; "
+            f"expected a curve through 0: subtract {-start / slope:.3g} from the strain, and "
+            "remove the points with negative strain"
         )

@@ -50,8 +50,8 @@ def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str
     unit = by_name(settings.servos.model).current_unit * settings.control.torque_constant
     if not unit:
         raise CalibrationError(
-            f"friction: servos.model: found {settings.servos.model}, expected one that measures "
-            "its current"
+            f"friction: servos.model: found {settings.servos.model}, expected a model that "
+            "measures its current"
         )
     if len(arguments.recording) > 1:
         raise CalibrationError("friction: expected at most one --recording")

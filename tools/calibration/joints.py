@@ -113,9 +113,9 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
         if not 0 <= encoder < reg.COUNTS_PER_TURN:
             raise ServoError(
                 f"servo {servo}: found a position of {encoder} counts, expected 0 to "
-                f"{reg.COUNTS_PER_TURN - 1} (one turn), because the position changes by a turn at "
-                "power-up: switch its supply off and on; if that does not help, mount the horn "
-                "half a turn further"
+                f"{reg.COUNTS_PER_TURN - 1} (one turn), because a servo loses its full turns when "
+                "its supply is switched off: switch the supply off and on; if the position is "
+                "still outside this range, mount the horn half a turn further"
             )
     return counts
 
@@ -126,8 +126,8 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
     servo, *others = sorted(moved, key=lambda k: -moved[k])
     if moved[servo] < _LEAST:
         raise CalibrationError(
-            f"{name} finger: found {math.degrees(moved[servo]):.1f}° between closed and open, "
-            f"expected at least {math.degrees(_LEAST):.0f}°"
+            f"{name} finger: found a range of {math.degrees(moved[servo]):.1f}° between closed and "
+            f"open, expected at least {math.degrees(_LEAST):.0f}°"
         )
     for other in others:
         if moved[other] > _ALONE * moved[servo]:
@@ -149,7 +149,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
     """
     if len(arguments.recording) != 1:
         raise CalibrationError(
-            "heat: expected --recording with a recording of one grip, made with softfinger record"
+            "heat: expected --recording FILE, a recording of one grip made with `softfinger record`"
         )
     found = read_recording(arguments.recording[0])
     law, finger = HeatLaw(), arguments.finger
@@ -185,8 +185,7 @@ def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any
         found = tomllib.loads(text)
     if found != wanted:
         raise SettingsError(
-            f"{source}: the file could not be changed; add these settings yourself: "
-            f"{', '.join(changes)}"
+            f"{source}: could not be changed; add these settings yourself: {', '.join(changes)}"
         )
     write_whole(arguments.file, text.encode())
     return changes

@@ -73,21 +73,21 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
         raise CalibrationError(f"latency: {error}") from None
     if fit.std > _STD_MAX:
         raise CalibrationError(
-            f"latency: found a standard deviation of {fit.std * 1e3:.1f} ms, expected at most "
+            f"latency: found a latency uncertainty of {fit.std * 1e3:.1f} ms, expected at most "
             f"{_STD_MAX * 1e3:g} ms: grasp with more force, and change the force several times"
         )
     if not _SCALE[0] < fit.scale < _SCALE[1] or fit.residual > _MISFIT_MAX:
         raise CalibrationError(
-            f"latency: found a ratio of d from the frames to d from the joints of {fit.scale:.2f} "
-            f"with a difference of {fit.residual * 1e3:.2f} mm rms, expected a ratio of "
-            f"{_SCALE[0]:g} to {_SCALE[1]:g} and at most {_MISFIT_MAX * 1e3:g} mm: grasp a flat "
-            "object that neither slides nor tilts"
+            f"latency: d from the frames is {fit.scale:.2f} times d from the joints (expected "
+            f"{_SCALE[0]:g} to {_SCALE[1]:g}), and the rms difference is "
+            f"{fit.residual * 1e3:.2f} mm (expected at most {_MISFIT_MAX * 1e3:g} mm): grasp a "
+            "flat object that neither slides nor tilts"
         )
     latency = round(max(set_latency + fit.delay, 0.0), 4)
     told = (
         f"{latency * 1e3:.1f} ± {fit.std * 1e3:.1f} ms (the daemon used {set_latency * 1e3:g} ms) "
         f"from {fit.ramps} ramps; d from the frames is {fit.scale:.2f} times d from the joints, "
-        f"difference {fit.residual * 1e3:.2f} mm rms"
+        f"rms difference {fit.residual * 1e3:.2f} mm"
     )
     return "\n  ".join([told, *write_keys(arguments, {"tactile": {"latency": latency}})])
 

@@ -154,14 +154,14 @@ def done(step: Step) -> Done:
     """Compute the step; may raise CalibrationError."""
     truths = step.loads.truths
     if not step.loads.frames:
-        raise CalibrationError("found no frame with d above 0 in this run")
+        raise CalibrationError("the run does not contain any frames with d above 0")
     for name, values in truths.items():
         if not np.isfinite(values).all():
             raise CalibrationError(f"{name}: found a value that is not finite")
     radius = step.settings.tip.radius
     if "d" in truths and (deepest := float(truths["d"].max())) > radius:
         raise CalibrationError(
-            f"d: found {deepest * 1e3:g} mm, expected at most the tip's radius, {radius * 1e3:g} mm"
+            f"d: found {deepest * 1e3:g} mm, expected at most {radius * 1e3:g} mm, the tip's radius"
         )
     if "theta" in truths and (most := float(np.abs(truths["theta"]).max())) >= 0.5 * math.pi:
         raise CalibrationError(f"theta: found {math.degrees(most):g}°, expected less than 90°")
@@ -199,7 +199,7 @@ def _equilibrate(step: Step) -> Done:
     result = _kept(EquilibrateStep, found, dead=dead)
     line = (
         f"{len(step.loads.frames)} pressures, cells differ by {found.spread:.2%} rms before and "
-        f"{found.residual:.2%} after; {dead} dead"
+        f"{found.residual:.2%} after; {dead} dead cells"
     )
     calibration = step.result(equilibrate=result, curve=None, **_UNDONE)
     return calibration, line, (Map("gain of each cell (0: dead cell)", found.gain),)
@@ -289,7 +289,7 @@ def _law(step: Step) -> Done:
     if d is None:
         raise CalibrationError("law: expected --d, or a run that contains d")
     if len(d) < 3 or np.ptp(d) <= 0.0:
-        raise CalibrationError("law: expected at least three presses with different d")
+        raise CalibrationError("law: expected at least three presses at different d")
     sensor = step.calibration.sensor
     grid = calibrated_grid(settings, FINGERS.index(sensor.finger), step.calibration)
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])

@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"figures: {', '.join(NAMES)} (default: all of these); {', '.join(BY_NAME)}: a minute",
+        help=f"figures: {', '.join(NAMES)} (default: all of these); {', '.join(BY_NAME)} (takes "
+        "a minute)",
     )
     parser.add_argument(
         "--out",

@@ -340,9 +340,9 @@ PAGES = {
         compression,
         (
             Panel(_forces, DEPTH, FORCE, "(a) force", (0, 8.2), (0, 78), "upper left"),
-            _error_panel("F", "(b) error of the force", "estimate over model − 1 [%]", 5.0),
-            _error_panel("d", "(c) error of the displacement", "estimate − truth [µm]", 75.0),
-            _error_panel("theta", "(d) error of the angle", "estimate − truth [deg]", 0.5),
+            _error_panel("F", "(b) force error", "estimate over model − 1 [%]", 5.0),
+            _error_panel("d", "(c) displacement error", "estimate − truth [µm]", 75.0),
+            _error_panel("theta", "(d) angle error", "estimate − truth [deg]", 0.5),
         ),
         rows=2,
         notes=(
@@ -363,7 +363,7 @@ PAGES = {
             Panel(_over_upright, RELATIVE, "U(θ)/U(0)", "(c) energy while rolling, over U(0)",
                   _PATH, (0.86, 1.085), "lower center"),
             Panel(_angle_errors, RELATIVE, "estimate − truth [deg]",
-                  "(d) error of the angle while rolling", _PATH, None,
+                  "(d) angle error while rolling", _PATH, None,
                   {"loc": "lower right", "ncols": 2}),
         ),
         rows=2,

@@ -88,7 +88,7 @@ def build_kernels(
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
-        text = f"{folder.path}: compiling {count} corrupted files again"
+        text = f"{folder.path}: recompiling {count} corrupted files"
         tell("warning", "compile", text)
     missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
     if not missing:
@@ -105,7 +105,7 @@ def build_kernels(
             "info", "compile", f"compiling with Numba alone, which takes twice as long: {why_plain}"
         )
     names = ", ".join(part.name for part in missing)
-    tell("info", "compile", f"compiling kernels, on the first start only: {names}")
+    tell("info", "compile", f"compiling kernels (only on the first start): {names}")
     started = time.monotonic()
     build = _Build(settings, missing, tell, Progress("compiling kernels", _kernels(missing), bar))
     build.run()

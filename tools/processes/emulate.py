@@ -43,9 +43,10 @@ faults; any number can be given, each in the form KIND[=VALUE][@START]:
 
 softfinger emulate --send "drop=0.01 left:frozen@2" changes a running emulator, through DIR/control.
 
-a plate on a test stage, which presses a tip instead of the object, to try out `calibrate`:
+a plate on a test stage, which takes the place of the object and presses on a tip, to try out
+`calibrate`:
   --send "press PRESSES" returns when the plate has reached its position
-  PRESSES is a list separated by commas; each press consists of some of these words:
+  PRESSES is a comma-separated list; each press consists of some of these words:
     depth=4mm      or force=5N, or pressure=10kPa on all cells, as from a bladder; 0mm lifts off
     tilt=10deg     tilt of the plate (0)
     speed=2mm/s    approach speed (5)
@@ -59,7 +60,8 @@ a person's hand, which turns joints while torque is off, to try out `calibrate j
   --send "turn left=closed right=open"   turns each joint to its stop, or to its
                                          zero position with zero; returns on arrival
 
-the object: --send place puts it back after it has slipped away, at standstill and without a load.
+the object: --send place puts it back after it has slipped away; the object is then at rest and
+without a load.
 
 the record of the servo bus, for testing a daemon: --send report prints it as JSON, --send forget
 starts a new record, and --send "report forget" does both without a gap:

@@ -148,7 +148,7 @@ def _serve(
         for line in recording.close().splitlines():
             log.plain(line)
         if recording.failed:
-            log.plain(f"softfinger: {arguments.record} is incomplete", "error")
+            log.plain(f"softfinger: the recording {arguments.record} is incomplete", "error")
     state, statistics = daemon.loop.state, daemon.loop.statistics
     if statistics.ticks:
         counts = {"ticks": statistics.ticks, "overruns": state.timing.overruns}

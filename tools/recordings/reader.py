@@ -67,7 +67,7 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     recording = Recording(Path(path))
     states = [read(HandState, message) for _, message in recording.messages({STATE})]
     if not states:
-        raise RecordingError(f"{path}: contains no {STATE.decode()}")
+        raise RecordingError(f"{path}: the recording does not contain {STATE.decode()}")
     columns = to_columns(states)
     return {"t": (columns["mono_ns"] - recording.zero) * 1e-9, **columns}
 
@@ -128,15 +128,16 @@ class Recording:
             names = ", ".join(sorted(self._other_names.values())[:_OTHERS_NAMED_MAX]) or "none"
             damage = f"; {self.damage}" if self.damage else ""
             raise RecordingError(
-                f"{path}: profile {self._profile!r}, expected {PROFILE!r} or channels of this "
-                f"stream, such as hand/state in JSON; its channels: {names}{damage}"
+                f"{path}: found the profile {self._profile!r} and the channels {names}, expected "
+                f"the profile {PROFILE!r} or channels of this stream, such as hand/state in "
+                f"JSON{damage}"
             )
         if self.others and self._say is not None:
             names = ", ".join([*self.others][:_OTHERS_NAMED_MAX])
             more = ", …" if len(self.others) > _OTHERS_NAMED_MAX else ""
             self._say(
-                f"{path}: {sum(self.others.values())} messages on {len(self.others)} channels "
-                f"from other programs were skipped ({names}{more})"
+                f"{path}: skipped {sum(self.others.values())} messages on {len(self.others)} "
+                f"channels from other programs ({names}{more})"
             )
 
     @property
@@ -211,7 +212,7 @@ class Recording:
                 if len(data) > (
                     _SETTINGS_SIZE_MAX if topic == schema.SETTINGS else _MESSAGE_SIZE_MAX
                 ):
-                    raise ValueError(f"a message of {len(data) >> 20} MB")
+                    raise ValueError(f"a message of {len(data) >> 20} MB, which is too large")
                 message = convert(_plain(loads(data)))
             except ValueError as error:
                 self._damaged(error)
@@ -283,7 +284,7 @@ class Recording:
     def _count(self, unpacked: int) -> None:
         self._left -= unpacked
         if self._left < 0:
-            raise ValueError("its unpacked data are suspiciously large for the size of the file")
+            raise ValueError("the unpacked data are suspiciously large for the size of the file")
 
     def _learn(self, content: bytes) -> None:
         from mcap.data_stream import ReadDataStream
@@ -406,7 +407,7 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
         if length > SIZE_MAX and kind == _MESSAGE:
             length, skipped = _BEFORE_DATA.size, length - _BEFORE_DATA.size
         elif length > (_CHUNK_SIZE_MAX if kind == _CHUNK else SIZE_MAX):
-            raise ValueError(f"a record of {length >> 20} MB")
+            raise ValueError(f"a record of {length >> 20} MB, which is too large")
         content = file.read(length)
         if len(content) < length:
             raise EOFError
@@ -435,7 +436,7 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
 def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
     """Unpack a chunk's records. Raises ValueError for a wrong checksum or an excessive size."""
     if size > _CHUNK_SIZE_MAX:
-        raise ValueError(f"a chunk of {size >> 20} MB")
+        raise ValueError(f"a chunk of {size >> 20} MB, which is too large")
     if method == "zstd":
         import zstandard
 

@@ -74,7 +74,7 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
     text, *calibrations = (message.get(name) for name in _SETTINGS)
     if not (isinstance(text, str) and all(isinstance(each, str) for each in calibrations)):
         raise RecordingError(
-            f"{recording.path}: its hand/settings message lacks {' or '.join(_SETTINGS)}"
+            f"{recording.path}: hand/settings does not contain {' or '.join(_SETTINGS)}"
         )
     try:
         settings = Settings.model_validate_json(text, strict=False)
@@ -82,7 +82,7 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
         first = error.errors(include_url=False, include_input=False)[0]
         where = "".join(f"{part}: " for part in first["loc"])
         raise RecordingError(
-            f"{recording.path}: its settings belong to another version: {where}{first['msg']}"
+            f"{recording.path}: the settings belong to another version: {where}{first['msg']}"
         ) from None
     return without_files(settings), [str(each) for each in calibrations]
 
@@ -114,15 +114,15 @@ def counts_of(
     """
     if message.get("unit") != "count":
         raise RecordingError(
-            f"{recording.path}: frames in {message.get('unit')!r}, expected counts: "
+            f"{recording.path}: found frames in {message.get('unit')!r}, expected counts: "
             'record with stream.tactile_unit = "count"'
         )
     shape, expected = (message["rows"], message["cols"]), settings.tactile
     if shape != (expected.rows, expected.cols):
         raise RecordingError(
-            f"{recording.path}: its frames have {shape[0]} × {shape[1]} cells, expected the "
-            f"settings' {expected.rows} × {expected.cols}: the recording or the settings belong "
-            "to another hand"
+            f"{recording.path}: found frames of {shape[0]} × {shape[1]} cells, expected "
+            f"{expected.rows} × {expected.cols} as in the settings: the recording or the settings "
+            "belong to another hand"
         )
     return np.frombuffer(message["data"], "<u2").reshape(shape)
 
@@ -148,7 +148,7 @@ def recompute(
         _run(result, recording, settings or own, calibrations, progress)
     except (LookupError, TypeError, ValueError, ArithmeticError, struct.error) as error:
         raise RecordingError(
-            f"{recording.path}: its messages do not form complete ticks: {error!r}"
+            f"{recording.path}: the messages do not form complete ticks: {error!r}"
         ) from error
     return result
 
@@ -220,9 +220,9 @@ def _ticks(
         if topic == schema.TACTILE:
             if message.get("seq_step") != 1:
                 raise RecordingError(
-                    f"{recording.path}: contains one in {message.get('seq_step')} frames, "
-                    "expected all frames: record with stream.tactile_rate equal to the sensors' "
-                    "rate"
+                    f"{recording.path}: found only 1 of {message.get('seq_step')} frames, expected "
+                    "all frames: set stream.tactile_rate to the frame rate of the sensors and "
+                    "record again"
                 )
             finger = FINGERS.index(message["finger"])
             frames[finger, message["seq"]] = counts_of(recording, message, used)

@@ -228,7 +228,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Record until the end. Return 1 if the recording is incomplete. Raises SoftfingerError."""
     if arguments.recover:
         messages, damage = recover(arguments.file)
-        state = f"was corrupted ({damage}); only the intact part was kept" if damage else "sound"
+        state = f"was corrupted ({damage}); only the intact part was kept" if damage else "intact"
         print(f"{arguments.file}: {messages} messages; {state}")
         return 0
     with StopCondition(arguments.duration, arguments.lifeline) as ending:

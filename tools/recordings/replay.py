@@ -140,7 +140,7 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
         )
     for count, what in ((result.missing_ticks, "ticks"), (result.missing_frames, "frames")):
         if count:
-            print(f"{count} {what} are missing in the recording")
+            print(f"{count} {what} are missing from the recording")
     if not result.differences:
         print("all states are bit-identical")
         return 0

@@ -197,9 +197,9 @@ def _keep(
 ) -> None:
     frictions, masses, sizes = axes
     lines = [
-        "# Objects that the hand holds, by `softfinger envelope --keep`; a row for each friction "
-        "and mass,",
-        "# a letter for each size: "
+        "# Objects that the hand holds, computed by `softfinger envelope --keep`; one row for each "
+        "friction and mass,",
+        "# one letter for each size: "
         + ", ".join(f"{k} {text}" for k, text in OUTCOME_TEXTS.items()),
         f"force = {force!r}",
         f"raised = {increased_force_limit(settings, force)!r}",

@@ -131,7 +131,7 @@ class MonitorPage:
             badge = _BADGES["disarmed"]
         left = Text.assemble((" softfinger ", "bold"), (f" {feed.mode.upper() or '—'} ", badge))
         if status == "waiting":
-            right = Text("○ no stream has arrived yet ", WARN)
+            right = Text("○ waiting for the stream ", WARN)
         elif status == "live":
             right = Text.assemble(("● live ", GOOD), (f"{format_value(feed.rate, 0)} Hz ", DIM))
         else:
@@ -145,7 +145,7 @@ class MonitorPage:
     def _notice(self, width: int, now: float, status: str) -> Text:
         feed = self.feed
         if status == "lost":
-            return Text(" the stream has stopped; everything below is old", BAD)
+            return Text(" the stream has stopped; the values below are outdated", BAD)
         if feed.fault:
             fault = truncated(Text(f" FAULT {feed.fault}"), width - len(self._way_out) - 1)
             line = justified(fault, Text(self._way_out), width)
@@ -157,8 +157,8 @@ class MonitorPage:
                 Text(what + " (or it requires --keys)" * (not self.guarded), WARN), width
             )
         if feed.state.schema != SCHEMA:
-            what = f" the stream has schema {feed.state.schema}, this page supports {SCHEMA}"
-            return Text(what + "and shows only known fields", WARN)
+            what = f" the stream uses schema {feed.state.schema}, but this page supports schema "
+            return Text(f"{what}{SCHEMA} and shows only known fields", WARN)
         lately = feed.waited(now)
         if lately > DELAY_MIN:
             what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"

@@ -180,7 +180,7 @@ class StreamState:
 
     def _read_frame(self, frame: schema.TactileFrame, now: float) -> None:
         if frame.finger not in FINGERS:
-            raise ValueError("not a frame of one of the fingers")
+            raise ValueError("found a frame of an unknown finger")
         known = 0.0 < frame.scale < math.inf
         grid = frame.counts.astype(np.float64) * (frame.scale if known else 1.0)
         aspect = frame.pitch_y / (frame.pitch or math.nan)
@@ -258,7 +258,7 @@ class StreamState:
             return ""
         is_raised = force > _INCREASED_RATIO * self.commanded
         raised = f", raised from {self.commanded:.1f} N" if is_raised else ""
-        turned = f", object to {angle:z.1f}°" if math.isfinite(angle) else ""
+        turned = f", object angle {angle:z.1f}°" if math.isfinite(angle) else ""
         return f"grip: goal {force:.1f} N{raised}{turned}"
 
     def age(self, now: float) -> float:
@@ -380,7 +380,7 @@ class Commander:
                 if overdue or (not each.warned and now - each.sent >= SILENCE_TIME):
                     each.warned = True
                     timeout = f"{REPLY_TIMEOUT:g} s"
-                    so_far = f"within {timeout}" if overdue else f"yet, waiting up to {timeout}"
+                    so_far = f"within {timeout}" if overdue else f"yet; waiting up to {timeout}"
                     self.refuse(now, f"{each.label}: no reply from {self._address} {so_far}")
                 if overdue:
                     self._close(each)

@@ -269,7 +269,7 @@ class Site:
         if name == "record":
             return self.record()
         if name != "stop" and math.isnan(age):
-            return f'✗ {name}: expected "seen", the time of its picture'
+            return f'✗ {name}: expected "seen", the time of the displayed picture'
         if name != "stop" and not age < self._stale:
             return f"✗ {name}: discarded because the page is {age:.0f} s behind"
         try:
@@ -327,7 +327,9 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
         address = _address(listener)
 
         def announce(code: str) -> None:
-            print(f"view: http://{address}/?code={code} opens in one browser", flush=True)
+            print(
+                f"view: http://{address}/?code={code} to view the hand in one browser", flush=True
+            )
 
         site = Site(loop, token, hand_on, foxglove, arguments.timeout, announce if away else None)
         period = 1.0 / arguments.rate
@@ -377,7 +379,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
             serving.join()
     _say(f"{pictures.seen} states received, {pictures.unreadable} messages could not be read")
     if pictures.seen == 0:
-        raise ViewError(f"{arguments.file or arguments.address}: received nothing to show")
+        raise ViewError(f"{arguments.file or arguments.address}: received no hand/state")
 
 
 def _address(listener: socket.socket) -> str:

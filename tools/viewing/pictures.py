@@ -385,7 +385,8 @@ class Pictures:
         ]
         if self.states and state.schema != schema.SCHEMA:
             notes.append(
-                f"the stream has schema {state.schema}, this page supports {schema.SCHEMA}"
+                f"the stream uses schema {state.schema}, but this page supports schema "
+                f"{schema.SCHEMA}"
             )
         return notes
 

@@ -32,12 +32,12 @@ def save(path: Path, recording: Recording, period: float, say: Callable[[str], N
     count = 1 + math.ceil(recording.duration / period)
     if count > _PICTURE_COUNT_MAX:
         raise ViewError(
-            f"{recording.path}: found {recording.duration:.0f} s, which is {count} pictures, "
+            f"{recording.path}: {recording.duration:.0f} s of recording require {count} pictures, "
             f"expected at most {_PICTURE_COUNT_MAX}; choose a lower --rate"
         )
     scenes, rows, seen = _pictures(recording, period, count, say)
     if seen == 0:
-        raise ViewError(f"{recording.path}: received nothing to show")
+        raise ViewError(f"{recording.path}: the recording does not contain hand/state")
     if path.suffix == ".svg":
         text = _moving(scenes, period)
     else:

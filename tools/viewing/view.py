@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_saved,
         metavar="OUT",
         help="save the recording and end: OUT.html is a page that plays without softfinger, "
-        "OUT.svg a moving picture of the hand",
+        "OUT.svg is an animated picture of the hand",
     )
     add_stream(parser, addresses)
     parser.add_argument(
@@ -69,8 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         default=3.0,
         metavar="S",
-        help="maximum age of a picture for which a command is still sent, and maximum time to "
-        "wait for the daemon's reply (default 3)",
+        help="discard a command if the displayed picture is older than this, and wait this long "
+        "for the daemon's reply (default 3)",
     )
     parser.add_argument(
         "--rate",
@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return 2
     if arguments.save is not None and arguments.file is None:
-        print("view: --save needs a recording, found no FILE.mcap", file=sys.stderr)
+        print("view: --save requires a recording: add FILE.mcap", file=sys.stderr)
         return 2
     arguments.address, arguments.commands = arguments.address
     require("view")

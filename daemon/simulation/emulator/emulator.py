@@ -389,11 +389,11 @@ class Emulator:
         for finger, _, pose in turns:
             if finger not in FINGERS or pose not in _TURN_GOALS or self._servos is None:
                 return (
-                    f"error: turn: expected left or right={'|'.join(_TURN_GOALS)}; the scene "
-                    "must have servos"
+                    "error: turn: expected left=POSE or right=POSE in a scene with servos; POSE is "
+                    f"one of {', '.join(_TURN_GOALS)}"
                 )
             if self._servos.bus.servos[FINGERS.index(finger)].torque_on:
-                return f"error: turn: torque is on in the {finger} servo, expected torque off"
+                return f"error: turn: torque of the {finger} servo is on; switch torque off first"
         for finger, _, pose in turns:
             joint = FINGERS.index(finger)
             self.hand.drive(

@@ -90,7 +90,9 @@ def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, lis
                 values[name] = _value(name, value)
         load = [name for name in _LOADS if name in values]
         if len(load) != 1:
-            raise PlateError(f"press {' '.join(words)!r}: expected one of {', '.join(_LOADS)}")
+            raise PlateError(
+                f"press {' '.join(words)!r}: expected exactly one of {', '.join(_LOADS)}"
+            )
         press = _press(values, table, scale)
         for finger in FINGERS if tip == "both" else (tip,):
             made.setdefault(finger, []).append(press)
@@ -108,9 +110,9 @@ def _value(name: str, text: str) -> float:
     except (ValueError, KeyError):
         value = math.nan
     if not math.isfinite(value) or (name != "tilt" and value < 0.0):
-        raise PlateError(f"press: {name}={text}: expected a number with {' or '.join(units)}")
+        raise PlateError(f"press: {name}={text}: expected a number in {' or '.join(units)}")
     if name == "speed" and value == 0.0:
-        raise PlateError("press: speed: expected a number above 0")
+        raise PlateError("press: speed: found 0, expected a number above 0")
     return value
 
 
@@ -126,8 +128,8 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
     force, *_, inside = lookup(table.data, d, theta)
     if d > d_max or not inside:
         raise PlateError(
-            f"press: expected at most {depths[-1] * 1e3:.2f} mm or {forces[-1]:.1f} N at "
-            f"{math.degrees(theta):g}° on this tip"
+            f"press: the load is too large; expected at most {depths[-1] * 1e3:.2f} mm or "
+            f"{forces[-1]:.1f} N on this tip at a tilt of {math.degrees(theta):g}°"
         )
     return PlatePress(d, theta, pressure, scale * float(force), values["speed"], values["hold"])
 

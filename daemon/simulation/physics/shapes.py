@@ -74,16 +74,15 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
     """
     points = np.array(corners, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or not 3 <= len(points) <= CORNERS:
-        raise ValueError(f"found corners {points.shape}, expected 3 to {CORNERS} pairs")
+        raise ValueError(f"corners: found shape {points.shape}, expected 3 to {CORNERS} pairs")
     if not np.isfinite(points).all():
-        raise ValueError("found a corner that is not finite, expected finite numbers")
+        raise ValueError("corners: found a number that is not finite, expected finite numbers")
     along = np.roll(points, -1, axis=0) - points
     turns = _cross(along, np.roll(along, -1, axis=0))
     whole = np.arctan2(turns, (along * np.roll(along, -1, axis=0)).sum(axis=1)).sum()
     if not ((turns > 0.0).all() and whole < 3.0 * math.pi):
         raise ValueError(
-            "found a polygon that is not convex or not counter-clockwise, expected a convex "
-            "polygon with its corners in counter-clockwise order"
+            "corners: expected the corners of a convex polygon in counter-clockwise order"
         )
     areas = _cross(points, np.roll(points, -1, axis=0))
     points -= ((points + np.roll(points, -1, axis=0)) * areas[:, None]).sum(axis=0) / (
@@ -113,8 +112,9 @@ def wedge(simulation: SimulationSettings) -> Shape:
     width = simulation.object_width
     if 2.0 * abs(leaning) >= width:
         raise ValueError(
-            f"the faces of the wedge meet: found simulation.object_width {width:g} m, expected "
-            f"above {2.0 * abs(leaning):.3g} m with this object_taper and object_height"
+            f"simulation.object_width: found {width:g} m, expected more than "
+            f"{2.0 * abs(leaning):.3g} m; otherwise the faces of a wedge with this object_taper "
+            "and object_height meet"
         )
     return polygon(_trapezoid(simulation, leaning))
 

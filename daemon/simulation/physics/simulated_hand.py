@@ -328,7 +328,7 @@ class SimulatedHand:
         if mode not in _MODES:
             raise ValueError(f"operating mode {mode} is not simulated; expected one of {_MODES}")
         if not (math.isfinite(goal_q) and math.isfinite(goal_current)):
-            raise ValueError(f"goals must be finite, not {goal_q!r} rad, {goal_current!r} A")
+            raise ValueError(f"goals must be finite, got {goal_q!r} rad, {goal_current!r} A")
         self._mode[joint] = mode
         self.torque_on[joint] = torque_on
         self._goal_q[joint] = goal_q

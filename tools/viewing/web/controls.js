@@ -31,7 +31,7 @@ function drop(why) {
 function transmit(lane, { message, answered }) {
   lane.busy++;
   say(`${message.command} …`);
-  let answer = `✗ ${message.command}: the page's server doesn't answer`;
+  let answer = `✗ ${message.command}: the page's server does not respond`;
   // Use a separate connection, because the picture connection may be closed.
   const line = new WebSocket(`ws://${location.host}/command${location.search}`);
   line.onopen = () => line.send(JSON.stringify(message));

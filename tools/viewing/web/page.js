@@ -183,7 +183,7 @@ function showAges() {
   put(one(".mode"), old ? "No stream" : picture.mode || "—");
   give(one(".mode"), "data-mode", picture.mode);
   const past = age === Infinity ? "no state yet" : `last state ${seconds(age)} s ago, then ${picture.mode}`;
-  const why = connected ? "" : "; the page's server doesn't answer";
+  const why = connected ? "" : "; the page's server does not respond";
   put(one(".stream"), old ? past + why : scene.live ? "live" : "recording");
   if (old && settings.force) showControls();
   const next = picture.patience.state + scene.period - age;
