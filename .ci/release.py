@@ -17,12 +17,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 CHANGELOG = "CHANGELOG.md"
-# Files that contain the version, and the pattern of their version line.
-VERSION_LINES = {
-    "softfinger/__init__.py": r'(?m)^(__version__ = ")(.*)(")$',
-    "lerobot_robot_softfinger/pyproject.toml": r'(?m)^(version = ")(.*)(")$',
-    "CITATION.cff": r"(?m)^(version: )(.*)()$",
-}
+# Lines that state the version, date or year of the release: file, quantity and pattern.
+RELEASE_LINES = (
+    ("softfinger/__init__.py", "version", r'(?m)^(__version__ = ")(.*)(")$'),
+    ("lerobot_robot_softfinger/pyproject.toml", "version", r'(?m)^(version = ")(.*)(")$'),
+    ("CITATION.cff", "version", r"(?m)^(version: )(.*)()$"),
+    ("CITATION.cff", "date", r"(?m)^(date-released: )(.*)()$"),
+    ("README.md", "version", r"(?m)^(  version = \{)(.*)(\},)$"),
+    ("README.md", "year", r"(?m)^(  year = \{)(.*)(\},)$"),
+)
 MAX_LINES = 40  # maximum number of changelog lines per release, not counting blank lines
 _UNRELEASED = "## [Unreleased]\n"
 
@@ -35,6 +38,12 @@ def sections(changelog: str) -> dict[str, str]:
     """Map each changelog version, and ``Unreleased``, to the text below its heading."""
     parts = re.split(r"(?m)^## \[(.+?)\].*\n", changelog)
     return dict(zip(parts[1::2], (text.strip() for text in parts[2::2]), strict=True))
+
+
+def stated(changelog: str, version: str) -> dict[str, str]:
+    """Return the version, date and year that the release lines contain."""
+    (date,) = re.findall(rf"(?m)^## \[{re.escape(version)}\] - (\S+)$", changelog)
+    return {"version": version, "date": date, "year": date[:4]}
 
 
 def dated(changelog: str, version: str, today: datetime.date) -> str:
@@ -82,17 +91,20 @@ def _parts(version: str) -> tuple[int, ...]:
 def prepare(version: str) -> None:
     """Write the version and the changelog date to the project files."""
     _parts(version)
-    ours = {CHANGELOG, *VERSION_LINES}
+    ours = {CHANGELOG, *(name for name, _, _ in RELEASE_LINES)}
     changed = {line[3:] for line in _git("status", "--porcelain").splitlines()}
     if others := sorted(changed - ours):
         raise ReleaseError(f"found uncommitted files, commit or stash them: {', '.join(others)}")
     if _git("tag", "--list", f"v{version}"):
         raise ReleaseError(f"VERSION: found the tag v{version}, expected a version without one")
     log = ROOT / CHANGELOG
-    log.write_text(dated(log.read_text("utf-8"), version, datetime.date.today()), "utf-8")
-    for name, pattern in VERSION_LINES.items():
+    changelog = dated(log.read_text("utf-8"), version, datetime.date.today())
+    log.write_text(changelog, "utf-8")
+    values = stated(changelog, version)
+    for name, quantity, pattern in RELEASE_LINES:
         text = (ROOT / name).read_text("utf-8")
-        (ROOT / name).write_text(re.sub(pattern, rf"\g<1>{version}\g<3>", text), "utf-8")
+        text = re.sub(pattern, rf"\g<1>{values[quantity]}\g<3>", text)
+        (ROOT / name).write_text(text, "utf-8")
 
 
 def build(version: str) -> None:

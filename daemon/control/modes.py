@@ -125,7 +125,7 @@ COMMANDS: dict[str, CommandKind] = {
     "grasp": CommandKind(
         frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING_MODES,
         "Closes the fingers until both tips are in contact, then presses with the given force. "
-        "If the hand already grips, only the force changes.",
+        "If the hand is already gripping, only the force changes.",
         {"force": _FORCE},
         ("warning",),
         {
@@ -150,7 +150,7 @@ COMMANDS: dict[str, CommandKind] = {
     "hold": CommandKind(
         frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING_MODES,
         "Follows setpoints that a program streams at 50 to 100 Hz. The first setpoint starts a "
-        "grasp, unless the hand already grips.",
+        "grasp, unless the hand is already gripping.",
         {
             "force": _FORCE._replace(
                 meaning="normal force of each tip; if it is omitted during a grip, the force does "
@@ -184,7 +184,7 @@ COMMANDS: dict[str, CommandKind] = {
     ),
     "stop": CommandKind(
         _ALL_MODES,
-        "Switches torque off immediately. Commands that are still waiting are refused as "
+        "Switches torque off immediately. Commands that are still waiting are rejected as "
         "`stopped`. `stop` itself is always accepted, even if the message contains unknown "
         "fields.",
         reply=("torque_off",),

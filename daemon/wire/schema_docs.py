@@ -75,11 +75,11 @@ bytes. The reason in the reply is then `request`.
 
 **Late commands.** If the daemon stalls, commands wait longer than their clients expect. The daemon
 therefore rejects outdated commands as `late`. `arm` and all commands that move the hand or change
-its grip are rejected if they are older than 0.2 s (or than `servos.watchdog`, if that is shorter).
+its grip are rejected if they are older than 0.2 s or `servos.watchdog`, whichever is shorter.
 `disarm`, `tare`, `clear`, and `hold` during a grip are accepted up to an age of 1 s. `status` and
 `stop` are always accepted.
 
-**Repeated commands.** To be able to repeat a late command safely, add a `key` to the command: a
+**Repeated commands.** To make a late command safe to repeat, add a `key` to the command: a
 unique string of 1 to 64 characters, for example a random number. To repeat the command, send the
 same map again. The daemon carries out the command at most once, and sends the reply of the executed
 command again for each further repetition. If the hand was stopped after the first rejection, the

@@ -1,4 +1,4 @@
-"""Test a release: its changelog section, and the same version in all files that state it."""
+"""Test a release: its changelog section, and the same version and date in all project files."""
 
 import datetime
 import importlib.util
@@ -35,10 +35,23 @@ def release():
     return module
 
 
-def test_every_file_states_the_version_of_the_package(release):
-    for name, pattern in release.VERSION_LINES.items():
+def test_every_file_states_the_version_of_the_package_and_its_date(release):
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    values = release.stated(changelog, softfinger.__version__)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", values["date"])
+    for name, quantity, pattern in release.RELEASE_LINES:
         (found,) = re.findall(pattern, (ROOT / name).read_text(encoding="utf-8"))
-        assert found[1] == softfinger.__version__, name
+        assert found[1] == values[quantity], name
+
+
+def test_the_bibtex_entry_matches_the_citation_file():
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (entry,) = re.findall(r"(?ms)^```\n@software\{softfinger,\n(.*?)^\}\n```$", readme)
+    for field, key in (("author", "  - name"), ("title", "title"), ("version", "version")):
+        (cited,) = re.findall(rf"(?m)^{key}: (.*)$", citation)
+        (found,) = re.findall(rf"(?m)^  {field} = \{{+(.*?)\}}+,$", entry)
+        assert found == cited, field
 
 
 def test_changelog_sections_are_short_and_start_with_unreleased(release):
