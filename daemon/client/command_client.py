@@ -84,10 +84,10 @@ def send(
 ) -> dict[str, Any]:
     """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
 
-    If the daemon refuses the command as late, it is sent again until ``timeout`` expires. If the
-    reply takes longer than 1 s, a warning is logged. If no logging handler exists, the warning is
-    printed to standard error. If the daemon runs on this machine under the same user, a ``stop`` is
-    sent over a local socket and bypasses other clients' queues.
+    If the daemon refuses the command as late, the client sends the command again until ``timeout``
+    expires. If the reply takes longer than 1 s, a warning is logged. If no logging handler exists,
+    the warning is printed to standard error. If the daemon runs on this machine under the same
+    user, a ``stop`` is sent over a local socket and bypasses other clients' queues.
     """
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
@@ -180,9 +180,9 @@ class HandClient(Generic[_Done]):
     """Base class of `Hand` and `AsyncHand`, which stores the addresses and defines the commands.
 
     A command raises Refused, with the reason, if the daemon refuses it, and NoAnswer if the daemon
-    does not reply. If the daemon refuses a command as late, it is sent again until ``timeout``
-    expires. ``arm``, ``disarm``, ``clear`` and ``release`` may be repeated: arming an armed hand is
-    not an error.
+    does not reply. If the daemon refuses a command as late, the client sends the command again
+    until ``timeout`` expires. ``arm``, ``disarm``, ``clear`` and ``release`` may be repeated:
+    arming an armed hand is not an error.
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context

@@ -18,9 +18,9 @@ within ±`friction` of its initial value. Because rubber relaxes, the offset may
 range by up to _RELAXATION_SHARE of the tip moment.
 
 **Load.** Friction hides a load of up to friction/load_arm, which is 2 N per tip for the default
-hand. Loads below half of the hidden load are ignored. The load that friction may hide is added to
-larger loads. Increasing the grip force by more than _UNCONFIRMED_SHARE requires confirmation: the
-object has rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
+hand. Loads below half of the hidden load are ignored. Larger loads are increased by the load that
+friction may hide. Increasing the grip force by more than _UNCONFIRMED_SHARE requires confirmation:
+the object has rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
 
 **Sudden events** increase the force immediately. A torque jump beyond the noise while both joints
 yield, or a shear jump in the frames of solid tips, increases the force to its limit. An object

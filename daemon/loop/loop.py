@@ -153,8 +153,8 @@ class Loop:
         """Run ticks for ``duration`` [s] of machine time or until `end`; leave torque unchanged.
 
         Deadlines are absolute. After a late tick, the next deadline is set to the current time to
-        avoid a burst of ticks. Real hardware has continued moving in the meantime, whereas the
-        clock of a simulated hand has paused.
+        avoid a burst of ticks. Real hardware continues to move during a late tick, whereas the
+        clock of a simulated hand pauses.
         """
         clock, timing = self._clock, self.state.timing
         clock.sleep_until(clock.now())  # The time before the first tick does not count as a delay.

@@ -455,7 +455,7 @@ def _measure_free_torque(
 def _check_current(grasp: GraspState, finger: int, current: float, goal: float, dt: float) -> float:
     """Return a joint's current [A]: its ``goal`` during a grip, otherwise the measured current.
 
-    Also measure the time for which both currents have differed by more than a servo's current
+    Also measure how long goal and measured current have differed by more than a servo's current
     controller allows.
     """
     is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + _CURRENT_NOISE

@@ -70,7 +70,7 @@ class Servos(Protocol):
     def torque_on(self) -> None:
         """Set the goal to the current angle, switch torque on and verify it.
 
-        Raises ServoError if this fails or cannot be verified; torque may then be on.
+        Raises ServoError if switching on fails or cannot be verified; torque may then be on.
         """
 
     def torque_off(self, reading: Reading) -> bool:

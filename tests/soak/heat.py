@@ -1,4 +1,6 @@
-"""Predict servo temperatures with unknown constants: ``python -m tests.soak.heat --runs 40``.
+"""Predict the temperatures of servos whose thermal constants are unknown:
+
+``python -m tests.soak.heat --runs 40``.
 
 Each run draws random values: a servo model; factors for heating, cooling and heat capacity (0.75 to
 1.33); the room temperature (15 to 35 °C); a current (1.15 to 1.8 times the maximum continuous

@@ -69,7 +69,7 @@ def bounded(value: float, limit: float) -> float:
 
 @inner_kernel
 def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
-    """Add the motors to the load; set the currents of ``k``, without the effect of the solution.
+    """Add the motors to the load; set the current rates in ``k`` for zero acceleration.
 
     A current lags behind its reference: i' = (r(q, ω) − i)/τ. The current's rate k decreases by
     (r_q g + r_ω) g/(τ + g) per unit of acceleration; the matrix contains this term.
@@ -225,7 +225,7 @@ def senses_other_tip(plant: Plant, finger: int) -> bool:
 
 @inner_kernel
 def sensed_contact_of(plant: Plant, finger: int) -> TipContact:
-    """Return a tip's sensed contact."""
+    """Return the contact that a tip's sensor measures."""
     if senses_other_tip(plant, finger):
         return plant.stages[0].on_tip[finger]
     return plant.stages[0].on_object[finger]
