@@ -161,8 +161,8 @@ class Gripping(ControlState):
     """Base class of the states in which the grip controller computes joint torques."""
 
     history: GripHistory
-    reached_for: float = 0.0  # time that force and angle have been at their targets [s]
-    near_for: float = 0.0  # time that the force error has been within _FRICTION_TOLERANCE [s]
+    reached_for: float = 0.0  # time for which force and angle have been at their targets [s]
+    near_for: float = 0.0  # time for which the force error has been within _FRICTION_TOLERANCE [s]
 
 
 @dataclass(kw_only=True)
