@@ -2,14 +2,14 @@
 # make test: run the first test tier on all processors.  make test-extended: run the second tier (tests marked
 # `extended`).  make test-all: run both tiers.  ARGS selects tests (ARGS=tests/unit) or adds pytest options (ARGS=-n0
 # uses one process). Test files named in ARGS run with their extended tests.
-# make test-arithmetic: repeat the numerical tests with different floating-point arithmetic.
+# make test-arithmetic: run the numerical tests again with different floating-point arithmetic.
 # make lowest: run the tests of servos, settings and messages with the oldest packages that pyproject.toml allows.
 # make docs: build the documentation site in build/site.
 # make newest: run a fast subset of the tests with the newest Python on this machine.
 # make release VERSION=1.2.3: set version and changelog, run all checks, build the packages, and print the publishing
 # commands.
 # Each target installs only its own requirements into .venv. PYTHON=python3.13 selects an interpreter (3.11 or later) with
-# a separate environment, e.g. .venv-3.13.
+# a separate environment, for example .venv-3.13.
 
 PYTHON ?= python3
 ifeq ($(origin PYTHON),command line)
@@ -18,16 +18,16 @@ else
 VENV := .venv
 endif
 BIN := $(VENV)/bin
-# With --no-compile, pip does not compile all modules, most of which are never imported.
+# The option --no-compile keeps pip from compiling all modules, most of which are never imported.
 PIP_INSTALL := -m pip --disable-pip-version-check install --no-compile
 # `make CONSTRAINTS=` installs the newest dependencies instead of the tested versions.
 CONSTRAINTS := --constraint constraints.txt
 INSTALL := $(BIN)/python $(PIP_INSTALL) $(CONSTRAINTS)
-WORKERS := $(shell expr $$(nproc) + 2) # more than processors, because some tests only wait
+WORKERS := $(shell expr $$(nproc) + 2) # more workers than processors, because some tests only wait
 # Coverage is measured on Python 3.12 and later, where its overhead is small.
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
 PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
-# Compile the kernels for both kinds of tips in advance, so that the test processes do not all compile them.
+# Compile the kernels for both kinds of tips in advance, so that the test processes do not all compile the same kernels.
 COMPILE = $(BIN)/softfinger compile --all && $(BIN)/softfinger compile --all --config solid
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 NEWEST_PIP := build/newest/bin/python $(PIP_INSTALL) --quiet $(CONSTRAINTS)
@@ -73,7 +73,7 @@ test-arithmetic: $(TO_TEST)
 	$(BIN)/python -m tests.harness.arithmetic pytest --numprocesses $$(nproc) --dist worksteal \
 		-m 'not extended' $(NUMERICAL_TESTS) $(ARGS)
 
-# Compile bytecode in advance, so that the test processes do not all compile it.
+# Compile the bytecode in advance, so that the test processes do not all compile the same modules.
 warm: $(TO_TEST)
 	-@$(BIN)/python -m pytest --collect-only --quiet >/dev/null
 
@@ -115,7 +115,7 @@ $(TO_RUN): pyproject.toml constraints.txt
 		|| { echo "softfinger needs Python 3.11 or later; say which with PYTHON=…"; exit 1; }
 	@echo "Setting up $(VENV) once: numpy, numba and seven small packages, about 100 MB to fetch."
 	@$(PYTHON) -m venv $(VENV)
-	@$(INSTALL) --quiet 'pip>=25.1' # first version with support for dependency groups
+	@$(INSTALL) --quiet 'pip>=25.1' # the first version that supports dependency groups
 	@$(INSTALL) --editable .
 	@$(BIN)/softfinger compile --config demo
 	@touch $@

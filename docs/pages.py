@@ -251,7 +251,7 @@ def limits() -> str:
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
         after = f"{lasts:g} s + " if lasts else ""
         if row.in_turn:
-            turns = 2 if lasts else 1  # one turn to detect the violation, and one to confirm it
+            turns = 2 if lasts else 1  # One turn detects the violation, and one turn confirms it.
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
         elif row.check:
             when = f"{after}one tick ({tick:g} ms)"

@@ -55,7 +55,7 @@ __all__ = ["MujocoHand", "SoftTips"]
 
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
-_ROWS = 4  # number of rows per tip: d, θ, shear along the tilt, shear across the tilt
+_ROWS = 4  # number of rows per tip: d, θ, and the shears along and across the tilt
 _GAP_MAX = 0.005  # maximum gap that can close within the next step [m]
 _VALUE_MIN = 1e-9  # smallest nonzero contact depth [m], friction force [N] and sin θ
 _SHEAR = 2  # row index of the shear along the tilt

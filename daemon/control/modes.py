@@ -16,7 +16,7 @@ class Mode(StrEnum):
     DISARMED = "disarmed"  # torque off
     ARMED = "armed"  # torque on, joints hold their positions
     MOVING = "moving"  # joints moving to commanded angles
-    GRASPING = "grasping"  # closing, or increasing the force
+    GRASPING = "grasping"  # closing the fingers or increasing the force
     HOLDING = "holding"  # holding force and object angle
     ROTATING = "rotating"  # rotating the object
     RELEASING = "releasing"  # opening the fingers

@@ -108,7 +108,7 @@ class SlipState(Record):
     deviation: float  # residual attributed to a load [N·m]
     moment: float  # moment of the tip forces when holding began [N·m]
     holding_time: float  # time since holding began, up to _SETTLING_TIME [s]
-    load: float  # load per tip, including the hidden part [N]
+    load: float  # load per tip, including the part hidden by friction [N]
     assumed_load: float  # maximum of `load`, solid-tip shear and declared load [N]
     is_confirmed: bool  # True if the load may increase the force by more than _UNCONFIRMED_SHARE
     pull: float  # average pull measured by solid tips [N]

@@ -47,8 +47,8 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
-# Maximum distance between a joint and its goal on arrival [rad]. This is five times the position
-# error that the default joint friction causes at the default servos.stiffness.
+# Maximum distance between a joint and its goal on arrival [rad]. The value is five times the
+# position error that the default joint friction causes at the default servos.stiffness.
 _ARRIVAL_DISTANCE = 0.03
 # Time allowed for a joint to arrive after its setpoint [s]. A joint that takes longer is held by
 # friction.
@@ -63,13 +63,13 @@ _HELD_FORCE_MAX = 0.12
 # finger, a friction of 0.05 N·m corresponds to a tenth of 6 N. The integral term removes this error
 # within seconds.
 _FRICTION_TOLERANCE = 0.1
-# Time after which the force counts as reached despite a friction error [s]. This is ten times the
-# settling time without friction.
+# Time after which the force counts as reached despite a friction error [s]. The value is ten times
+# the settling time without friction.
 _STUCK_TIME = 2.0
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
-# Time for which force and angle must stay at their targets [s]. This is five frames at 25 Hz and
-# twice the default smooth_time.
+# Time for which force and angle must stay at their targets [s]. The value is five frames at 25 Hz
+# and twice the default smooth_time.
 _SETTLING_TIME = 0.2
 # Tolerance of a streamed force, as a fraction of the force target. A streamed target may change
 # continuously, so a grip also settles while it follows a setpoint within this distance of the
@@ -78,11 +78,11 @@ _STREAM_TOLERANCE = 0.25
 # Smaller changes in a streamed setpoint or in the force increase are treated as noise. The units
 # are fractions of the force, and rad (1 σ of the angle).
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
-# Time without contact after which the contact counts as lost [s]. Two frames at 25 Hz fit into this
-# time.
+# Time without contact after which the contact counts as lost [s]. Two frames at 25 Hz are shorter
+# than this value.
 _CONTACT_LOSS_TIME = 0.1
-# Time for which the tips must appear to touch each other before the grip counts as empty [s]. It is
-# longer than one frame period at 25 Hz.
+# Time for which the tips must appear to touch each other before the grip counts as empty [s]. The
+# value is longer than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 
 
@@ -161,8 +161,8 @@ class Gripping(ControlState):
     """Base class of the states in which the grip controller computes joint torques."""
 
     history: GripHistory
-    reached_for: float = 0.0  # time that force and angle have been at their targets [s]
-    near_for: float = 0.0  # time that the force error has been within _FRICTION_TOLERANCE [s]
+    reached_for: float = 0.0  # time for which force and angle have been at their targets [s]
+    near_for: float = 0.0  # time for which the force error has been within _FRICTION_TOLERANCE [s]
 
 
 @dataclass(kw_only=True)
@@ -352,7 +352,7 @@ class Control:
         goal.force = goal.angle = math.nan
         if not goal.valid:
             return
-        current = self._current()  # for the state before any transition on this tick
+        current = self._current()  # current for the state before any transition on this tick
         if isinstance(self.state, Armed) and self.state.following_count:
             self.state.following_count -= 1
             self.fingers.hold_here()
@@ -387,8 +387,8 @@ class Control:
         # The tip must not exceed the commanded force if it reaches the object before the sensor
         # detects contact.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
-        # A joint that this torque does not move in free motion has more friction than the setting
-        # states. `free_torque` is the measured friction torque.
+        # If this torque does not move a joint in free motion, the friction of the joint exceeds the
+        # setting. `free_torque` is the measured friction torque.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 

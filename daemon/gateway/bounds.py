@@ -13,8 +13,8 @@ MEMORY_MAX = 128 << 20  # data segment limit [bytes]; Python and libzmq use a th
 DESCRIPTOR_COUNT = 64  # number of file descriptors in addition to those of clients
 CLIENT_COUNT_MAX = 256  # maximum number of connections, commands and stream combined
 STEP_CPU_TIME_MAX = 3.0  # CPU time limit of one step [s], after which the kernel ends the process
-# Elapsed time limit of one step [s]. It is higher than the CPU limit, because the process may have
-# to wait on a busy machine.
+# Elapsed time limit of one step [s]. This limit is higher than the CPU limit, because the process
+# may have to wait on a busy machine.
 STEP_TIME_MAX = 30.0
 # Longest poll interval [s]. After a longer interval, new requests are stamped with the time of the
 # previous poll.

@@ -48,7 +48,7 @@ class Client:
     def __init__(self, per_second: float, now: float) -> None:
         self.waiting: deque[Ask] = deque()
         self.urgent = False  # True while an urgent request awaits its reply
-        self._behind = False  # True from exceeding the rate until the client pauses
+        self._behind = False  # True after the client has exceeded the rate, until it pauses
         self._left = per_second
         self._then = now
 
@@ -79,7 +79,7 @@ class CommandEndpoint(Endpoint):
         self._too_many = refusal(text, Reason.BUSY)
         self._send_to_loop = send_to_loop
         self._clock = clock
-        self.refused = 0  # number of requests refused by rate and queue limits
+        self.refused = 0  # number of requests refused because of rate and queue limits
         self.stops = 0  # stop count stamped on new requests
         self._fence = 0  # current stop count
         self._last_poll = clock()

@@ -68,8 +68,8 @@ _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confir
 _NORMAL_FORCE_MIN = 1.0
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
 # A footprint that grows during the response time of the cells looks wider and flatter. These
-# factors are the relative changes per var(d)/d². They come from fitting a paraboloid to a mean of
-# paraboloids.
+# factors are the relative changes per var(d)/d². The factors come from fitting a paraboloid to a
+# mean of paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
 _SLOPE_SMOOTHING = 0.9  # low-pass coefficient of ∂ ln F/∂d, applied once per frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model

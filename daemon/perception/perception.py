@@ -138,7 +138,7 @@ class FingerPerception:
         self.changed_time = 0.0  # arrival time of the last frame that changed [s]
         # A recording that is played in a loop repeats its frames.
         self.repeats = RepeatDetector(settings.tactile.rate, tactile.backend != "replay")
-        self.estimate = ContactEstimate()  # from the last valid frame
+        self.estimate = ContactEstimate()  # estimate from the last valid frame
         active = getattr(sensor, "live", None)  # Some recordings lack cells.
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration

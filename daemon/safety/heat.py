@@ -38,7 +38,7 @@ _FRACTION_MAX = 0.97  # maximum ratio of new to old force for which a reduction 
 _FRACTION_MIN = 0.6  # minimum ratio of new to old force, because the first estimate is uncertain
 _SETTLING_TIME = 10.0  # time from a reduction to the next evaluation [s]
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
-# Winding fractions of the total heat capacity and thermal resistance.
+# Fractions of the total heat capacity and thermal resistance that belong to the winding.
 _WINDING_SHARE, _COUPLING_SHARE = 0.04, 0.4
 
 

@@ -44,7 +44,8 @@ _RESPONSE_TIME = 0.3  # time within which the measured force must follow [s]
 _STEP_TOLERANCE = 0.02  # step tolerance beyond the distance travelled at maximum velocity [rad]
 _DRIFT_MAX = 0.1  # allowed difference between the angle and the integrated velocity [rad]
 _DRIFT_TIME = 0.1  # time window of the drift check [s], which allows for velocity lag
-# Interval between readings above which the drift window restarts [s]. It must also exceed 3 ticks.
+# Interval between readings above which the drift window restarts [s]. The interval must also exceed
+# 3 ticks.
 _LATE_TIME = 0.02
 _FAILURE_TIME = 0.72  # time constant of the fraction of failed readings [s]
 _FAILED_FRACTION_MAX = 0.75  # fraction that is reached after 1 s without a valid reading
@@ -169,8 +170,8 @@ def _touches(contact: Contact) -> bool:
     return contact.valid and contact.contact
 
 
-# A check receives the fraction of the bound to apply. It returns a description of the violation, or
-# "" if there is none. Checks do not modify the state, and NaN violates every bound.
+# A check receives the fraction of the bound to apply. The check returns a description of the
+# violation, or "" if there is none. Checks do not modify the state, and NaN violates every bound.
 Check = Callable[[View, State, float], str]
 FingerCheck = Callable[[View, State, float, int], str]
 

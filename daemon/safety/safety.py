@@ -23,8 +23,8 @@ from softfinger.daemon.types import Goal, State
 _REPEAT_TIME = 1.0  # time without a violation after which a warning may be repeated [s]
 _HYSTERESIS = 0.95  # fraction of the bound below which a reported warning clears
 
-BUS = "servos.bus"  # limit name for errors of the servo backend
-TORQUE_OFF = "torque.off"  # limit name for an unconfirmed torque off, see `safety.torque_state`
+BUS = "servos.bus"  # name of the limit for errors of the servo backend
+TORQUE_OFF = "torque.off"  # limit for an unconfirmed torque off, see `safety.torque_state`
 
 
 class Breach(NamedTuple):

@@ -133,7 +133,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 known = sender == BROADCAST_ID if fast_option else sender <= MAX_ID
                 if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != INST_STATUS:
                     self.skipped_bytes += 1
-                    del buffer[0]  # This byte is an echo of the request, or noise.
+                    del buffer[0]  # Skip an echo of the request, or noise.
                     continue
                 end = 7 + length
                 if len(buffer) >= end:

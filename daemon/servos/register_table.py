@@ -27,8 +27,8 @@ from softfinger.daemon.servos.joint import JointScale
 # A read takes the sum of both servos' return delays. With delays longer than 50 µs, a read would
 # exceed a tick at 500 Hz.
 RETURN_DELAY_MAX: Final = 25
-# Drive mode bits that must be clear. They make a servo follow another servo, or switch torque on
-# when a goal is written.
+# Drive mode bits that must be clear. These bits make a servo follow another servo, or switch torque
+# on when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
 _STARTUP_FIRMWARE = 45

@@ -18,10 +18,10 @@ from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
-_SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest one
+_SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest frame
 _MARKER_COUNT_MAX = 96  # number of markers stored to recognise another grid size
 _GAP_TIME = 1e-3  # minimum gap between frames [s]
-_CELL_COUNT_MIN = 16  # minimum number of cells; ``AA 55`` pairs closer together are image content
+_CELL_COUNT_MIN = 16  # minimum number of cells between markers; a closer ``AA 55`` is image content
 
 
 class FlexiTacDecoder(Decoder):

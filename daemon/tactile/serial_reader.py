@@ -93,7 +93,7 @@ class SerialReader:
         self._bytes = 0
         self._error = ""
         self._port_lost = False
-        self._event = threading.Event()  # set at the first frame, or when the port is lost
+        self._event = threading.Event()  # set at the first frame or when the port is lost
         self._thread: threading.Thread | None = None
         self._port: serial.Serial | None = None
         self._stop: tuple[int, int] | None = None

@@ -176,7 +176,7 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
             "the force does not increase with d; expected positive d and F in compression"
         )
     begin = float(d[0])
-    for _ in range(4):  # Each pass improves the zero of F from the rows before contact, if any.
+    for _ in range(4):  # Each pass improves the zero offset of F from the rows before contact.
         steep = rise > _STEEP * most
         if (count := np.count_nonzero(steep)) < 3:
             raise CalibrationError(

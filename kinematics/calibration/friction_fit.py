@@ -19,11 +19,10 @@ _GAP_MAX = 0.035  # maximum gap in the data across which values are interpolated
 # Speed above which static friction has mostly vanished [rad/s]. For the XL330, this speed is 0.12
 # rad/s.
 _SLIDING_SPEED = 0.2
-# Speed below which a joint is at standstill [rad/s]. It corresponds to one count of 1.5 mrad in
-# 0.08 s.
+# Speed below which a joint is at standstill, one count of 1.5 mrad in 0.08 s [rad/s].
 _REST_SPEED = 0.02
-# Travel from standstill at which a joint breaks away [rad]. It is three counts, or ten times the
-# gear compliance.
+# Travel from standstill at which a joint breaks away [rad]. This travel is three counts, or ten
+# times the gear compliance.
 _BREAK_AWAY_DISTANCE = 5e-3
 # Maximum goal velocity at break-away [rad/s], and number of steps over which it applies. The limit
 # keeps the inertial torque small.
@@ -44,7 +43,7 @@ class FrictionFit(NamedTuple):
     coulomb_std: float
     viscous: float  # [N·m·s/rad]
     viscous_std: float
-    stiction: float  # friction at break-away; NaN after fewer than three slow starts
+    stiction: float  # break-away friction; NaN if fewer than three slow starts were recorded
     stiction_std: float
 
 

@@ -39,7 +39,8 @@ FloatArray = NDArray[np.float64]
 # Number of Gauss points per piece. With 14 points, ∂F/∂θ has an error of 1e-10. With 18 points,
 # only rounding errors remain.
 _NODES = 18
-_NODES_HIGH_DEGREE = 26  # for laws above degree 8, where 18 points may give an error of 1e-11
+# Number of points for laws above degree 8; 18 points may give an error of 1e-11.
+_NODES_HIGH_DEGREE = 26
 _PIECE_MIN = 2.0**-14  # minimum size of a graded piece, relative to the scale of the singular point
 
 
@@ -118,15 +119,15 @@ def ratios(
     first_t = polynomials[2, 0]
     count = circle.shape[1]
     nodes = gauss.shape[1]
-    # The integrand has poles at y² = −2 sin θ and, unless y0 = 0, at y = 0. For h = 0, it has no
-    # poles.
+    # The integrand has poles at y² = −2 sin θ and, unless y0 = 0, at y = 0. For h = 0, the
+    # integrand has no poles.
     start = max(2.0 * y0, _PIECE_MIN * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0
     sum_fd = 0.0
     sum_ft = 0.0
     sum_ut = 0.0
-    low = 0.0  # y − y0 at the lower end of the piece
+    low = 0.0  # value of y − y0 at the lower end of the piece
     while low < span:
         high = max(start, 2.0 * (y0 + low)) - y0
         if not high < 0.75 * span:

@@ -45,7 +45,7 @@ class Table(Record):
     splits: int  # pieces per slab
     radius: float  # [m]
     inverse_radius: float
-    modulus: float  # at zero strain [Pa]
+    modulus: float  # modulus at zero strain [Pa]
     deepest: float  # maximum d [m]
     tilt: float  # maximum |θ| of a solid tip [rad]
     by_root: float  # 2/(maximum t)

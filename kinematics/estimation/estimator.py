@@ -318,7 +318,7 @@ class ContactEstimator:
         tabulate_moments(state.moments, grid, tip, material, options.deepest)
         records: Any = state.estimate.array
         self._estimate = records
-        self._results = self._estimate[list(_RESULTS)]  # This result is a view.
+        self._results = self._estimate[list(_RESULTS)]  # The result is a view of the estimate.
         self._seq: int | None = None
         self._last = ContactEstimate(
             cells_per_sample=state.budget.cells_per_sample,

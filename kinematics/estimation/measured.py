@@ -223,8 +223,9 @@ class MeasuredEstimator:
         shown, shown_t, shown_q = _curve(law.shown, t, q)
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        # Partials of the sum and of the moment along the tilt with respect to d and s. The last
-        # partial is that of the moment across the tilt with respect to the tilt in that direction.
+        # Partial derivatives of the sum and of the moment along the tilt with respect to d and s,
+        # followed by the derivative of the moment across the tilt with respect to the tilt in that
+        # direction.
         by_d = shown_t * per_d, s * (shown_t * per_d * lever + shown * lever_t * per_d)
         b = 2.0 * s * shown_q
         by_s = b, shown * lever + s * (b * lever + shown * 2.0 * s * lever_q)

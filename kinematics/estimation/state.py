@@ -38,7 +38,7 @@ class Options(Record):
     peak_level: float  # [noise standard deviations]
     patch_level: float
     r_squared_min: float
-    modulus: float  # at zero strain [Pa]
+    modulus: float  # modulus at zero strain [Pa]
     blur: float  # standard deviation [m]
     rotation: float  # rotation of the sensor [rad]
     iterations: int
@@ -97,7 +97,7 @@ class Estimate(Record):
     residual: float  # sum of (reading − model)² − reading² over the footprint [Pa²]
     undetected: float  # relative error of d that a smooth misfit may cause
     shared: float  # relative standard deviation of d due to known uncertainties
-    covariance: Matrix  # of (d, tilt_x, tilt_y, gain)
+    covariance: Matrix  # covariance of (d, tilt_x, tilt_y, gain)
     systematic: Matrix  # part of the covariance that is common to all frames
 
 
@@ -142,7 +142,7 @@ class Fit(Record):
     scale: Column
     lower: Normal
     inverse: Normal
-    covariance: Matrix  # of (d, n_x, n_y, gain)
+    covariance: Matrix  # covariance of (d, n_x, n_y, gain)
 
 
 class Budget(Record):

@@ -52,7 +52,7 @@ class SpringPoints(NamedTuple):
     loops.
     """
 
-    x: FloatArray  # from the tip centre [m], one row
+    x: FloatArray  # distance from the tip centre in x [m], one row
     strain: FloatArray  # scratch, one row
     slope: FloatArray
     factor: FloatArray
@@ -151,7 +151,7 @@ def _set_strains(
         small = min(by_x, by_y)
         spread = 4.0 * max(big, max(0.963 * big + 0.222 * small, 0.77 * big + 0.556 * small))
         part = min(max(f + 0.5 * spread, 0.0), spread)
-        # Value of z in the middle of the part with f > 0, because f decreases along (p, q).
+        # Value of z in the middle of the part with f > 0, where f decreases along (p, q).
         p = x - z * v
         q = y - z * w
         away = 0.5 * max(0.5 * part - f, 0.0) / (p * p + q * q + least)

@@ -431,7 +431,7 @@ class Body:
     def base_pressure(self, motion: FloatArray, forces: FloatArray) -> FloatArray:
         """Return cosine harmonics of the base pressure at `MIDDLES` in the deformed position."""
         place = self.nodes.copy()
-        if self.at_rest is not None:  # for linear elements
+        if self.at_rest is not None:  # The elements are linear.
             motion = 0 * motion
         if self.frames.shape[2] == 3:
             place += np.einsum("nij,nj->ni", self.frames, motion.reshape(-1, 3))

@@ -28,9 +28,9 @@ from softfinger.tools.sweep import Sweep, add_sweep
 SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, and episodes per sample
 STEPS = 200
 FEATURES = 5
-# Scale of the weights. It keeps the joints slow, because an action of 1 is fast (1 rad/s).
+# Scale of the weights, which keeps the joints slow, because an action of 1 is fast (1 rad/s).
 _WEIGHT_SCALE = 0.2
-_ADDED_STD = 0.2  # added to the standard deviation to avoid premature convergence
+_ADDED_STD = 0.2  # increase in standard deviation that avoids premature convergence
 
 Weights = NDArray[np.float64]
 

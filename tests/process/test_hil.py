@@ -129,7 +129,7 @@ def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
             for process in (daemon.process, rig.hand.popen):
                 stood = hand.state().behind_s + 0.4
                 process.send_signal(signal.SIGSTOP)
-                select.select([], [], [], 0.5)  # This pause is five times the watchdog time.
+                select.select([], [], [], 0.5)  # Pause for five times the watchdog time.
                 process.send_signal(signal.SIGCONT)
                 hand.wait_for(lambda state, at=stood: state.behind_s > at, 120.0)
             with hand.stream(120.0) as states:

@@ -35,8 +35,8 @@ sys.exit(failed)
 """
 
 
-# Both compilers give identical bits on this processor. On others, they may fuse different products
-# with their sums.
+# Both compilers give identical bits on this processor. On other processors, the compilers may fuse
+# different products with their sums.
 SAME_BITS = "znver3"
 
 

@@ -507,7 +507,7 @@ def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline)
     with pytest.raises(ViewError, match="No such file or directory"):
         save(tmp_path / "none" / "a.svg", Recording(recorded), 0.1, print)
     RecordingWriter(tmp_path / "empty.mcap").close()
-    with pytest.raises(ViewError, match="received no hand/state"):
+    with pytest.raises(ViewError, match="the recording does not contain hand/state"):
         save(tmp_path / "a.html", Recording(tmp_path / "empty.mcap"), 0.1, print)
     assert not (tmp_path / "a.html").exists()
     for words, message in (

@@ -37,7 +37,7 @@ from tests.soak.rig import CASES, End, Rig, judge_wire
 SECONDS = 3600.0
 SUBSCRIBERS = 3
 _LOOK = 5.0  # time between checks of the bus and of the memory [s]
-# Length of the compared windows at both ends [s]. It is at most a third of the run.
+# Length of the compared windows at both ends [s]. Each window is at most a third of the run.
 _WINDOW = 600.0
 _FLAT = 2.0  # maximum memory growth of a process [MB]
 _FAULT_EVERY = 40.0  # average time between faults [s]

@@ -10,7 +10,7 @@ from softfinger.daemon.wire.event_kinds import KINDS
 
 ROOT = Path(softfinger.__file__).parents[1]
 LEVELS = ("info", "warning", "error")
-WARNS = {"_warn": "warning"}  # maps functions whose first argument is the kind to their level
+WARNS = {"_warn": "warning"}  # level of each function whose first argument is the kind
 
 
 def written(expression: ast.expr) -> str:

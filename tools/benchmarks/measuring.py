@@ -18,8 +18,8 @@ from softfinger.tools.terminal.text_layout import plain_table, table_text
 # Result of one measurement. Each key is a column heading, and "name" is the first column.
 Row = dict[str, Any]
 
-# Duration of a repetition [s]. It is short enough to avoid most interruptions, but long compared
-# with the clock resolution.
+# Duration of a repetition [s]. A repetition is short enough to avoid most interruptions, but long
+# compared with the clock resolution.
 _SLICE = 4e-4
 
 

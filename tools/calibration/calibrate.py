@@ -131,7 +131,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "{finger} and {pose} are replaced (pose: closed, open or zero)",
     )
     parser.add_argument("--no-plot", action="store_true", help="do not plot the result")
-    add_daemon(parser, addresses)  # used by friction, latency and scales
+    add_daemon(parser, addresses)  # The steps friction, latency and scales use this option.
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -33,8 +33,8 @@ _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
 # do not follow the joints.
 _SCALE = 0.5, 2.0
 _MISFIT_MAX = 0.3e-3  # RMS limit [m]; larger values indicate sliding, tilting or a second contact
-# Relative errors of d from frames. The first one applies if d is estimated from the shape of the
-# frame, and the second one if it is estimated from the amplitude.
+# Relative errors of d from frames. The first error applies if d is estimated from the shape of the
+# frame, and the second error if d is estimated from the amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 

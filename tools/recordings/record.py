@@ -246,7 +246,7 @@ class _Recorder:
         # The last writer in this list is the active writer.
         self._writers = [RecordingWriter(arguments.file)]
         self._opened = time.monotonic()
-        self._messages = 0  # number of messages received for writing
+        self._messages = 0  # number of received messages to write
         self._unreadable = 0
         self._waiting = False  # True once the notice about the missing stream has been printed
 

@@ -197,10 +197,9 @@ def _keep(
 ) -> None:
     frictions, masses, sizes = axes
     lines = [
-        "# Objects that the hand holds, computed by `softfinger envelope --keep`; one row for each "
-        "friction and mass,",
-        "# one letter for each size: "
-        + ", ".join(f"{k} {text}" for k, text in OUTCOME_TEXTS.items()),
+        "# Objects that the hand holds. `softfinger envelope --keep` writes this file.",
+        "# Each row is for one friction and mass, and each letter is for one size:",
+        *(f"# {letter}: {text}" for letter, text in OUTCOME_TEXTS.items()),
         f"force = {force!r}",
         f"raised = {increased_force_limit(settings, force)!r}",
         f"friction = {json.dumps([float(each) for each in frictions])}",

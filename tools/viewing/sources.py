@@ -28,8 +28,8 @@ _SILENCE_TIME = 2.0  # time without messages before a notice is printed [s]
 _DRAW_PAUSE_MAX = 1.0  # maximum time between pictures if drawing is slow [s]
 _MARK_COUNT_MAX = 2_000  # maximum number of marks shown for a recording
 _SPEED_RANGE = 0.1, 10.0
-# Maximum number of messages queued between reads. This is enough for 2 s of states, truth and
-# frames at 1 kHz.
+# Maximum number of messages queued between reads. The queue is long enough for 2 s of states, truth
+# and frames at 1 kHz.
 _QUEUE_LENGTH = 5_000
 
 

@@ -348,7 +348,7 @@ class Emulator:
                 self._take_away(finger)
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
-        self._advance_due = now  # Faults without a time begin immediately.
+        self._advance_due = now  # Faults without a start time begin immediately.
         return reply
 
     def press(self, text: str) -> str:

@@ -26,8 +26,8 @@ _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _READ_SIZE = 4096
 _READS_PER_TURN = 4  # maximum number of reads per turn; the limit leaves time for other tasks
-# Duration of silence that ends a packet [s]. It is longer than 1.5 ms because this process may be
-# delayed.
+# Duration of silence that ends a packet [s]. The duration is longer than 1.5 ms because this
+# process may be delayed.
 _GAP_TIME = 0.02
 # Typical pseudo-terminal latency from a write to the reader's wake-up [s]. A paced bus subtracts
 # this latency in both directions, because the simulated wire has its own transmission time.

@@ -16,7 +16,8 @@ from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Pla
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth undamped steps
-# Relative rounding error of the energy. It is large because d is a small difference of lengths.
+# Relative rounding error of the energy. The rounding error is large because d is a small difference
+# of lengths.
 _ROUNDING = 3e-13
 HALVINGS = 12  # maximum number of times that a step is halved
 

@@ -198,7 +198,7 @@ class TipContact(Record):
     normal: float  # N [N]
     tangential: float  # T [N]
     rim: float  # rim penetration depth, or 0 without contact [m]
-    rim_energy: float  # rim energy, which is set if ``rim`` is above 0 [J]
+    rim_energy: float  # rim energy [J], which is valid only if ``rim`` is above 0
     rim_d: float  # derivatives of the rim energy with respect to d [N] and θ [N·m]
     rim_theta: float
     rows: Annotated[FloatArray, 3, 4]  # derivatives of d, θ and d_t with respect to the coordinates
@@ -243,7 +243,7 @@ class Plant(Record):
     on_other_tip: Flags  # 1 if the contact is with the other tip
     step_count: int  # number of completed sub-steps
     sample_count: int  # number of samples taken
-    energy: float  # kinetic, elastic and gravitational [J]
+    energy: float  # kinetic, elastic and gravitational energy [J]
     energy_limit: float  # energy limit that results from the work done on the hand [J]
     limited_step_count: int  # number of sub-steps that the energy guard has limited
     last_state: Motion  # state before the step

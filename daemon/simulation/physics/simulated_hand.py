@@ -279,8 +279,8 @@ class SimulatedHand:
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
         self.torque_on = goals.torque_on  # 1 if the servo's torque is on
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
-        # Faults of each finger's tactile sensor and servo, left finger first. These faults do not
-        # change the physics.
+        # Faults of each finger's tactile sensor and servo, left finger first. Measurement faults do
+        # not change the physics.
         self.measurement_faults = MeasurementFaults(), MeasurementFaults()
         self.servo_heat = ServoHeat.of(settings), ServoHeat.of(settings)
         self._run(0)

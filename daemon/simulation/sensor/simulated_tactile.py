@@ -200,7 +200,7 @@ class Arrivals:
     to ``jitter`` [s]. Frames never overtake each other.
     """
 
-    # Allowance for clock rounding errors, with which a frame that is due now counts as arrived.
+    # Allowance for clock rounding errors, so that a frame that is due now counts as arrived.
     _SLACK = 1e-9
 
     def __init__(

@@ -37,7 +37,7 @@ _SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
 _GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}
 _FAST_READS = frozenset((framing.FAST_SYNC_READ, framing.FAST_BULK_READ))
 _READS = _GROUP_READS | {framing.PING, framing.READ}
-_FACTORY_RESET_GUARD = 42  # first firmware that ignores a broadcast of a full factory reset
+_FACTORY_RESET_GUARD = 42  # first firmware version that ignores a broadcast full factory reset
 _SPAN = struct.Struct("<HH")  # address, length
 _ITEM = struct.Struct("<BHH")  # ID, address, length
 

@@ -6,14 +6,14 @@
 // contains it requires IPython. Plotly takes seven times as long and has 4.8 MB.
 
 const [TIME, MODE] = [1, 2];
-const KEPT = 6000;  // rows, ten minutes
-const READABLE = 180;  // ms, minimum time between updates of a number, for readability
+const KEPT = 6000;  // number of rows, enough for ten minutes
+const READABLE = 180;  // minimum time between updates of a number, for readability [ms]
 
 const inks = new Map();
 const ink = name => inks.get(name)
   ?? inks.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim()).get(name);
 
-// A canvas's context and its size in CSS pixels. The size is observed, because reading it would force a layout.
+// Context of a canvas, and its size in CSS pixels. The size is observed, because reading it would force a layout.
 class Surface {
   constructor(canvas, changed) {
     [this.canvas, this.pen, this.width, this.height] = [canvas, canvas.getContext("2d"), 0, 0];
@@ -23,7 +23,7 @@ class Surface {
     }).observe(canvas);
   }
 
-  // Clear the canvas; return false if it is not visible.
+  // Clear the canvas. Return false if the canvas is not visible.
   clear() {
     const ratio = window.devicePixelRatio || 1, { canvas, pen } = this;
     const [width, height] = [this.width, this.height].map(side => Math.round(ratio * side));
@@ -39,7 +39,7 @@ class Surface {
 class History {
   rows = [];
 
-  // Add rows. Rows before number `first` belong to another daemon or recording position and are dropped.
+  // Add rows. Drop rows before number `first`, which belong to another daemon or recording position.
   add(rows, first) {
     if (this.rows.length && this.rows[0][0] < first) this.rows = this.rows.filter(row => row[0] >= first);
     this.rows.push(...rows.filter(row => row[0] >= first && row[0] > (this.rows.at(-1)?.[0] ?? -1)));
@@ -172,7 +172,7 @@ class Chart {
     });
     canvas.addEventListener("dblclick", () => view.follow());
     canvas.addEventListener("wheel", event => {
-      if (!event.ctrlKey && !event.metaKey) return;  // The page scrolls.
+      if (!event.ctrlKey && !event.metaKey) return;  // Let the page scroll.
       event.preventDefault();
       view.zoom(event.deltaY > 0 ? 1.25 : 0.8, time(event));
     }, { passive: false });
@@ -275,7 +275,7 @@ class Chart {
       if (high > low) to(rows[k][TIME], high);
     }
     pen.strokeStyle = ink(colour);
-    pen.lineWidth = 1;  // Without a graphics card, a wider line takes two and a half times as long.
+    pen.lineWidth = 1;  // Without a graphics card, a wider line takes two and a half times as long to draw.
     pen.lineJoin = "round";
     pen.stroke();
   }
@@ -337,7 +337,7 @@ class Chart {
     }
   }
 
-  // Write the values to the caption, and as text for screen readers.
+  // Write the values to the caption and to the text for screen readers.
   tell(row) {
     const { plot, values, canvas, view } = this, words = [], now = performance.now();
     if (view.cursor === null && now < (this.written ?? 0) + READABLE) return;
@@ -369,7 +369,7 @@ function make(parent, kind, name = "", text = "") {
   return element;
 }
 
-// Set a text only if it has changed, because the browser would lay it out and paint it again.
+// Set a text only if it has changed, because the browser lays out and paints each text that is set.
 function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }

@@ -1,5 +1,5 @@
 
-// One command of each kind is in transit at a time. Of those that follow, only the newest is sent next.
+// Only one command of each kind is in transit at a time. Of the commands that follow, only the newest one is sent.
 const client = "page " + Math.random().toString(16).slice(2, 6);
 const one = selector => document.querySelector(selector);
 const lanes = {}, settings = {};
@@ -47,8 +47,8 @@ function transmit(lane, { message, answered }) {
   };
 }
 
-// A value of the hand with a slider and a field. It follows the hand. After a change on this page, it
-// shows the new value until the hand has reached or refused this value.
+// A value of the hand with a slider and a field, which follow the hand. After a change on this page,
+// they show the new value until the hand has reached or refused this value.
 class Setting {
   wanted = null;
   accepted = NaN;
@@ -92,10 +92,10 @@ class Setting {
     });
   }
 
-  // Show the hand's value, which is NaN if it is unknown.
+  // Show the hand's value. NaN means that the value is unknown.
   follow(value) {
     if (!Number.isNaN(value)) this.value = value;
-    if (this.wanted === null && Math.abs(value - this.accepted) > 0.05) {  // Another client has changed it.
+    if (this.wanted === null && Math.abs(value - this.accepted) > 0.05) {  // Another client has changed the value.
       this.accepted = NaN;
       this.tell("");
     }
@@ -238,7 +238,7 @@ class Player {
   }
 
   jump(step) {
-    // During playback, a mark that was just passed does not count as the previous mark yet.
+    // During playback, a mark that has just been passed does not yet count as the previous mark.
     const { position, playing } = picture.place, least = step < 0 && playing ? 0.5 : 0.03;
     const beyond = scene.marks.filter(([at]) => step * (at - position) > least);
     const mark = beyond.at(step > 0 ? 0 : -1);
@@ -273,7 +273,7 @@ class Player {
   // Draw the recording's modes along its track, with warnings and errors above them.
   draw() {
     if (!picture || !scene.marks || !this.track.clear()) return;
-    const { pen, width } = this.track, { duration } = picture.place, inset = 8;  // px, half of the thumb's width
+    const { pen, width } = this.track, { duration } = picture.place, inset = 8;  // half the width of the thumb [px]
     this.drawn = `${duration} ${scene.marks.length}`;
     const x = at => inset + (width - 2 * inset) * at / duration;
     const modes = scene.marks.filter(([, , kind]) => kind === "mode");

@@ -6,7 +6,7 @@ const images = new Map();  // panel images
 
 const seconds = value => value < 10 ? value.toFixed(1) : Math.round(value).toString();
 const elapsed = () => (performance.now() - arrived) / 1000;
-// Return the current value of an age that was sent in a picture; null means that there was no message.
+// Return the current value of an age that was sent in a picture. Null means that there was no message.
 const aged = age => age === null ? Infinity : scene.live ? age + elapsed() : 0;
 const isOld = () => aged(picture.age) > picture.patience.state + scene.period;
 
@@ -159,7 +159,7 @@ function redraw() {
   put(one("#hold"), view.end === null ? "Pause" : "Resume");
 }
 
-// Mark panels with old data. Each panel shows its data's age once the next picture is overdue.
+// Mark panels with old data. Each panel shows the age of its data once the next picture is overdue.
 function showAges() {
   clearTimeout(showAges.timer);
   if (!picture) return;
@@ -268,7 +268,7 @@ function connect() {
     past.add(given.rows, given.first);
     if (drawing) return more = true;
     drawing = true;
-    next();  // Request the next picture while drawing this one. A hidden page requests only one more.
+    next();  // Request the next picture while drawing this one. A hidden page requests only one more picture.
     requestAnimationFrame(() => {
       show();
       drawing = false;
@@ -278,7 +278,7 @@ function connect() {
   };
 }
 
-// Play a recording that is stored in the page: JSON lines with scenes, their pictures and, last, all rows.
+// Play a recording that is stored in the page. Its JSON lines contain scenes, pictures and, in the last line, all rows.
 async function play(text) {
   const packed = new Blob([Uint8Array.from(atob(text), each => each.charCodeAt(0))]);
   const lines = (await new Response(packed.stream().pipeThrough(new DecompressionStream("gzip"))).text()).split("\n");
