@@ -71,7 +71,8 @@ per load, or one .npz file of the whole run with d [m], theta [rad] and force [N
 If you have no test stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
-Each step except law plots its result and residuals in FILE.STEP.png if matplotlib is installed.
+If matplotlib is installed, each step plots its result and residuals in FILE.STEP.png (law: only
+with --compression).
 Steps depend on earlier steps: repeating equilibrate removes the results of curve, modulus and
 scales; repeating curve removes those of modulus and scales; repeating modulus removes scales.
 """
