@@ -128,7 +128,7 @@ def test_missing_servos_are_reported(bus, silent):
     for servo in silent:
         bus.fault(f"silent={servo}")
     (line,) = refusal(bus.port, reply_timeout=0.5)
-    missing = "servo 2 (right): no reply at 2000000 baud: check its power supply"
+    missing = "servo 2 (right): no reply at 2000000 baud: check the power supply"
     nothing = f"{bus.port}: no servo replies at 2000000 baud (IDs 1, 2): check the power"
     assert line.startswith(missing if silent == (2,) else nothing)
 
@@ -166,7 +166,7 @@ def test_minor_findings_are_notices(bus):
         assert [
             n for n in notices if n.startswith(f"{finger}servos.fault_after = 60 s: if replies")
         ]
-    assert [n for n in notices if n.startswith(f"{LEFT}its drive mode is reversed")]
+    assert [n for n in notices if n.startswith(f"{LEFT}the drive mode is reversed")]
     assert [n for n in notices if n.startswith(f"{LEFT}torque is already on")]
     span = slice(reg.GOAL_CURRENT, reg.GOAL_POSITION + 4)
     goal = bus.memory(0)[span]
