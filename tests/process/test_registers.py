@@ -210,7 +210,7 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
         == "reboot the servo: switch its supply off and on, or run `softfinger doctor --fix`"
     )
     (fixed,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
-    assert "rebooted because its position was wrong by at least one turn" in fixed.text
+    assert "rebooted because the position was wrong by at least one turn" in fixed.text
     assert [each.status for each in told(bus)] == ["pass"]
 
 
