@@ -195,7 +195,7 @@ class Sweep(Generic[Case, Result]):
             lines = file.read().decode("utf-8", "replace").splitlines()
         if not lines or lines[0] != json.dumps(self._digest):
             raise SweepError(
-                f"{self._journal}: belongs to another sweep; remove the file or choose another one"
+                f"{self._journal}: belongs to another sweep; remove the file or choose another file"
             )
         for line in lines[1:]:
             try:

@@ -20,7 +20,7 @@ from softfinger.daemon.types import GRIP_FRACTION
 PACKAGED_MAP = Path(__file__).with_name("envelope.toml")
 HELD, TURNED, LOST, REFUSED = "htlr"
 OUTCOME_TEXTS = {
-    HELD: "held",
+    HELD: "the object is held",
     TURNED: "the object is held, but rotates by more than 5°",
     LOST: "the object slips out",
     REFUSED: "the hand can't grip the object",

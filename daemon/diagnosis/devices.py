@@ -133,7 +133,7 @@ def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -
         problem = (
             f"no reply at {settings.servos.baud} baud within servos.open_timeout = {waited:g} s"
         )
-        fix = "check its power supply and cable, and read the findings below"
+        fix = "check the power supply and the cable, and read the findings below"
         if late:
             fix = "set a longer servos.open_timeout, because the servo replies now"
         return [Finding("FAIL", name, problem, fix)]
@@ -189,7 +189,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
         Finding(
             "note",
             "found",
-            f"{problem}; the supply is {min(volts):.1f} V at the servos that reply",
+            f"{problem}; the supply voltage is {min(volts):.1f} V at the servos that reply",
             fix,
         )
     ]

@@ -187,7 +187,7 @@ def _check(settings: Settings, key: str, address: str) -> Finding:
             f"a softfinger daemon is already running on this machine ({mode}), so a second daemon "
             "will not start"
         )
-        return Finding("warn", subject, text, "stop it before you start another daemon")
+        return Finding("warn", subject, text, "stop this daemon before you start another")
     text = "in use by another program, which is not a softfinger daemon"
     return Finding("FAIL", subject, text, f"end that program, or set {key} to another address")
 

@@ -119,7 +119,7 @@ def _restore(
     for turn in range(_PASS_COUNT + 1):
         table = line.read(servo_id, 0, CHECKED)
         if table is None:
-            result.append(Finding("warn", name, "not restored: its registers could not be read"))
+            result.append(Finding("warn", name, "not restored: the registers could not be read"))
             return
         tables.append(table)
         for each in order if turn < _PASS_COUNT else ():

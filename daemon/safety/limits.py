@@ -351,8 +351,8 @@ _EXPECTED_CURRENT_MIN = 0.04  # minimum expected current for the check [A]
 _CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 
 
-@Limit("joint.dead", "joint that neither moves nor draws current for 0.05 s, at least 0.05 rad "
-    "from its goal", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
+@Limit("joint.dead", "joint that is at least 0.05 rad from its goal, but neither moves nor draws "
+    "current for 0.05 s", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     """Report a joint that is stationary away from its goal without drawing current.
 
@@ -387,7 +387,7 @@ def _joint_current(view: View, state: State, _: float, i: int) -> str:
 _FULL_CURRENT = 0.9  # minimum fraction of the goal's current limit that counts as saturated
 
 
-@Limit("joint.stall", "joint that does not move at maximum current before it reaches its "
+@Limit("joint.stall", "joint that stands still at maximum current without having reached its "
     "goal",
     "fault", ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
     lasts="stall_time").each  # fmt: skip
@@ -435,8 +435,8 @@ _OVERLAP_RATIO = 0.5  # minimum overlap in tip radii; offset errors and frame la
 
 
 @Limit("joint.opens",
-    "overlap of the tips, computed from the joint angles, while a tip has no contact during the "
-    "approach", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
+    "overlap of the tips (computed from the joint angles) during the approach, although one tip "
+    "has no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 
@@ -568,8 +568,9 @@ def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
 
 # --- sensors --------------------------------------------------------------------------------------
 
-LIMITS.append(Limit("tactile.late", "age of the last valid frame; the goal is frozen above it",
-    "limit", ("safety.frame_age_hold",), "sensors", gripping=True))  # fmt: skip
+LIMITS.append(Limit("tactile.late",
+    "age of the last valid frame; above this limit, the goal is frozen", "limit",
+    ("safety.frame_age_hold",), "sensors", gripping=True))  # fmt: skip
 
 
 @Limit("tactile.silent", "age of the last valid frame", "fault",

@@ -87,7 +87,7 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
             notices = notice_servo(name, model, table, settings, finger)
         else:
             why = (
-                "replies to a ping but not to a read: its status return level is 0, two servos "
+                "replies to a ping but not to a read: the status return level is 0, two servos "
                 "have this ID, or the line is faulty"
             )
             errors, notices = [Finding("FAIL", name, why, FIX)], []
@@ -218,12 +218,12 @@ def notice_servo(
         ),
         (
             table[reg.DRIVE_MODE] & DRIVE_REVERSE,
-            "its drive mode is reversed in addition to the reversal by servos.direction",
+            "the drive mode is reversed in addition to the reversal by servos.direction",
         ),
         (table[reg.TORQUE_ENABLE], "torque is already on and stays on until `disarm` or `arm`"),
         (
             table[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR,
-            "its bus watchdog has stopped the servo; `arm` clears the watchdog",
+            "the bus watchdog has stopped the servo; `arm` clears the watchdog",
         ),
         (
             not model.fast_read(firmware),
@@ -282,7 +282,7 @@ def check_angle(
     problem = f"the joint is at {found}, expected {lowest} to {highest}"
     turns = counts // reg.COUNTS_PER_TURN
     if turns and is_inside(counts - turns * reg.COUNTS_PER_TURN):
-        problem += f": its servo has counted {turns} turn{'' if turns in (1, -1) else 's'} too many"
+        problem += f": the servo has counted {turns} turn{'' if turns in (1, -1) else 's'} too many"
         return Finding("FAIL", name, problem, LOST_TURN_FIX)
     cure = (
         "turn the joint into this range by hand, or correct servos.zero with `softfinger "

@@ -170,7 +170,7 @@ class DynamixelServos:
             errors += each.errors
             notices += each.notices
             if not each.replies and not each.errors:
-                fix = "check its cable and ID; `softfinger doctor` tries every baud rate"
+                fix = "check the cable and the ID; `softfinger doctor` tries every baud rate"
                 errors.append(Finding("FAIL", each.name, f"no reply at {port.baudrate} baud", fix))
         if errors:
             silent = sum(not each.replies and not each.errors for each in found)
@@ -369,7 +369,8 @@ class DynamixelServos:
                 self.torque_off(reading)
             if torque.may_be_on:
                 _log.error(
-                    "the servos have not confirmed torque off; their bus watchdogs will stop them"
+                    "the servos have not confirmed torque off; the bus watchdogs will stop the "
+                    "servos"
                 )
         except PortLost:
             _log.error(

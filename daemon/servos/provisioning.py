@@ -266,7 +266,7 @@ def provision(settings: Settings) -> list[Finding]:
             elif number != model.number:
                 result.append(Finding("warn", name, *other_model(number, model)))
             elif is_garbled(line, servo_id):
-                result.append(Finding("warn", name, "its replies are corrupted", ONE_SERVO_ONLY))
+                result.append(Finding("warn", name, "the replies are corrupted", ONE_SERVO_ONLY))
             else:
                 _set_up(line, settings, finger, model, result)
     return result
@@ -280,7 +280,7 @@ def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
     names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
     fit = ", ".join(f"ID {each.id} at {each.baud} baud" for each in what.strangers)
     if not fit:
-        fix = "check its power supply and cable"
+        fix = "check the power supply and the cable"
         return [Finding("warn", name, "no reply at any baud rate", fix) for name in names]
     return [
         Finding("warn", name, f"could be any of these servos: {fit}", ONE_SERVO_ONLY)
@@ -343,7 +343,7 @@ def _set_up(
         result.append(Finding("fixed", name, "status return level 0 → 2"))
     table = line.read(servo_id, 0, CHECKED)
     if table is None:
-        return failed("its registers could not be read")
+        return failed("the registers could not be read")
     if table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
         return None
     rows = required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION])
@@ -373,13 +373,13 @@ def _reboot_if_needed(
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
     table = Registers(line.read(servo_id, 0, CHECKED) or b"")
     if not table:
-        return result.append(Finding("warn", name, "its registers could not be read"))
+        return result.append(Finding("warn", name, "the registers could not be read"))
     misplaced = check_position(name, scale, table, settings.hand, finger)
     if error := table[reg.HARDWARE_ERROR_STATUS]:
         why = f"it had a hardware error: {reg.hardware_error_names(error)}"
     elif misplaced is not None and misplaced.fix == LOST_TURN_FIX:
         why = (
-            f"its position was wrong by at least one turn: {table.long(reg.PRESENT_POSITION)} "
+            f"the position was wrong by at least one turn: {table.long(reg.PRESENT_POSITION)} "
             "counts"
         )
     else:

@@ -170,7 +170,7 @@ class Torque:
         for servo_id, joint in self._joints.items():
             held = self._line.read(servo_id, reg.RAM, reg.GOAL_POSITION - reg.RAM)
             if held is None:
-                raise ServoError(f"{joint.name}: its registers could not be read")
+                raise ServoError(f"{joint.name}: the registers could not be read")
             for row in armed_registers(self._model):
                 if row.wrong_in(held, reg.RAM) is not None:
                     what, data = row.register.name, row.register.packed(row.mended(0))
@@ -183,7 +183,7 @@ class Torque:
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.PRESENT_POSITION, 4)
             if raw is None:
-                raise ServoError(f"{joint.name}: its position could not be read")
+                raise ServoError(f"{joint.name}: the position could not be read")
             positions[servo_id] = int.from_bytes(raw, "little", signed=True)
         return positions
 
@@ -193,7 +193,7 @@ class Torque:
             raw = self._line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
             if raw is None:
                 found.append(
-                    Finding("FAIL", joint.name, "no reply", "check its power supply and cable")
+                    Finding("FAIL", joint.name, "no reply", "check the power supply and the cable")
                 )
             elif raw[0]:
                 error = f"hardware error: {reg.hardware_error_names(raw[0])}"
@@ -218,12 +218,12 @@ class Torque:
         watchdog = table[reg.BUS_WATCHDOG - start]
         if watchdog == reg.WATCHDOG_ERROR:
             raise ServoError(
-                f"{joint.name}: its bus watchdog stopped the servo because no packet arrived "
+                f"{joint.name}: the bus watchdog stopped the servo because no packet arrived "
                 "within servos.watchdog: send `clear`, then `arm`"
             )
         if watchdog != self._ticks:
             raise ServoError(
-                f"{joint.name}: its bus watchdog is off, possibly because the servo has rebooted: "
+                f"{joint.name}: the bus watchdog is off, possibly because the servo has rebooted: "
                 "check the supply, then send `clear` and `arm`"
             )
         return goal_in(self._mode, table, start) in joint.sent

@@ -186,7 +186,7 @@ def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     # NumPy uses only these compression methods. Other methods may unpack to more than the stated
     # size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{name}: found an unsupported compression, expected deflate")
+        raise ValueError(f"{name}: found an unsupported compression method, expected deflate")
     return part
 
 

@@ -47,8 +47,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "material": EventKind(
         "info",
-        "The material law was fitted to the measured points. The text states its deviation from "
-        "the points.",
+        "The material law was fitted to the measured points. The text states the deviation of "
+        "the law from the points.",
         "If the deviation is large, remove outliers or measure more points.",
     ),
     "realtime": EventKind(
@@ -110,7 +110,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "silence": EventKind(
         "warning",
-        "The lease of the client in control expired, and the action in `commands.on_silence` "
+        "The lease of the controlling client expired, and the action in `commands.on_silence` "
         "was carried out.",
         "Make the client send commands or setpoints at intervals shorter than `commands.lease`.",
     ),
@@ -177,8 +177,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "torque.off": EventKind(
         "error, info",
-        "The servos have not confirmed torque off. When they confirm it, an event of level info "
-        "follows.",
+        "The servos have not confirmed torque off. When the servos confirm torque off, an "
+        "event of level info follows.",
         "Switch off the supply, then find out why the servos do not reply.",
     ),
     # Joints
@@ -190,7 +190,7 @@ KINDS: dict[str, EventKind] = {
     "joint.velocity": EventKind(
         "error",
         "A joint moves too fast.",
-        "Check whether something pushed the finger; otherwise reduce the control gains.",
+        "Check whether something pushed the finger. If not, reduce the control gains.",
     ),
     "joint.jump": EventKind(
         "error",
@@ -268,7 +268,7 @@ KINDS: dict[str, EventKind] = {
     "tactile.frozen": EventKind(
         "error",
         "A board repeats the same frame during contact.",
-        "Switch the board off and on. If its noise is below one count, set "
+        "Switch the board off and on. If the board's noise is below one count, set "
         "`safety.frozen_after = 0`.",
     ),
     "tactile.saturated": EventKind(

@@ -163,7 +163,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     typical = float(np.median(response))
     if not typical > 0.0:
         raise CalibrationError(
-            "equilibrate: the readings of most cells do not exceed their zero offset"
+            "equilibrate: the readings of most cells do not exceed the zero offsets"
         )
     active = response > DEAD_RESPONSE * typical
     target = np.array([reading[active].mean() for reading in readings])

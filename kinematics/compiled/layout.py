@@ -131,7 +131,7 @@ class _Compound:
 
     def __set__(self, record: Any, value: Any) -> None:
         if self.inner is not None:
-            raise AttributeError(f"{self._name} is a record: set its individual fields")
+            raise AttributeError(f"{self._name} is a record: set the individual fields")
         record._fields[self._name][...] = value
 
 

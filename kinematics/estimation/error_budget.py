@@ -119,7 +119,9 @@ class Uncertainty:
         if self.correlation is not None:
             rho = np.asarray(self.correlation, np.float64)
             if rho.ndim != 2 or not np.isfinite(rho).all() or not abs(rho[0, 0] - 1.0) < 1e-6:
-                raise ValueError("correlation must be [rows, cols], with 1 at [0, 0]")
+                raise ValueError(
+                    "correlation must have shape [rows, cols] and the value 1 at [0, 0]"
+                )
             object.__setattr__(self, "correlation", rho)
 
 

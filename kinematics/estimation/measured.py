@@ -97,7 +97,9 @@ class MeasuredEstimator:
     ) -> None:
         law = tip.law
         if law is None or law.radius != tip.radius:
-            raise ValueError(f"tip must have a measured law for its radius, {tip.radius:g} m")
+            raise ValueError(
+                f"the tip's law must be measured at the tip's radius, {tip.radius:g} m"
+            )
         alive = np.ones(grid.shape, np.bool_) if active is None else active
         self.grid = grid
         self._law = law

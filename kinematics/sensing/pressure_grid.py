@@ -177,7 +177,7 @@ def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float
     if not (math.isfinite(d) and math.isfinite(tilt_x) and math.isfinite(tilt_y)):
         raise ValueError(f"d and tilts must be finite, got {d}, {tilt_x}, {tilt_y}")
     if d > radius:
-        raise ValueError(f"d = {d} m is more than the tip's radius {radius} m")
+        raise ValueError(f"d must be at most the tip's radius, {radius} m, got {d} m")
     n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
     if abs(tilt_x) >= 0.5 * math.pi or abs(tilt_y) >= 0.5 * math.pi or n_x**2 + n_y**2 >= 1.0:
         raise ValueError(

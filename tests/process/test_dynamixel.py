@@ -219,7 +219,7 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
         for _ in range(2):  # The first read checks the supply voltage.
             backend.read(Reading())
 
-    with pytest.raises(ServoError, match="its bus watchdog stopped the servo"):
+    with pytest.raises(ServoError, match="the bus watchdog stopped the servo"):
         look()
     assert backend.torque_off(Reading())
     backend.torque_on()
@@ -228,7 +228,7 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
 
 
 @pytest.mark.parametrize(
-    "what", ["its bus watchdog stopped the servo", "its bus watchdog is off, possibly because"]
+    "what", ["the bus watchdog stopped the servo", "the bus watchdog is off, possibly because"]
 )
 def test_a_servo_that_stopped_by_itself_is_detected_despite_timely_writes(bus, connect, what):
     # This happens if an adapter delays packets or if power is lost briefly.

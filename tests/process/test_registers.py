@@ -204,13 +204,13 @@ def test_invalid_register_files_are_refused(bus, tmp_path):
 def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
     bus.call(lambda: setattr(bus.servo(0)._joint, "_turns", -2))
     (found,) = [each for each in told(bus) if each.status == "FAIL"]
-    assert "its servo has counted 2 turns too many" in found.text
+    assert "the servo has counted 2 turns too many" in found.text
     assert (
         found.fix
         == "reboot the servo: switch its supply off and on, or run `softfinger doctor --fix`"
     )
     (fixed,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
-    assert "rebooted because its position was wrong by at least one turn" in fixed.text
+    assert "rebooted because the position was wrong by at least one turn" in fixed.text
     assert [each.status for each in told(bus)] == ["pass"]
 
 

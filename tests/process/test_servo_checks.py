@@ -128,7 +128,7 @@ def test_missing_servos_are_reported(bus, silent):
     for servo in silent:
         bus.fault(f"silent={servo}")
     (line,) = refusal(bus.port, reply_timeout=0.5)
-    missing = "servo 2 (right): no reply at 2000000 baud: check its power supply"
+    missing = "servo 2 (right): no reply at 2000000 baud: check the cable and the ID"
     nothing = f"{bus.port}: no servo replies at 2000000 baud (IDs 1, 2): check the power"
     assert line.startswith(missing if silent == (2,) else nothing)
 
@@ -144,7 +144,7 @@ def test_unusable_ports_are_reported(bus):
     assert "port not found: connect the adapter" in refusal("/dev/does-not-exist")[0]
     assert "port not found: start `softfinger emulate`" in refusal("/tmp/does-not-exist/servos")[0]
     first = connected(bus)
-    assert "in use by another process" in refusal(bus.port)[0]
+    assert "in use by another program" in refusal(bus.port)[0]
     reading = Reading()
     first.read(reading)
     assert reading.valid
@@ -166,7 +166,7 @@ def test_minor_findings_are_notices(bus):
         assert [
             n for n in notices if n.startswith(f"{finger}servos.fault_after = 60 s: if replies")
         ]
-    assert [n for n in notices if n.startswith(f"{LEFT}its drive mode is reversed")]
+    assert [n for n in notices if n.startswith(f"{LEFT}the drive mode is reversed")]
     assert [n for n in notices if n.startswith(f"{LEFT}torque is already on")]
     span = slice(reg.GOAL_CURRENT, reg.GOAL_POSITION + 4)
     goal = bus.memory(0)[span]
@@ -180,7 +180,7 @@ def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     bus = running(servos={"model": "XL330-M288"})
     backend = connected(bus, model="XL330-M288")
     constant = "control.torque_constant is 1.78 N·m/A, but the servo's data sheet states 0.354"
-    gears = "gear friction consumes 0.25 of the transmitted torque, so a grip may never settle"
+    gears = "gear friction consumes 25% of the transmitted torque, so a grip may never settle"
     assert [each.text for each in backend.notices] == 2 * [constant, gears]
     backend.close()
     for name in ("hil", "small"):  # The forces in these profiles match their servos.

@@ -527,7 +527,7 @@ def test_the_noise_of_a_sensor_as_small_as_its_tip_is_measured_between_frames(ze
 
 
 def test_a_recording_needs_an_existing_folder(tmp_path):
-    with pytest.raises(RecordingError, match="its folder does not exist; create it first"):
+    with pytest.raises(RecordingError, match="the folder does not exist; create the folder first"):
         RecordingWriter(tmp_path / "no" / "a.mcap")
     assert not list(tmp_path.iterdir())
 

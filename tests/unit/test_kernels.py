@@ -101,7 +101,7 @@ def test_an_unknown_field_is_an_error():
     memory = Memory()
     with pytest.raises(AttributeError):
         memory.spred = 1.0
-    with pytest.raises(AttributeError, match="newest is a record: set its individual fields"):
+    with pytest.raises(AttributeError, match="newest is a record: set the individual fields"):
         memory.newest = Tip()
 
 

@@ -186,7 +186,7 @@ def test_two_factory_servos_are_configured_one_after_the_other(wired):
     bus.servos[1].silent = True
     assert bus.provision() == (
         named(LEFT, "57600 → 2000000 baud", *MODE_AND_DELAY),
-        [f"{RIGHT}: no reply at any baud rate: check its power supply and cable"],
+        [f"{RIGHT}: no reply at any baud rate: check the power supply and the cable"],
     )
     assert bus.addresses() == [(1, HOME), (1, 57600)]
     bus.servos[1].silent = False
@@ -236,7 +236,7 @@ def test_configured_registers(wired, fault, register, value, done):
 def test_failed_and_successful_configurations_are_both_reported(wired):
     bus = wired(factory=True)
     put_fault(bus.bus, "silent=2", 0.0)
-    missing = f"{RIGHT}: no reply at any baud rate: check its power supply and cable"
+    missing = f"{RIGHT}: no reply at any baud rate: check the power supply and the cable"
     assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])
     _, problems = bus.provision(model="XL330-M288")
     assert f"{LEFT}: is an XM430-W350, expected an XL330-M288: set servos.model" in problems

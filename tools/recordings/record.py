@@ -95,7 +95,9 @@ class RecordingWriter:
         except FileExistsError:
             raise RecordingError(f"{path}: already exists; choose another file") from None
         except FileNotFoundError:
-            raise RecordingError(f"{path}: its folder does not exist; create it first") from None
+            raise RecordingError(
+                f"{path}: the folder does not exist; create the folder first"
+            ) from None
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
@@ -397,7 +399,7 @@ def recover(path: Path) -> tuple[int, str]:
     if recording.others:
         raise RecordingError(
             f"{path}: contains channels from other programs, which would be lost; use `mcap "
-            "recover`, which keeps them"
+            "recover`, which keeps these channels"
         )
     closed = path.with_name(path.name + ".recovered")
     closed.unlink(missing_ok=True)
