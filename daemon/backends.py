@@ -36,13 +36,9 @@ class Backend(NamedTuple):
     load: Callable[[], Any]
     metal: bool = True  # True for real hardware
     hand: Any = False  # True if a simulated hand is needed; a servo backend may specify its class
-    source: str = ""  # plugin name, package and version
+    name: str = ""  # plugin name, or empty for a built-in backend
+    source: str = ""  # plugin name, package and version for messages
     section: type[BaseModel] | None = None  # plugin's settings model
-
-    @property
-    def name(self) -> str:
-        """Plugin name, or empty for a built-in backend."""
-        return self.source.partition(" ")[0]
 
     def options(self, tables: Mapping[str, Any]) -> tuple[BaseModel, ...]:
         """Return the plugin's validated settings in a tuple, which is empty without settings."""
@@ -129,7 +125,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
         why = f"{type(error).__name__}: {error}"
         raise PluginError(f"{source(entry)} can't be loaded: {why}") from error
     metal, hand = getattr(made, "metal", True), getattr(made, "hand", False)
-    return Backend(entry.load, metal, hand, source(entry), getattr(made, "Settings", None))
+    return Backend(entry.load, metal, hand, name, source(entry), getattr(made, "Settings", None))
 
 
 def servo_model(name: str) -> Any:

@@ -362,7 +362,7 @@ def test_missing_damaged_and_writable_kernel_files_cause_warnings(tmp_path, monk
     (folder,) = tmp_path.glob("kernels-*")
     (folder / "grip.kernel").write_bytes(b"torn")
     (found,) = kernels.check_kernels(scene)
-    assert (found.status, found.text[:17]) == ("warn", "1 corrupted files")
+    assert (found.status, found.text[:17]) == ("warn", "found 1 corrupted")
     folder.chmod(0o777)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"

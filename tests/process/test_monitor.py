@@ -157,7 +157,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         return [each.get("force") for each in fake.requests]
 
     with TerminalProcess(command(fake)) as page:
-        page.shows("HOLDING", "+- 10 N", "grip: goal 10.0 N, object to 5.0°")
+        page.shows("HOLDING", "+- 10 N", "grip: goal 10.0 N, object angle 5.0°")
         fake.changes = {"mode": "armed", "goal_force": math.nan, "goal_angle": math.nan}
         page.shows("ARMED", "+- N")
         page.type(b"+")

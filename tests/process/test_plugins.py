@@ -59,14 +59,14 @@ def test_plugin_errors_are_part_of_the_report():
     with pytest.raises(SettingsError) as caught:
         load(changes=wrong)
     report = str(caught.value)
-    with pytest.raises(SettingsError, match=r"broken of softfinger-example 1\.0 can't be loaded"):
+    with pytest.raises(SettingsError, match=r"broken from softfinger-example 1\.0 can't be loaded"):
         load(changes=["tactile.backend=broken"])
     with pytest.raises(PluginError):
         backend("tactile", "broken")
     for part in (
         "plugins.pulsing.height: found -1",
         "plugins.pulsing.hight: unknown key; nearest: height",
-        "plugins.following: found settings, but following of softfinger-example 1.0 does not ",
+        "plugins.following: found settings, but plugin following from softfinger-example 1.0 does not ",
         "plugins.nobody: found settings, but no plugin of this name is installed",
     ):
         assert part in report

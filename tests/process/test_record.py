@@ -224,7 +224,10 @@ def test_other_files_are_rejected(tmp_path):
         writer = Writer(file)
         writer.start(profile="ros2", library="x")
         writer.finish()
-    with pytest.raises(RecordingError, match="profile 'ros2', expected 'softfinger'"):
+    with pytest.raises(
+        RecordingError,
+        match=r"profile 'ros2' \(channels: none\), expected the profile 'softfinger'",
+    ):
         Recording(tmp_path / "other.mcap")
 
 

@@ -128,8 +128,8 @@ class Recording:
             names = ", ".join(sorted(self._other_names.values())[:_OTHERS_NAMED_MAX]) or "none"
             damage = f"; {self.damage}" if self.damage else ""
             raise RecordingError(
-                f"{path}: found the profile {self._profile!r} and the channels {names}, expected "
-                f"the profile {PROFILE!r} or channels of this stream, such as hand/state in "
+                f"{path}: found the profile {self._profile!r} (channels: {names}), expected the "
+                f"profile {PROFILE!r} or channels of this stream, such as hand/state in "
                 f"JSON{damage}"
             )
         if self.others and self._say is not None:
