@@ -162,7 +162,7 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
         return
-    moment = mean(grasp.normal) * mean(grasp.moment_arm)
+    moment = _moment(grasp)
     if s.load > 0.0 and s.moment > 0.0:
         s.start_offset *= moment / s.moment
         off = mean(s.residual) - s.deviation - s.start_offset
@@ -182,6 +182,12 @@ def mean(pair: Pair) -> float:
     """Return the mean of (left, right)."""
     value: float = 0.5 * (pair[0] + pair[1])
     return value
+
+
+@inner_kernel
+def _moment(grasp: GraspState) -> float:
+    """Return the mean joint torque that balances the normal forces [N·m]."""
+    return mean(grasp.normal) * mean(grasp.moment_arm)
 
 
 @inner_kernel
@@ -207,14 +213,9 @@ def update(
     are the joint torques of the previous tick [N·m].
     """
     law = s.law
-    moment = mean(grasp.normal) * mean(grasp.moment_arm)
-    free_torque = max(mean(grasp.free_torque), law.joint_friction)
-    s.friction = min(free_torque, _FRICTION_MAX) + law.load_friction * moment
-    is_held = holding and s.is_watched and grasp.load_arm > 0.0
-    # Rolling uses part of the friction, in proportion to the grip force.
-    spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
-    s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
+    spare_friction = _update_friction(s, grasp)
     sudden_min = _SUDDEN_SHARE * max(spare_friction, 0.0) * mean(grasp.normal)
+    is_held = holding and s.is_watched and grasp.load_arm > 0.0
     sudden = _detect_torque_jump(s, grasp, closing, dq, is_held, sudden_min)
     pull = max(abs(grasp.pull_shear) - grasp.shear * mean(grasp.normal), 0.0)
     sudden = _detect_shear_jump(s, pull, grasp.twist_shear, is_held, sudden_min) or sudden
@@ -233,9 +234,29 @@ def update(
         s.load = pull = s.needed_force = 0.0
         s.has_turned = sudden = s.is_confirmed = False
     s.assumed_load = max(s.load, pull, 0.5 * law.object_load)
+    return _increased_force(s, commanded, sudden)
+
+
+@inner_kernel
+def _update_friction(s: SlipState, grasp: GraspState) -> float:
+    """Set the joint friction and the usable tip friction; return the tip friction before its bound.
+
+    Rolling uses part of the tip friction, and this part increases with the grip force.
+    """
+    law = s.law
+    free_torque = max(mean(grasp.free_torque), law.joint_friction)
+    s.friction = min(free_torque, _FRICTION_MAX) + law.load_friction * _moment(grasp)
+    spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
+    s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
+    return spare_friction
+
+
+@inner_kernel
+def _increased_force(s: SlipState, commanded: float, sudden: bool) -> float:
+    """Return the grip force [N] that the assumed load and the events of this tick require."""
     s.reflex_triggered = s.has_turned or sudden
     s.is_confirmed = s.is_confirmed or s.reflex_triggered
-    s.force_limit = _force_limit(s, commanded, 0.5 * law.object_load / s.usable_friction)
+    s.force_limit = _force_limit(s, commanded, 0.5 * s.law.object_load / s.usable_friction)
     needed_force = s.assumed_load / s.usable_friction
     if s.has_turned:
         turned_force = (1.0 + _ROTATION_INCREASE) * max(commanded, s.needed_force)
@@ -269,49 +290,73 @@ def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
     law = s.law
     share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
     increase = min(max(share * commanded, declared - commanded), law.increase_ratio * commanded)
-    return max(min(commanded + min(increase, law.increase_max), law.force_max), commanded)
+    limit = min(commanded + min(increase, law.increase_max), s.law.force_max)
+    return max(limit, commanded)
 
 
 @inner_kernel
 def _detect_torque_jump(
     s: SlipState, grasp: GraspState, closing: float, dq: FloatPair, is_held: bool, sudden_min: float
 ) -> bool:
-    """Average the residuals; return True if both residuals jumped while both joints yielded.
-
-    An incorrect current reading affects only one joint, and an incorrect frame moves no joints.
-    """
+    """Average the residuals; return True if they show a sudden pull or twist."""
     known_torque = closing * (s.friction if closing < 0.0 else s.law.joint_friction)
-    deviation1 = grasp.torque_residual[0] - known_torque - s.residual[0]
-    deviation2 = grasp.torque_residual[1] - known_torque - s.residual[1]
-    jump_min = _JUMP_MIN + s.friction * (1.0 - s.holding_time / _SETTLING_TIME)
-    sudden = False
-    for k in range(2):  # pull, then twist
-        sense = 1.0 - 2.0 * k
-        deviation = 0.5 * (deviation1 + sense * deviation2)
-        last = 0.5 * (s.residual[0] + sense * s.residual[1])
-        last -= s.offset if k == 0 else clip(last, s.friction)
-        agreement = min(deviation1 * deviation, sense * deviation2 * deviation)
-        agrees = agreement > _AGREEMENT * deviation * deviation
-        sign = math.copysign(1.0, deviation)
-        yield1 = sign * (s.speed[0] - dq[0])
-        yield2 = sense * sign * (s.speed[1] - dq[1])
-        jumps = abs(deviation) > _GATE * math.sqrt(s.variance[k]) + jump_min
-        grows = abs(last + deviation) > abs(last)
-        if is_held and agrees and jumps and grows and min(yield1, yield2) > s.law.yield_speed:
-            curvature = grasp.load_curvature if k == 0 else 0.0
-            load, slope = load_of(last + deviation, grasp.load_arm, curvature)
-            hidden = s.friction / max(slope, s.law.arm_min)
-            sudden = sudden or abs(load) + 0.5 * hidden > sudden_min
+    change1 = grasp.torque_residual[0] - known_torque - s.residual[0]
+    change2 = grasp.torque_residual[1] - known_torque - s.residual[1]
+    sudden = is_held and (
+        _has_jumped(s, grasp, 0, (change1, change2), dq, sudden_min)
+        or _has_jumped(s, grasp, 1, (change1, change2), dq, sudden_min)
+    )
     weight = 1.0 if sudden else s.law.dt / _AVERAGE_TIME
     if not sudden:
         for k in range(2):
-            deviation = 0.5 * (deviation1 + (1.0 - 2.0 * k) * deviation2)
-            s.variance[k] += (deviation * deviation - s.variance[k]) * s.law.dt / _SETTLING_TIME
-    s.residual[0] += deviation1 * weight
-    s.residual[1] += deviation2 * weight
+            change = 0.5 * (change1 + (1.0 - 2.0 * k) * change2)
+            s.variance[k] += (change * change - s.variance[k]) * s.law.dt / _SETTLING_TIME
+    s.residual[0] += change1 * weight
+    s.residual[1] += change2 * weight
     for k in range(2):
         s.speed[k] += (dq[k] - s.speed[k]) * s.law.dt / _AVERAGE_TIME
     return sudden
+
+
+@inner_kernel
+def _has_jumped(
+    s: SlipState,
+    grasp: GraspState,
+    kind: int,
+    changes: FloatPair,
+    dq: FloatPair,
+    sudden_min: float,
+) -> bool:
+    """Return True if ``changes`` of both residuals [N·m] show a pull (kind 0) or a twist (kind 1).
+
+    A pull changes both residuals equally, a twist changes them in opposite directions. Four tests
+    exclude other causes:
+
+    1. Both residuals change. A wrong current or frame affects only one joint.
+    2. The change exceeds the noise. Soon after holding began, friction may also be released.
+    3. Both joints yield to the load.
+    4. The load increases to a large fraction of the friction force. Half of the load that joint
+       friction may hide is added.
+    """
+    sense = 1.0 - 2.0 * kind
+    change = 0.5 * (changes[0] + sense * changes[1])
+    smaller = min(changes[0] * change, sense * changes[1] * change)
+    noise = _GATE * math.sqrt(s.variance[kind]) + _JUMP_MIN
+    released = s.friction * (1.0 - s.holding_time / _SETTLING_TIME)
+    if smaller <= _AGREEMENT * change * change or abs(change) <= noise + released:
+        return False
+    sign = math.copysign(1.0, change)
+    yield1 = sign * (s.speed[0] - dq[0])
+    yield2 = sense * sign * (s.speed[1] - dq[1])
+    last = 0.5 * (s.residual[0] + sense * s.residual[1])
+    last -= s.offset if kind == 0 else clip(last, s.friction)
+    if min(yield1, yield2) <= s.law.yield_speed or abs(last + change) <= abs(last):
+        return False
+    curvature = grasp.load_curvature if kind == 0 else 0.0
+    load, slope = load_of(last + change, grasp.load_arm, curvature)
+    hidden = s.friction / max(slope, s.law.arm_min)
+    has_jumped: bool = abs(load) + 0.5 * hidden > sudden_min
+    return has_jumped
 
 
 @inner_kernel
@@ -330,31 +375,22 @@ def _detect_shear_jump(
 
 @inner_kernel
 def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> None:
-    """Estimate the load from the residual that friction cannot explain."""
+    """Estimate the load from the residual that friction cannot explain.
+
+    ``torque_change`` is the change of the mean joint torque since the previous tick [N·m].
+    """
     law = s.law
     smaller = 0.0
     if s.residual[0] * s.residual[1] > 0.0:
         smaller = min(abs(s.residual[0]), abs(s.residual[1]))
     residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
-    is_standing = True
-    for k in range(2):
-        s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING_TIME
-        is_standing = is_standing and abs(grasp.q[k] - s.q[k]) < law.standstill
-    if is_standing:
-        s.offset += torque_change
-    relaxation = _RELAXATION_SHARE * mean(grasp.normal) * mean(grasp.moment_arm)
-    deviation = residual - s.offset
-    if -s.friction - relaxation < deviation < s.friction:
-        s.offset += deviation * law.dt / s.holding_time
-    lowest = s.start_offset - s.friction - relaxation
-    s.offset = min(max(s.offset, lowest), s.start_offset + s.friction)
+    _update_offset(s, grasp, residual, torque_change)
     # A decrease or reversal of friction is not a load.
     deviation = residual - s.offset
     increase = residual - s.start_offset
-    deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
-    s.deviation = deviation
-    load, slope = load_of(deviation, grasp.load_arm, grasp.load_curvature)
+    s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
+    load, slope = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
@@ -363,6 +399,24 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
     hidden = s.friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)
+
+
+@inner_kernel
+def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_change: float) -> None:
+    """Let the offset follow the ``residual`` [N·m] within the range that friction explains."""
+    law = s.law
+    is_standing = True
+    for k in range(2):
+        s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING_TIME
+        is_standing = is_standing and abs(grasp.q[k] - s.q[k]) < law.standstill
+    if is_standing:
+        s.offset += torque_change
+    relaxation = _RELAXATION_SHARE * _moment(grasp)
+    deviation = residual - s.offset
+    if -s.friction - relaxation < deviation < s.friction:
+        s.offset += deviation * law.dt / s.holding_time
+    lowest = s.start_offset - s.friction - relaxation
+    s.offset = min(max(s.offset, lowest), s.start_offset + s.friction)
 
 
 @inner_kernel
@@ -377,7 +431,8 @@ def _has_turned(s: SlipState, grasp: GraspState) -> bool:
     total = s.rotation[0] + s.rotation[1]
     agrees = min(s.rotation[0] * total, s.rotation[1] * total) > _AGREEMENT * total * total
     by_shear = 0.5 * s.law.friction * (grasp.d[0] + grasp.d[1]) / s.law.width
-    turned: bool = agrees and abs(total) > _ROTATION_MARGIN * by_shear + _GATE * grasp.angle_std
+    noise = _GATE * grasp.angle_std
+    turned: bool = agrees and abs(total) > _ROTATION_MARGIN * by_shear + noise
     if turned:
         s.rotation[:] = 0.0
     return turned
