@@ -14,6 +14,7 @@ import errno
 import json
 import logging
 import math
+import os
 import secrets
 import socket
 import threading
@@ -45,6 +46,7 @@ from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
+_NICENESS = 5  # lower than the priority of any real-time thread
 _WAITING_COUNT_MAX = 40  # maximum number of commands awaiting a reply, for all pages together
 _REQUEST_TIMEOUT = 5.0  # timeout for a request's header [s], long enough for a busy browser
 _NAME_LENGTH_MAX = 40  # maximum number of characters of a command name that are displayed
@@ -311,6 +313,7 @@ def listen(host: str, port: int | None) -> socket.socket:
 
 def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
     """Serve the page until the end. Raises SoftfingerError if nothing can be shown."""
+    os.nice(_NICENESS)
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
     if recording is not None and arguments.save is not None:
