@@ -60,7 +60,6 @@ D_MIN = 1e-5  # m, minimum displacement of a tip in contact
 # rad, or fraction of the tip radius: smallest shift of a pressure image that is a fault. A shift by
 # this fraction of the radius changes the angle by 0.06 rad; correct frames are within 0.04 rad.
 IMAGE_SHIFT_MIN = 0.06
-_D_JUMP = 1e-3  # m
 _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must also show to confirm it
 _NORMAL_FORCE_MIN = 1.0  # N per tip; below this, an object may rock between the tips
 _RATE_INTERVAL_MIN = 0.005  # s, minimum interval for the rates of d and θ
@@ -410,7 +409,7 @@ def _is_rejected(
     angle = grasp.angle_jump[finger]
     d = grasp.d_jump[finger]
     angle_jumps = abs(angle) > max(2.0 * IMAGE_SHIFT_MIN, OUTLIER_GATE * angle_std)
-    d_jumps = abs(d) > max(_D_JUMP, OUTLIER_GATE * d_std)
+    d_jumps = abs(d) > max(IMAGE_SHIFT_MIN * h.radius, OUTLIER_GATE * d_std)
     # Two velocity units per joint
     joints_move = abs(tip.speed) + abs(h.tip[other].speed) > 4.0 * h.velocity_unit
     continues = tip.rejected_count > 0 and abs(angle - tip.last_angle_jump) > IMAGE_SHIFT_MIN
