@@ -58,7 +58,6 @@ from softfinger.kinematics.hand.grasp_state import (
 FloatArray = NDArray[np.float64]
 
 _SUPPORT_FRICTION = 0.4  # N, friction between object and table
-_BIAS_RATIO_MIN = 0.8  # fraction of the other sensor's bias, because a bias partly appears in both
 _D_BIAS_MIN = 0.1  # fraction of d, smallest significant bias
 
 
@@ -317,5 +316,5 @@ def _is_larger_bias(bias: Pair, finger: int, smallest: float) -> bool:
     A bias of one sensor also appears, more weakly, in the estimate for the other sensor.
     """
     size = abs(bias[finger])
-    is_larger: bool = size > smallest and size > _BIAS_RATIO_MIN * abs(bias[1 - finger])
+    is_larger: bool = size > smallest and size >= abs(bias[1 - finger])
     return is_larger
