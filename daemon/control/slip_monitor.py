@@ -48,6 +48,7 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.hand_state import OUTLIER_GATE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import GRIP_FRACTION
@@ -55,19 +56,15 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
-_AVERAGE_TIME = 0.1  # averaging time, because velocities fluctuate by one count (0.024 rad/s) [s]
-_SETTLING_TIME = 1.0  # settling time of the residual and hold time of a force increase [s]
-_DECAY_TIME = 2.0  # time to decrease the force by `grip_raise_max`, and decay time of rotations [s]
-_SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
-_ROTATION_INCREASE = 0.5  # relative force increase after an object rotation
-_ROTATION_MARGIN = 1.5  # minimum object rotation, relative to the rotation due to shear deformation
-_GATE = 4.0  # number of standard deviations above which a jump is not noise
-_JUMP_MIN = 0.01  # minimum torque jump [N·m]
-_SHEAR_JUMP = 0.6  # minimum shear jump of solid tips [N], six standard deviations
-_AGREEMENT = 0.25  # minimum share of each joint and each tip in a change, as a fraction of the mean
-_FRICTION_MAX = 0.3  # maximum joint friction derived from the torque during free approach [N·m]
-# Maximum increase for an unconfirmed load, relative to the commanded force.
-_UNCONFIRMED_SHARE = 0.3
+_AVERAGE_TIME = 0.1  # s; velocities fluctuate by one unit of 0.024 rad/s
+_SETTLING_TIME = 1.0  # s, settling time of the residual, for which an increase is also held
+_DECAY_TIME = 2.0  # s for a decrease by `grip_raise_max`; decay time of rotations
+_SUDDEN_SHARE = 0.7  # fraction of the usable friction force above which a sudden load counts
+_ROTATION_INCREASE = 0.5  # relative increase after an object rotation
+_ROTATION_MARGIN = 1.5  # multiple of the rotation due to shear deformation
+_SHEAR_JUMP = 0.6  # N, minimum shear jump of solid tips: six standard deviations
+_AGREEMENT = 0.25  # fraction of the mean that each joint and each tip must show
+_UNCONFIRMED_SHARE = 0.3  # fraction of the commanded force
 _RELAXATION_SHARE = 0.2  # fraction of the tip force that rubber may lose during a hold
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
 _SPARE_MIN = 0.3  # minimum fraction of the friction that remains after rolling
@@ -85,6 +82,7 @@ class SlipLaw(Record):
     friction: float  # Coulomb coefficient between tip and object
     margin: float  # fraction of the friction that is kept as a margin
     joint_friction: float  # [N·m]
+    friction_max: float  # maximum joint torque during an approach [N·m]
     load_friction: float  # fraction of the tip moment that gears hold until the joint opens
     object_load: float  # [N]
     has_shear: bool  # frames measure shear
@@ -134,6 +132,7 @@ def configure(s: SlipState, settings: Settings) -> None:
     law.force_max = GRIP_FRACTION * settings.safety.force_max
     law.friction, law.margin = control.tip_friction, control.slip_margin
     law.joint_friction = control.joint_friction
+    law.friction_max = control.approach_current * control.torque_constant
     law.load_friction = control.load_held
     law.object_load = control.object_load
     law.has_shear = settings.tip.physics == "solid"
@@ -245,7 +244,7 @@ def _update_friction(s: SlipState, grasp: GraspState) -> float:
     """
     law = s.law
     free_torque = max(mean(grasp.free_torque), law.joint_friction)
-    s.friction = min(free_torque, _FRICTION_MAX) + law.load_friction * _moment(grasp)
+    s.friction = min(free_torque, law.friction_max) + law.load_friction * _moment(grasp)
     spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
     s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
     return spare_friction
@@ -341,7 +340,7 @@ def _has_jumped(
     sense = 1.0 - 2.0 * kind
     change = 0.5 * (changes[0] + sense * changes[1])
     smaller = min(changes[0] * change, sense * changes[1] * change)
-    noise = _GATE * math.sqrt(s.variance[kind]) + _JUMP_MIN
+    noise = OUTLIER_GATE * math.sqrt(s.variance[kind])
     released = s.friction * (1.0 - s.holding_time / _SETTLING_TIME)
     if smaller <= _AGREEMENT * change * change or abs(change) <= noise + released:
         return False
@@ -431,7 +430,7 @@ def _has_turned(s: SlipState, grasp: GraspState) -> bool:
     total = s.rotation[0] + s.rotation[1]
     agrees = min(s.rotation[0] * total, s.rotation[1] * total) > _AGREEMENT * total * total
     by_shear = 0.5 * s.law.friction * (grasp.d[0] + grasp.d[1]) / s.law.width
-    noise = _GATE * grasp.angle_std
+    noise = OUTLIER_GATE * grasp.angle_std
     turned: bool = agrees and abs(total) > _ROTATION_MARGIN * by_shear + noise
     if turned:
         s.rotation[:] = 0.0
