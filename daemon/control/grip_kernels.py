@@ -24,11 +24,11 @@ FloatArray = NDArray[np.float64]
 
 _TORQUE_ERROR_SIGMA = 2.0  # number of torque-constant standard deviations in the force limit
 _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
-_DISTRIBUTE_BANDWIDTH = 2.0  # Hz, integral control of the tip force difference
-_DISTRIBUTE_ANGLE = 3e-3  # rad, maximum object rotation that equalises the tip forces
-_DITHER_STEP_MAX = 0.05  # s, maximum dither time step after a delayed tick
-_STIFFNESS_MIN = 100.0  # N/m, lower bound because gains are divided by stiffness
-ROTATION_MIN = 0.1  # minimum object rotation per antisymmetric joint angle
+_DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the integral control of the tip force difference [Hz]
+_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation that this integral control may cause [rad]
+_DITHER_STEP_MAX = 0.05  # maximum dither time step after a delayed tick [s]
+_STIFFNESS_MIN = 100.0  # minimum stiffness, because gains are divided by stiffness [N/m]
+ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
 
 
 class GripLaw(Record):
@@ -131,6 +131,7 @@ def grip_torques(
     if g.slip.reflex_triggered and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)
     target = setpoint.advance(g.force, force_windows, g.force_rate)
+    target = min(target, g.slip.balanced_max)
     limit = _force_limit(g, grasp.load_arm * g.slip.load, mean(grasp.moment_arm))
     bound = _INTEGRAL_RATIO * g.force.target
     g.grip_force = _grip_force(g, target, mean(grasp.force), bound, limit)

@@ -31,16 +31,8 @@ directions. A sideways push looks like a twist.
 
 A force increase is held for _SETTLING_TIME and then decreases by increase_max per _DECAY_TIME.
 
-Limits of the method:
-
-- A pressure grid measures only normal pressure. Sliding along parallel faces does not change d, θ
-  or the joint angles, so ``control.tip_friction`` must not exceed the actual friction.
-- Slowly growing loads stay hidden in joint friction; docs/safety.md gives the values.
-- Grips below 7 N (default hand) are poorly protected, because joint friction hides their loads.
-- A load towards the palm wedges the object between the tips, so the object slips later and the load
-  is harder to detect.
-- While the force changes or the object rotates, the motors also move the joints, so the load
-  estimate is not updated.
+While the force changes or the object rotates, the motors also move the joints, so the load estimate
+is not updated. `docs/safety.md` lists the loads that cannot be detected.
 """
 
 from __future__ import annotations
@@ -56,14 +48,14 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
-_AVERAGE_TIME = 0.1  # s; velocities fluctuate by one unit of 0.024 rad/s
-_SETTLING_TIME = 1.0  # s, settling time of the residual, for which an increase is also held
-_DECAY_TIME = 2.0  # s for a decrease by `grip_raise_max`; decay time of rotations
-_SUDDEN_SHARE = 0.7  # fraction of the usable friction force above which a sudden load counts
-_ROTATION_INCREASE = 0.5  # relative increase after an object rotation
-_ROTATION_MARGIN = 1.5  # multiple of the rotation due to shear deformation
-_SHEAR_JUMP = 0.6  # N, minimum shear jump of solid tips: six standard deviations
-_AGREEMENT = 0.25  # fraction of the mean that each joint and each tip must show
+_AVERAGE_TIME = 0.1  # averaging time, because velocities fluctuate by one count (0.024 rad/s) [s]
+_SETTLING_TIME = 1.0  # settling time of the residual and hold time of a force increase [s]
+_DECAY_TIME = 2.0  # time to decrease the force by `grip_raise_max`, and decay time of rotations [s]
+_SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
+_ROTATION_INCREASE = 0.5  # relative force increase after an object rotation
+_ROTATION_MARGIN = 1.5  # minimum object rotation, relative to the rotation due to shear deformation
+_SHEAR_JUMP = 0.6  # minimum shear jump of solid tips [N], six standard deviations
+_AGREEMENT = 0.25  # minimum share of each joint and each tip in a change, as a fraction of the mean
 _UNCONFIRMED_SHARE = 0.3  # fraction of the commanded force
 _RELAXATION_SHARE = 0.2  # fraction of the tip force that rubber may lose during a hold
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
@@ -118,6 +110,7 @@ class SlipState(Record):
     reflex_triggered: bool  # True if a sudden event occurred on this tick
     needed_force: float  # required force, held for _SETTLING_TIME [N]
     force_limit: float  # [N]
+    balanced_max: float  # mean force at which the more loaded tip reaches its limit [N]
     idle_time: float  # time since a force increase was last required [s]
 
 
@@ -148,7 +141,7 @@ def reset(s: SlipState) -> None:
     s.load = s.assumed_load = s.pull = s.twist = 0.0
     s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
     s.rotation_seen[:] = s.rotation[:] = 0.0
-    s.needed_force = s.force_limit = s.idle_time = 0.0
+    s.needed_force = s.force_limit = s.balanced_max = s.idle_time = 0.0
 
 
 @inner_kernel
@@ -233,7 +226,7 @@ def update(
         s.load = pull = s.needed_force = 0.0
         s.has_turned = sudden = s.is_confirmed = False
     s.assumed_load = max(s.load, pull, 0.5 * law.object_load)
-    return _increased_force(s, commanded, sudden)
+    return _increased_force(s, grasp, commanded, sudden)
 
 
 @inner_kernel
@@ -251,10 +244,15 @@ def _update_friction(s: SlipState, grasp: GraspState) -> float:
 
 
 @inner_kernel
-def _increased_force(s: SlipState, commanded: float, sudden: bool) -> float:
+def _increased_force(s: SlipState, grasp: GraspState, commanded: float, sudden: bool) -> float:
     """Return the grip force [N] that the assumed load and the events of this tick require."""
     s.reflex_triggered = s.has_turned or sudden
     s.is_confirmed = s.is_confirmed or s.reflex_triggered
+    # A push across the faces presses the object into one tip. The torques show it first.
+    by_torque = abs(grasp.torque_residual[0] - grasp.torque_residual[1])
+    by_torque /= max(mean(grasp.moment_arm), s.law.arm_min)
+    imbalance = 0.5 * max(abs(grasp.force[0] - grasp.force[1]), by_torque)
+    s.balanced_max = max(s.law.force_max - imbalance, commanded)
     s.force_limit = _force_limit(s, commanded, 0.5 * s.law.object_load / s.usable_friction)
     needed_force = s.assumed_load / s.usable_friction
     if s.has_turned:
@@ -289,7 +287,7 @@ def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
     law = s.law
     share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
     increase = min(max(share * commanded, declared - commanded), law.increase_ratio * commanded)
-    limit = min(commanded + min(increase, law.increase_max), s.law.force_max)
+    limit = min(commanded + min(increase, law.increase_max), s.balanced_max)
     return max(limit, commanded)
 
 

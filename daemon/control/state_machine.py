@@ -123,7 +123,7 @@ class Approaching(ControlState):
 class GripHistory:
     """Data shared by the states of one grip, from the contact of all fingers to the end."""
 
-    lost_for: float = 0.0  # time for which a contact has been missing [s]
+    lost_for: float = 0.0  # [s]
     lost_current: float = 0.0  # current limit while a contact is missing [A]
     empty_for: float = 0.0  # duration of apparent tip-to-tip contact [s]
     settled_force: float = math.nan  # commanded force when the grip last settled [N]
@@ -382,7 +382,7 @@ class Control:
         if off < _ARRIVAL_DISTANCE:
             self._enter_armed()
         elif state.arrived_for > _STUCK_TIME:
-            text = f"{state.mode.value} ended {math.degrees(off):.1f}° before the goal"
+            text = f"{state.mode.value}: stopped {math.degrees(off):.1f}° before the goal"
             self._warn("short", text)
             self._enter_armed()
 

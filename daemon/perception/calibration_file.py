@@ -28,7 +28,7 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
-_FAULTY = 0.2  # fraction of the median range below which an unloaded cell is nearly saturated
+_FAULTY = 0.2  # minimum range of an unloaded cell, as a fraction of the median range
 
 
 class CalibrationFileError(TactileError):
@@ -219,8 +219,8 @@ def difference(file: Sensor, there: Sensor) -> str:
         ("full_count", str(file.full_count), str(there.full_count)),
         ("pitch", _millimetres(file.pitch), _millimetres(there.pitch)),
     ]
-    return ", ".join(
-        f"{name} {theirs}, here {ours}" for name, theirs, ours in pairs if theirs != ours
+    return "; ".join(
+        f"{name}: found {theirs}, expected {ours}" for name, theirs, ours in pairs if theirs != ours
     )
 
 

@@ -56,13 +56,13 @@ from softfinger.kinematics.hand.grasp_state import FloatPair, total_tilt
 
 FloatArray = NDArray[np.float64]
 
-D_MIN = 1e-5  # m, minimum displacement of a tip in contact
+D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
 # rad, or fraction of the tip radius: smallest shift of a pressure image that is a fault. A shift by
 # this fraction of the radius changes the angle by 0.06 rad; correct frames are within 0.04 rad.
 IMAGE_SHIFT_MIN = 0.06
-_JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must also show to confirm it
+_JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
 _NORMAL_FORCE_MIN = 1.0  # N per tip; below this, an object may rock between the tips
-_RATE_INTERVAL_MIN = 0.005  # s, minimum interval for the rates of d and θ
+_RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
 # A footprint that grows during the response time of the cells looks wider and flatter. These are
 # the relative changes per var(d)/d², from fitting a paraboloid to a mean of paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1

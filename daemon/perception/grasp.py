@@ -71,4 +71,4 @@ class GraspState(Record):
     gain_std: Pair
     gain_prior_std: Pair
     has_wrong_current: Pair  # 1 if a joint's current has differed from its goal for too long
-    sensor_fault: bool  # a channel is faulty, so the grip force must not increase
+    sensor_fault: bool  # True if a channel is faulty, so that the grip force must not increase

@@ -57,8 +57,8 @@ from softfinger.kinematics.hand.grasp_state import (
 
 FloatArray = NDArray[np.float64]
 
-_SUPPORT_FRICTION = 0.4  # N, friction between object and table
-_D_BIAS_MIN = 0.1  # fraction of d, smallest significant bias
+_SUPPORT_FRICTION = 0.4  # friction between object and table [N]
+_D_BIAS_MIN = 0.1  # fraction of d
 
 
 class TipResult(NamedTuple):

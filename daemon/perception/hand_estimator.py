@@ -44,8 +44,8 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 FloatArray = NDArray[np.float64]
 
 # Standard deviations of the settings.
-_TAPER_ERROR = 0.1  # rad, `object.taper`
-_LATENCY_ERROR = 0.03  # s, `tactile.latency`
+_TAPER_ERROR = 0.1  # `object.taper` [rad]
+_LATENCY_ERROR = 0.03  # `tactile.latency` [s]
 
 
 class HandEstimator:

@@ -41,7 +41,7 @@ ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 # Measurement channels, in the order of `grasp.CHANNELS`. The first four are pairs.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-HISTORY_TIME = 0.5  # s of stored joint motion; older frames are treated as this old
+HISTORY_TIME = 0.5  # duration of stored joint motion [s]; older frames are treated as this old
 LAW_POINTS = 17  # nodes in d from 0 to the radius
 
 GATE = 3.0  # number of standard deviations above which an innovation has a reduced effect
@@ -60,9 +60,9 @@ _WALK_ANGLE = 2e-4  # walk of the angle due to tip creep [rad]
 _WALK_D_BIAS = 1e-4  # zero drift during sensor warm-up [m]
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
-_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times gain
-_VELOCITY_TIME = 0.02  # s, correlation time of velocity rounding
-_VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to that before it
+_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only the product of force and gain
+_VELOCITY_TIME = 0.02  # correlation time of velocity rounding [s]
+_VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to the variance before it
 _CURRENT_ERROR = 0.25  # allowed relative deviation of a current from its goal
 _CURRENT_NOISE = 0.02  # additional allowed deviation of a current [A]
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
@@ -73,8 +73,8 @@ class TrackedTip(Record):
 
     in_contact: bool
     touch_time: float  # start of the contact [s]
-    has_new_frame: bool  # a frame arrived after the last torque update
-    gain_is_fixed: bool  # its frames measure force times gain but not displacement
+    has_new_frame: bool  # True if a frame has arrived since the last torque update
+    gain_is_fixed: bool  # True if the frames measure force times gain but not displacement
     rejected_count: int  # consecutive rejected frames
     last_angle_jump: float  # `grasp.angle_jump` of the previous frame [rad]
     current_off_time: float  # time for which the current has differed from its goal [s]
@@ -88,7 +88,7 @@ class TrackedTip(Record):
     speed: float  # joint speed [rad/s]
     torque: float  # joint torque [N·m]
     free_torque: float  # average torque without contact [N·m]
-    free_torque_max: Pair  # maxima in the current and the previous `frame_age_max` window
+    free_torque_max: Pair  # maxima in the current and in the previous _TOUCH_DELAY window
     window_start: float  # [s]
     travel: Pair  # integrated predicted motion of d [m] and of the joint [rad]
     law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F due to table and law

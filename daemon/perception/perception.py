@@ -24,10 +24,10 @@ from softfinger.daemon.types import FINGERS, Event, Frame, SensorInfo, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAME_COUNT = 16
-_ZERO_INTERVAL = 8  # frames between zero updates; thermal drift takes seconds
+_ZERO_INTERVAL = 8  # number of frames between zero updates; thermal drift takes seconds
 _PRESSURE_STEPS = np.iinfo(np.uint16).max  # quantisation steps of a published pressure
-_STORED_TIME = 2.0  # s of stored frames
-_CHANGED_CELLS_MIN = 4  # minimum per frame; one or two noisy cells may repeat by chance
+_STORED_TIME = 2.0  # time for which frames are stored [s]
+_CHANGED_CELLS_MIN = 4  # minimum number of changed cells; noisy cells may repeat by chance
 
 
 class Perception:
@@ -85,8 +85,8 @@ class RepeatDetector:
         If ``enabled``, ``fault_count`` repeated frames are a fault.
         """
         self._enabled = enabled
-        self.period = 0  # repetition period in frames, 0 without repetition
-        self._repeated_count = 0  # consecutive frames with this period
+        self.period = 0  # repetition period in frames, or 0 without repetition
+        self._repeated_count = 0  # number of consecutive frames with this period
         self._fault_count = fault_count
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
         self._last: NDArray[np.uint16] | None = None  # frame
@@ -141,7 +141,7 @@ class FingerPerception:
         self.repeats = RepeatDetector(
             tactile.rate, settings.safety.frame_age_fault, tactile.backend != "replay"
         )
-        self.estimate = ContactEstimate()  # from the last valid frame
+        self.estimate = ContactEstimate()  # estimate from the last valid frame
         active = getattr(sensor, "live", None)  # Some recordings lack cells.
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration

@@ -293,6 +293,26 @@ def test_the_force_increase_is_limited_by_its_setting_and_the_force_limit():
         assert watched.run(50.0, 500) == pytest.approx(expected)
 
 
+def test_the_more_loaded_tip_is_not_pressed_beyond_the_force_limit():
+    """A push across the faces looks like a twist; it presses the object into one tip."""
+    watched = GripUnderLoad(grip_raise_share=10.0)
+    watched.grip.begin_holding()
+    watched.held.force = [FORCE - 9.0, FORCE + 9.0]
+    assert watched.run(50.0, 500) == pytest.approx(0.9 * 30.0 - 9.0)
+    watched.held.force = [FORCE - 18.0, FORCE + 18.0]
+    assert watched.run(50.0, 500) == FORCE, "the commanded force is never reduced"
+
+
+def test_a_push_across_the_faces_causes_no_fault():
+    for push in (14.0, -14.0):
+        with Hand({}) as hand:
+            grasped(hand)
+            hand.plant.apply_load(push, 0.0)
+            hand.watch(0.6)
+            assert hand.mode == "holding"
+            assert hand.plant.force.max() < 30.0
+
+
 def test_a_grip_force_below_the_friction_limit_is_not_raised_by_torques():
     watched = GripUnderLoad(2.0)
     watched.held.normal = [2.0, 2.0]

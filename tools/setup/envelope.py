@@ -40,7 +40,7 @@ _LOAD_TIME = 1.0  # duration of the weight ramp [s]
 _OBSERVATION_TIME = 1.0  # observation time under the full weight [s]
 _LOAD_STEP_COUNT = 20  # number of steps in the weight ramp
 _TURN_MIN = math.radians(5.0)
-_SLIDE_MAX = 0.010  # m, displacement along the faces above which the object counts as lost
+_SLIDE_MAX = 0.010  # displacement along the faces above which the object counts as lost [m]
 _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
 
 
