@@ -25,7 +25,7 @@ OUTCOME_TEXTS = {
     LOST: "the object slips out",
     REFUSED: "the hand can't grip the object",
 }
-_GRAVITY = 9.81  # m/s²
+GRAVITY = 9.81  # m/s²
 _SECTIONS = ("hand", "tip", "material")
 
 
@@ -37,8 +37,9 @@ def identity(settings: Settings) -> dict[str, Any]:
 
 def increased_force_limit(settings: Settings, force: float) -> float:
     """Return the maximum [N] to which the slip monitor may increase a commanded ``force`` [N]."""
-    force_max = GRIP_FRACTION * settings.safety.force_max
-    return max(min(force + settings.control.grip_raise_max, force_max), force)
+    control, force_max = settings.control, GRIP_FRACTION * settings.safety.force_max
+    increase = min(control.grip_raise_max, control.grip_raise_share * force)
+    return max(min(force + increase, force_max), force)
 
 
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
@@ -101,7 +102,7 @@ class Envelope:
         if not self._is_valid:
             return ""
         settings, control = self._settings, self._settings.control
-        mass = control.object_load / _GRAVITY
+        mass = control.object_load / GRAVITY
         scaled = mass * self._force_limit / increased_force_limit(settings, force)
         heavier = min(bisect_left(self._masses, scaled), len(self._masses) - 1)
         outcome = self._outcomes[heavier]

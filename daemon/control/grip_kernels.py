@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.control import setpoint, slip_monitor
 from softfinger.daemon.control.setpoint import SetpointState
-from softfinger.daemon.control.slip_monitor import SlipState, mean
+from softfinger.daemon.control.slip_monitor import SlipState, clip, mean
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.hand_state import GATE
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
@@ -131,10 +131,10 @@ def grip_torques(
     if g.slip.reflex_triggered and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)
     target = setpoint.advance(g.force, force_windows, g.force_rate)
+    target = min(target, g.slip.balanced_max)
+    limit = _force_limit(g, grasp.load_arm * g.slip.load, mean(grasp.moment_arm))
     bound = _INTEGRAL_RATIO * g.force.target
-    grip_force = target + _force_feedback(g, target, mean(grasp.force), bound)
-    load = grasp.load_arm * g.slip.load
-    g.grip_force = min(grip_force, _force_limit(g, load, mean(grasp.moment_arm)))
+    g.grip_force = _grip_force(g, target, mean(grasp.force), bound, limit)
     if g.law.is_blind and not g.is_steering:
         return _equal_torques(g, grasp, target, dq)
     offset_rate = 0.0
@@ -144,7 +144,7 @@ def grip_torques(
     if setpoint.has_arrived(g.force) and not (g.is_steering and not setpoint.has_arrived(g.angle)):
         _distribute(g, grasp)
     closing_rate = _closing_rate(grasp, g.force.speed, offset_rate)
-    g.closing_friction = min(max(closing_rate / g.law.friction_speed, -1.0), 1.0)
+    g.closing_friction = clip(closing_rate / g.law.friction_speed, 1.0)
     return _torques(g, grasp, closing_rate, offset_rate, dq)
 
 
@@ -187,9 +187,9 @@ def single_torque(
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
         limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
         bound = max(limit - g.force.target, 0.0)
-        g.grip_force = min(target + _force_feedback(g, target, grasp.force[finger], bound), limit)
+        g.grip_force = _grip_force(g, target, grasp.force[finger], bound, limit)
         closing_rate = g.force.speed / (stiffness * arm)
-    damping = g.law.damping * math.sqrt(stiffness * arm * arm) * (closing_rate - dq)
+    damping = _damping(g.law, stiffness, arm) * (closing_rate - dq)
     motor_torque = _motor_torque(g.law, arm * g.grip_force, closing_rate)
     torque: float = motor_torque + damping + _friction(g.law, closing_rate)
     g.torque[finger] = torque
@@ -209,16 +209,26 @@ def _rotation_per_offset(grasp: GraspState) -> float:
 
 
 @inner_kernel
-def _force_feedback(g: GripState, target: float, measured: float, bound: float) -> float:
-    """Return the force feedback [N]; ``bound`` limits its integral term."""
+def _damping(law: GripLaw, stiffness: float, arm: float) -> float:
+    """Return the joint damping [N·m·s/rad] for a tip ``stiffness`` at a moment ``arm``."""
+    return law.damping * math.sqrt(stiffness * arm * arm)
+
+
+@inner_kernel
+def _grip_force(g: GripState, target: float, measured: float, bound: float, limit: float) -> float:
+    """Return ``target`` plus force feedback, at most ``limit`` [N].
+
+    ``bound`` limits the integral term.
+    """
     law = g.law
     error = target - measured
     # Anti-windup: do not integrate while a torque is at its limit.
     full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
     if not full or error < 0.0:
         integral = g.integral + law.force_bandwidth * error * law.dt
-        g.integral = min(max(integral, -bound), bound)
-    return law.force_gain * error + g.integral
+        g.integral = clip(integral, bound)
+    force: float = target + (law.force_gain * error + g.integral)
+    return min(force, limit)
 
 
 @inner_kernel
@@ -244,7 +254,7 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
         # The dead band keeps joints at rest from following noise.
         if setpoint.has_arrived(g.angle):
             noise = GATE * grasp.angle_std
-            error -= min(max(error, -noise), noise)
+            error -= clip(error, noise)
         g.offset += g.law.rotate_bandwidth * error / rotation * g.law.dt
     g.offset += offset_rate * g.law.dt
     return offset_rate
@@ -263,8 +273,9 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
         / (_mean_stiffness(grasp) * mean(grasp.moment_arm))
     )
     limit = _DISTRIBUTE_ANGLE / _rotation_per_offset(grasp)
-    balance_offset = g.balance_offset - 2.0 * math.pi * _DISTRIBUTE_BANDWIDTH * off * g.law.dt
-    balance_offset = min(max(balance_offset, -limit), limit)
+    balance_offset = clip(
+        g.balance_offset - 2.0 * math.pi * _DISTRIBUTE_BANDWIDTH * off * g.law.dt, limit
+    )
     g.offset += balance_offset - g.balance_offset
     g.balance_offset = balance_offset
 
@@ -291,7 +302,7 @@ def _torques(
     """Return both joint torques for the commanded closing and offset rates [rad/s]."""
     law = g.law
     arm = mean(grasp.moment_arm)
-    damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
+    damping = _damping(law, _mean_stiffness(grasp), arm)
     damping *= closing_rate - 0.5 * (dq[0] + dq[1])
     error = g.offset - 0.5 * (grasp.q[0] - grasp.q[1])
     steering = g.joint_stiffness * error
@@ -311,46 +322,53 @@ def _equal_torques(
 ) -> tuple[float, float]:
     """Return joint torques that push with equal force at any object angle.
 
-    During the dither, the virtual spring from `hand.upright` acts between the fingers. The dither
-    amplitude decreases gradually so that joint friction leaves no bias. After the dither, the
-    joints hold their antisymmetric angle.
+    After the dither, the joints hold their antisymmetric angle.
     """
     law, q = g.law, grasp.q
     closing_rate = _closing_rate(grasp, g.force.speed, 0.0)
     g.offset_rate = 0.0
-    g.closing_friction = min(max(closing_rate / law.friction_speed, -1.0), 1.0)
+    g.closing_friction = clip(closing_rate / law.friction_speed, 1.0)
     closed = mean(q)
     arm = law.length * math.cos(closed) - law.offset * math.sin(closed)
-    damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
+    damping = _damping(law, _mean_stiffness(grasp), arm)
     damped = damping * (closing_rate - 0.5 * (dq[0] + dq[1]))
     common = (
         _motor_torque(law, arm * g.grip_force, closing_rate) + damped + _friction(law, closing_rate)
     )
-    antisymmetric = 0.5 * (q[0] - q[1])
-    steering = -0.5 * damping * (dq[0] - dq[1])
     if g.dither_elapsed < law.dither_time:
-        lengths = (law.half_separation, law.length, law.offset, law.radius)
-        depth = mean(grasp.d)
-        spring = min(
-            upright_spring(closed, depth, target, grasp.tilt_moment_ratio, lengths),
-            g.joint_stiffness,
-        )
-        # The hold that follows the dither must start with the current spring torque.
-        g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
-        # The dither amplitude ramps up during the first period and fades over the whole dither.
-        phase = law.dither_rate * g.dither_elapsed
-        amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
-        steering = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
-        if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-            # Measure the dither time with the clock instead of counting ticks. Late ticks could
-            # otherwise slow the dither down to the resonance of the fingers on the tips, 1 to 2 Hz.
-            g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
+        steering = _dither(g, grasp, target)
     else:
-        steering += g.joint_stiffness * (g.offset - antisymmetric)
+        steering = g.joint_stiffness * (g.offset - 0.5 * (q[0] - q[1]))
+        steering -= 0.5 * damping * (dq[0] - dq[1])
     g.last_time = grasp.t
     g.torque[0] = common + steering
     g.torque[1] = common - steering
     return g.torque[0], g.torque[1]
+
+
+@inner_kernel
+def _dither(g: GripState, grasp: GraspState, target: float) -> float:
+    """Advance the dither; return its antisymmetric torque [N·m].
+
+    The virtual spring from `hand.upright` acts between the fingers, and an oscillating torque
+    overcomes the joint friction. It fades out so that friction leaves no bias.
+    """
+    law, q = g.law, grasp.q
+    antisymmetric = 0.5 * (q[0] - q[1])
+    lengths = (law.half_separation, law.length, law.offset, law.radius)
+    spring = upright_spring(mean(q), mean(grasp.d), target, grasp.tilt_moment_ratio, lengths)
+    spring = min(spring, g.joint_stiffness)
+    # The subsequent hold must start with the current spring torque.
+    g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
+    # The amplitude increases during the first period, and it fades throughout the dither.
+    phase = law.dither_rate * g.dither_elapsed
+    amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
+    if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
+        # Use the clock instead of counting ticks. Otherwise late ticks could slow the dither to the
+        # resonance of the fingers on the tips, at 1 to 2 Hz.
+        g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
+    torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
+    return torque
 
 
 @inner_kernel
@@ -366,4 +384,4 @@ def _motor_torque(law: GripLaw, torque: float, rate: float) -> float:
 @inner_kernel
 def _friction(law: GripLaw, rate: float) -> float:
     """Return the joint friction [N·m] at the commanded ``rate`` [rad/s]."""
-    return law.friction * min(max(rate / law.friction_speed, -1.0), 1.0)
+    return law.friction * clip(rate / law.friction_speed, 1.0)

@@ -31,16 +31,8 @@ directions. A sideways push looks like a twist.
 
 A force increase is held for _SETTLING_TIME and then decreases by increase_max per _DECAY_TIME.
 
-Limits of the method:
-
-- A pressure grid measures only normal pressure. Sliding along parallel faces does not change d, θ
-  or the joint angles, so ``control.tip_friction`` must not exceed the actual friction.
-- Slowly growing loads stay hidden in joint friction; docs/safety.md gives the values.
-- Grips below 7 N (default hand) are poorly protected, because joint friction hides their loads.
-- A load towards the palm wedges the object between the tips, so the object slips later and the load
-  is harder to detect.
-- While the force changes or the object rotates, the motors also move the joints, so the load
-  estimate is not updated.
+While the force changes or the object rotates, the motors also move the joints, so the load estimate
+is not updated. `docs/safety.md` lists the loads that cannot be detected.
 """
 
 from __future__ import annotations
@@ -48,6 +40,7 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.hand_state import OUTLIER_GATE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import GRIP_FRACTION
@@ -61,13 +54,9 @@ _DECAY_TIME = 2.0  # time to decrease the force by `grip_raise_max`, and decay t
 _SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
 _ROTATION_INCREASE = 0.5  # relative force increase after an object rotation
 _ROTATION_MARGIN = 1.5  # minimum object rotation, relative to the rotation due to shear deformation
-_GATE = 4.0  # number of standard deviations above which a jump is not noise
-_JUMP_MIN = 0.01  # minimum torque jump [N·m]
 _SHEAR_JUMP = 0.6  # minimum shear jump of solid tips [N], six standard deviations
 _AGREEMENT = 0.25  # minimum share of each joint and each tip in a change, as a fraction of the mean
-_FRICTION_MAX = 0.3  # maximum joint friction derived from the torque during free approach [N·m]
-# Maximum increase for an unconfirmed load, relative to the commanded force.
-_UNCONFIRMED_SHARE = 0.3
+_UNCONFIRMED_SHARE = 0.3  # fraction of the commanded force
 _RELAXATION_SHARE = 0.2  # fraction of the tip force that rubber may lose during a hold
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
 _SPARE_MIN = 0.3  # minimum fraction of the friction that remains after rolling
@@ -85,6 +74,7 @@ class SlipLaw(Record):
     friction: float  # Coulomb coefficient between tip and object
     margin: float  # fraction of the friction that is kept as a margin
     joint_friction: float  # [N·m]
+    friction_max: float  # maximum joint torque during an approach [N·m]
     load_friction: float  # fraction of the tip moment that gears hold until the joint opens
     object_load: float  # [N]
     has_shear: bool  # frames measure shear
@@ -120,6 +110,7 @@ class SlipState(Record):
     reflex_triggered: bool  # True if a sudden event occurred on this tick
     needed_force: float  # required force, held for _SETTLING_TIME [N]
     force_limit: float  # [N]
+    balanced_max: float  # mean force at which the more loaded tip reaches its limit [N]
     idle_time: float  # time since a force increase was last required [s]
 
 
@@ -134,6 +125,7 @@ def configure(s: SlipState, settings: Settings) -> None:
     law.force_max = GRIP_FRACTION * settings.safety.force_max
     law.friction, law.margin = control.tip_friction, control.slip_margin
     law.joint_friction = control.joint_friction
+    law.friction_max = control.approach_current * control.torque_constant
     law.load_friction = control.load_held
     law.object_load = control.object_load
     law.has_shear = settings.tip.physics == "solid"
@@ -149,7 +141,7 @@ def reset(s: SlipState) -> None:
     s.load = s.assumed_load = s.pull = s.twist = 0.0
     s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
     s.rotation_seen[:] = s.rotation[:] = 0.0
-    s.needed_force = s.force_limit = s.idle_time = 0.0
+    s.needed_force = s.force_limit = s.balanced_max = s.idle_time = 0.0
 
 
 @inner_kernel
@@ -162,7 +154,7 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
         return
-    moment = mean(grasp.normal) * mean(grasp.moment_arm)
+    moment = _moment(grasp)
     if s.load > 0.0 and s.moment > 0.0:
         s.start_offset *= moment / s.moment
         off = mean(s.residual) - s.deviation - s.start_offset
@@ -182,6 +174,12 @@ def mean(pair: Pair) -> float:
     """Return the mean of (left, right)."""
     value: float = 0.5 * (pair[0] + pair[1])
     return value
+
+
+@inner_kernel
+def _moment(grasp: GraspState) -> float:
+    """Return the mean joint torque that balances the normal forces [N·m]."""
+    return mean(grasp.normal) * mean(grasp.moment_arm)
 
 
 @inner_kernel
@@ -207,14 +205,9 @@ def update(
     are the joint torques of the previous tick [N·m].
     """
     law = s.law
-    moment = mean(grasp.normal) * mean(grasp.moment_arm)
-    free_torque = max(mean(grasp.free_torque), law.joint_friction)
-    s.friction = min(free_torque, _FRICTION_MAX) + law.load_friction * moment
-    is_held = holding and s.is_watched and grasp.load_arm > 0.0
-    # Rolling uses part of the friction, in proportion to the grip force.
-    spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
-    s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
+    spare_friction = _update_friction(s, grasp)
     sudden_min = _SUDDEN_SHARE * max(spare_friction, 0.0) * mean(grasp.normal)
+    is_held = holding and s.is_watched and grasp.load_arm > 0.0
     sudden = _detect_torque_jump(s, grasp, closing, dq, is_held, sudden_min)
     pull = max(abs(grasp.pull_shear) - grasp.shear * mean(grasp.normal), 0.0)
     sudden = _detect_shear_jump(s, pull, grasp.twist_shear, is_held, sudden_min) or sudden
@@ -233,9 +226,34 @@ def update(
         s.load = pull = s.needed_force = 0.0
         s.has_turned = sudden = s.is_confirmed = False
     s.assumed_load = max(s.load, pull, 0.5 * law.object_load)
+    return _increased_force(s, grasp, commanded, sudden)
+
+
+@inner_kernel
+def _update_friction(s: SlipState, grasp: GraspState) -> float:
+    """Set the joint friction and the usable tip friction; return the tip friction before its bound.
+
+    Rolling uses part of the tip friction, and this part increases with the grip force.
+    """
+    law = s.law
+    free_torque = max(mean(grasp.free_torque), law.joint_friction)
+    s.friction = min(free_torque, law.friction_max) + law.load_friction * _moment(grasp)
+    spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
+    s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
+    return spare_friction
+
+
+@inner_kernel
+def _increased_force(s: SlipState, grasp: GraspState, commanded: float, sudden: bool) -> float:
+    """Return the grip force [N] that the assumed load and the events of this tick require."""
     s.reflex_triggered = s.has_turned or sudden
     s.is_confirmed = s.is_confirmed or s.reflex_triggered
-    s.force_limit = _force_limit(s, commanded, 0.5 * law.object_load / s.usable_friction)
+    # A push across the faces presses the object into one tip. The torques show it first.
+    by_torque = abs(grasp.torque_residual[0] - grasp.torque_residual[1])
+    by_torque /= max(mean(grasp.moment_arm), s.law.arm_min)
+    imbalance = 0.5 * max(abs(grasp.force[0] - grasp.force[1]), by_torque)
+    s.balanced_max = max(s.law.force_max - imbalance, commanded)
+    s.force_limit = _force_limit(s, commanded, 0.5 * s.law.object_load / s.usable_friction)
     needed_force = s.assumed_load / s.usable_friction
     if s.has_turned:
         turned_force = (1.0 + _ROTATION_INCREASE) * max(commanded, s.needed_force)
@@ -269,49 +287,73 @@ def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
     law = s.law
     share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
     increase = min(max(share * commanded, declared - commanded), law.increase_ratio * commanded)
-    return max(min(commanded + min(increase, law.increase_max), law.force_max), commanded)
+    limit = min(commanded + min(increase, law.increase_max), s.balanced_max)
+    return max(limit, commanded)
 
 
 @inner_kernel
 def _detect_torque_jump(
     s: SlipState, grasp: GraspState, closing: float, dq: FloatPair, is_held: bool, sudden_min: float
 ) -> bool:
-    """Average the residuals; return True if both residuals jumped while both joints yielded.
-
-    An incorrect current reading affects only one joint, and an incorrect frame moves no joints.
-    """
+    """Average the residuals; return True if they show a sudden pull or twist."""
     known_torque = closing * (s.friction if closing < 0.0 else s.law.joint_friction)
-    deviation1 = grasp.torque_residual[0] - known_torque - s.residual[0]
-    deviation2 = grasp.torque_residual[1] - known_torque - s.residual[1]
-    jump_min = _JUMP_MIN + s.friction * (1.0 - s.holding_time / _SETTLING_TIME)
-    sudden = False
-    for k in range(2):  # pull, then twist
-        sense = 1.0 - 2.0 * k
-        deviation = 0.5 * (deviation1 + sense * deviation2)
-        last = 0.5 * (s.residual[0] + sense * s.residual[1])
-        last -= s.offset if k == 0 else clip(last, s.friction)
-        agreement = min(deviation1 * deviation, sense * deviation2 * deviation)
-        agrees = agreement > _AGREEMENT * deviation * deviation
-        sign = math.copysign(1.0, deviation)
-        yield1 = sign * (s.speed[0] - dq[0])
-        yield2 = sense * sign * (s.speed[1] - dq[1])
-        jumps = abs(deviation) > _GATE * math.sqrt(s.variance[k]) + jump_min
-        grows = abs(last + deviation) > abs(last)
-        if is_held and agrees and jumps and grows and min(yield1, yield2) > s.law.yield_speed:
-            curvature = grasp.load_curvature if k == 0 else 0.0
-            load, slope = load_of(last + deviation, grasp.load_arm, curvature)
-            hidden = s.friction / max(slope, s.law.arm_min)
-            sudden = sudden or abs(load) + 0.5 * hidden > sudden_min
+    change1 = grasp.torque_residual[0] - known_torque - s.residual[0]
+    change2 = grasp.torque_residual[1] - known_torque - s.residual[1]
+    sudden = is_held and (
+        _has_jumped(s, grasp, 0, (change1, change2), dq, sudden_min)
+        or _has_jumped(s, grasp, 1, (change1, change2), dq, sudden_min)
+    )
     weight = 1.0 if sudden else s.law.dt / _AVERAGE_TIME
     if not sudden:
         for k in range(2):
-            deviation = 0.5 * (deviation1 + (1.0 - 2.0 * k) * deviation2)
-            s.variance[k] += (deviation * deviation - s.variance[k]) * s.law.dt / _SETTLING_TIME
-    s.residual[0] += deviation1 * weight
-    s.residual[1] += deviation2 * weight
+            change = 0.5 * (change1 + (1.0 - 2.0 * k) * change2)
+            s.variance[k] += (change * change - s.variance[k]) * s.law.dt / _SETTLING_TIME
+    s.residual[0] += change1 * weight
+    s.residual[1] += change2 * weight
     for k in range(2):
         s.speed[k] += (dq[k] - s.speed[k]) * s.law.dt / _AVERAGE_TIME
     return sudden
+
+
+@inner_kernel
+def _has_jumped(
+    s: SlipState,
+    grasp: GraspState,
+    kind: int,
+    changes: FloatPair,
+    dq: FloatPair,
+    sudden_min: float,
+) -> bool:
+    """Return True if ``changes`` of both residuals [N·m] show a pull (kind 0) or a twist (kind 1).
+
+    A pull changes both residuals equally, a twist changes them in opposite directions. Four tests
+    exclude other causes:
+
+    1. Both residuals change. A wrong current or frame affects only one joint.
+    2. The change exceeds the noise. Soon after holding began, friction may also be released.
+    3. Both joints yield to the load.
+    4. The load increases to a large fraction of the friction force. Half of the load that joint
+       friction may hide is added.
+    """
+    sense = 1.0 - 2.0 * kind
+    change = 0.5 * (changes[0] + sense * changes[1])
+    smaller = min(changes[0] * change, sense * changes[1] * change)
+    noise = OUTLIER_GATE * math.sqrt(s.variance[kind])
+    released = s.friction * (1.0 - s.holding_time / _SETTLING_TIME)
+    if smaller <= _AGREEMENT * change * change or abs(change) <= noise + released:
+        return False
+    sign = math.copysign(1.0, change)
+    yield1 = sign * (s.speed[0] - dq[0])
+    yield2 = sense * sign * (s.speed[1] - dq[1])
+    last = 0.5 * (s.residual[0] + sense * s.residual[1])
+    last -= s.offset if kind == 0 else clip(last, s.friction)
+    if min(yield1, yield2) <= s.law.yield_speed or abs(last + change) <= abs(last):
+        return False
+    curvature = grasp.load_curvature if kind == 0 else 0.0
+    load, slope = load_of(last + change, grasp.load_arm, curvature)
+    hidden = s.friction / max(slope, s.law.arm_min)
+    has_jumped: bool = abs(load) + 0.5 * hidden > sudden_min
+    return has_jumped
 
 
 @inner_kernel
@@ -330,31 +372,22 @@ def _detect_shear_jump(
 
 @inner_kernel
 def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> None:
-    """Estimate the load from the residual that friction cannot explain."""
+    """Estimate the load from the residual that friction cannot explain.
+
+    ``torque_change`` is the change of the mean joint torque since the previous tick [N·m].
+    """
     law = s.law
     smaller = 0.0
     if s.residual[0] * s.residual[1] > 0.0:
         smaller = min(abs(s.residual[0]), abs(s.residual[1]))
     residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
-    is_standing = True
-    for k in range(2):
-        s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING_TIME
-        is_standing = is_standing and abs(grasp.q[k] - s.q[k]) < law.standstill
-    if is_standing:
-        s.offset += torque_change
-    relaxation = _RELAXATION_SHARE * mean(grasp.normal) * mean(grasp.moment_arm)
-    deviation = residual - s.offset
-    if -s.friction - relaxation < deviation < s.friction:
-        s.offset += deviation * law.dt / s.holding_time
-    lowest = s.start_offset - s.friction - relaxation
-    s.offset = min(max(s.offset, lowest), s.start_offset + s.friction)
+    _update_offset(s, grasp, residual, torque_change)
     # A decrease or reversal of friction is not a load.
     deviation = residual - s.offset
     increase = residual - s.start_offset
-    deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
-    s.deviation = deviation
-    load, slope = load_of(deviation, grasp.load_arm, grasp.load_curvature)
+    s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
+    load, slope = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
@@ -363,6 +396,24 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
     hidden = s.friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)
+
+
+@inner_kernel
+def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_change: float) -> None:
+    """Let the offset follow the ``residual`` [N·m] within the range that friction explains."""
+    law = s.law
+    is_standing = True
+    for k in range(2):
+        s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING_TIME
+        is_standing = is_standing and abs(grasp.q[k] - s.q[k]) < law.standstill
+    if is_standing:
+        s.offset += torque_change
+    relaxation = _RELAXATION_SHARE * _moment(grasp)
+    deviation = residual - s.offset
+    if -s.friction - relaxation < deviation < s.friction:
+        s.offset += deviation * law.dt / s.holding_time
+    lowest = s.start_offset - s.friction - relaxation
+    s.offset = min(max(s.offset, lowest), s.start_offset + s.friction)
 
 
 @inner_kernel
@@ -377,7 +428,8 @@ def _has_turned(s: SlipState, grasp: GraspState) -> bool:
     total = s.rotation[0] + s.rotation[1]
     agrees = min(s.rotation[0] * total, s.rotation[1] * total) > _AGREEMENT * total * total
     by_shear = 0.5 * s.law.friction * (grasp.d[0] + grasp.d[1]) / s.law.width
-    turned: bool = agrees and abs(total) > _ROTATION_MARGIN * by_shear + _GATE * grasp.angle_std
+    noise = OUTLIER_GATE * grasp.angle_std
+    turned: bool = agrees and abs(total) > _ROTATION_MARGIN * by_shear + noise
     if turned:
         s.rotation[:] = 0.0
     return turned

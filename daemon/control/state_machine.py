@@ -10,7 +10,7 @@ Travelling   MOVING     joints move to commanded angles  arrived, or timed out �
                                                          `grasp`, `hold` → Approaching
              RELEASING  joints move to the open angles   arrived, or timed out → Armed
 Approaching  GRASPING   fingers close; the first one to  all touch → Pressing; at the joint limits
-                        touch waits for the other        for _ARRIVAL_TIMEOUT → Armed
+                        touch waits for the other        for _STUCK_TIME → Armed
 Pressing     GRASPING   the force increases              force reached → Settled, then Turning if
                                                          an angle was commanded
 Settled      HOLDING    force and angle are constant:    `grasp`, `hold`, `limit_force` with
@@ -24,10 +24,10 @@ Several states share these transitions:
 - all: a fault → Off (FAULT); `stop`, `disarm` → Off (DISARMED), but a fault persists until `clear`
 - with torque: `release` → Travelling (RELEASING)
 - Settled, Changing, Turning: `rotate` → Turning
-- Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for _EMPTY_TIME →
-  Travelling (RELEASING)
-- Pressing, Settled, Changing, Turning: a contact is missing for _CONTACT_LOSS_TIME → Armed. While
-  the contact is missing, the joints hold their positions (`ContactLoss`).
+- Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for
+  `safety.frame_age_fault` frame periods → Travelling (RELEASING)
+- Pressing, Settled, Changing, Turning: a contact is missing for the same time → Armed. Until then,
+  the joints hold their positions.
 
 Each transition creates a new instance of a state class. Timers and flags are attributes of the
 state that uses them and are discarded with it. `control.modes` lists the commands for each mode,
@@ -50,40 +50,23 @@ from softfinger.daemon.types import FINGERS, Event, Goal, State
 # Maximum distance between a joint and its goal on arrival [rad]. The value is five times the
 # position error that the default joint friction causes at the default servos.stiffness.
 _ARRIVAL_DISTANCE = 0.03
-# Time allowed for a joint to arrive after its setpoint [s]. A joint that takes longer is held by
-# friction.
-_ARRIVAL_TIMEOUT = 1.0
-# Force tolerance as a fraction of the force target. With simulated sensors, the force noise is 0.3
-# to 0.6 % (1 σ).
+# Fraction of the force target. The force noise is 0.3 to 0.6 % (1 σ) with simulated sensors.
 _FORCE_TOLERANCE = 0.03
-# Maximum excess force that gear friction may hold, as a fraction of the force target. In the small
-# hand, this excess is 6 %.
-_HELD_FORCE_MAX = 0.12
-# Force error that joint friction may cause, as a fraction of the force target. For the default
-# finger, a friction of 0.05 N·m corresponds to a tenth of 6 N. The integral term removes this error
+# Fraction of the force target: error that joint friction or gear friction may cause. For the
+# default finger, 0.05 N·m corresponds to a tenth of 6 N. The integral term removes this error
 # within seconds.
 _FRICTION_TOLERANCE = 0.1
-# Time after which the force counts as reached despite a friction error [s]. The value is ten times
-# the settling time without friction.
+# s after which friction holds a joint that has not reached its goal, or a force within
+# _FRICTION_TOLERANCE: ten times the frictionless settling time of the force.
 _STUCK_TIME = 2.0
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
-# Time for which force and angle must stay at their targets [s]. The value is five frames at 25 Hz
-# and twice the default smooth_time.
-_SETTLING_TIME = 0.2
-# Tolerance of a streamed force, as a fraction of the force target. A streamed target may change
-# continuously, so a grip also settles while it follows a setpoint within this distance of the
-# target.
+# Fraction of the force target. A streamed target may change continuously, so a grip also settles
+# when it follows a setpoint that is within this distance of the target.
 _STREAM_TOLERANCE = 0.25
 # Smaller changes in a streamed setpoint or in the force increase are treated as noise. The units
 # are fractions of the force, and rad (1 σ of the angle).
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
-# Time without contact after which the contact counts as lost [s]. Two frames at 25 Hz are shorter
-# than this value.
-_CONTACT_LOSS_TIME = 0.1
-# Time for which the tips must appear to touch each other before the grip counts as empty [s]. The
-# value is longer than one frame period at 25 Hz.
-_EMPTY_TIME = 0.05
 
 
 class ControlState:
@@ -137,18 +120,11 @@ class Approaching(ControlState):
 
 
 @dataclass
-class ContactLoss:
-    """A contact is missing: the joints hold their positions."""
-
-    current: float  # current limit [A]
-    lost_for: float = 0.0  # [s]
-
-
-@dataclass
 class GripHistory:
     """Data shared by the states of one grip, from the contact of all fingers to the end."""
 
-    loss: ContactLoss | None = None
+    lost_for: float = 0.0  # [s]
+    lost_current: float = 0.0  # current limit while a contact is missing [A]
     empty_for: float = 0.0  # duration of apparent tip-to-tip contact [s]
     settled_force: float = math.nan  # commanded force when the grip last settled [N]
     settled_angle: float = math.nan  # commanded angle when the grip last settled [rad]
@@ -201,6 +177,12 @@ class Control:
         self.grip = Grip(settings, self.fingers.indices, grasp)
         self.state: ControlState = Off()
         self.events: list[Event] = []
+        # A contact may be missing, or the tips may appear to touch each other, as long as frames
+        # may be missing [s].
+        self._doubt_time = settings.safety.frame_age_fault / settings.tactile.rate
+        # Force and angle have settled when they have stayed at their targets for the time over
+        # which their setpoints are averaged, including the second average [s].
+        self._settling_time = 2.0 * settings.control.smooth_time
 
     @property
     def mode(self) -> Mode:
@@ -374,7 +356,7 @@ class Control:
 
         In a grip, the goals are torques: the joints stay damped, and any rotation stops.
         """
-        if goal.valid and isinstance(self.state, Gripping) and self.state.history.loss is None:
+        if goal.valid and isinstance(self.state, Gripping) and not self.state.history.lost_for:
             self.fingers.apply_torques(goal, self.grip.hold_goal(self.fingers.reading))
 
     def _current(self) -> float:
@@ -399,7 +381,7 @@ class Control:
         off = self.fingers.distance_max
         if off < _ARRIVAL_DISTANCE:
             self._enter_armed()
-        elif state.arrived_for > _ARRIVAL_TIMEOUT:
+        elif state.arrived_for > _STUCK_TIME:
             text = f"{state.mode.value}: stopped {math.degrees(off):.1f}° before the goal"
             self._warn("short", text)
             self._enter_armed()
@@ -414,7 +396,7 @@ class Control:
                 self._enter(Pressing(GripHistory(), command=state.command))
         elif self.fingers.advance_setpoints(self._settings.control.approach_speed):
             state.arrived_for += dt
-            if state.arrived_for > _ARRIVAL_TIMEOUT:
+            if state.arrived_for > _STUCK_TIME:
                 self._warn(
                     "grasp", "the fingers reached their joint limits without finding an object"
                 )
@@ -422,7 +404,7 @@ class Control:
                 self._enter_armed()
 
     def _empty_for(self, before: float, dt: float) -> float:
-        """Return the duration [s] of apparent tip-to-tip contact; release after _EMPTY_TIME.
+        """Return the duration [s] of apparent tip-to-tip contact; release if it persists.
 
         Tips that press against each other would roll off to one side. When the tips touch each
         other, both sensors measure the same contact, so the estimated object width is 0 to within
@@ -431,7 +413,7 @@ class Control:
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:
             return 0.0
-        if before + dt > _EMPTY_TIME:
+        if before + dt > self._doubt_time:
             text = (
                 f"no object between the tips: their distance is {pose.width * 1e3:.1f} mm, "
                 f"expected at least object.width_min = {width_min * 1e3:g} mm; the hand opens"
@@ -445,8 +427,8 @@ class Control:
         if not fingers.in_contact:
             self._handle_contact_loss(history, dt, goal)
             return
-        if history.loss is not None:  # Joint motion while the force recovers is not a load.
-            history.loss, state.reached_for = None, 0.0
+        if history.lost_for:  # Joint motion is not a load while the force increases again.
+            history.lost_for = state.reached_for = 0.0
             if isinstance(state, Settled):
                 self._enter(state := Changing(history))
         is_settled = isinstance(state, Settled)
@@ -457,21 +439,20 @@ class Control:
         history.empty_for = self._empty_for(history.empty_for, dt)
 
     def _handle_contact_loss(self, history: GripHistory, dt: float, goal: Goal) -> None:
-        """Hold the joints while a contact is missing; end the grip after _CONTACT_LOSS_TIME."""
-        if history.loss is None:
+        """Hold the joints while a contact is missing; end the grip if it remains missing."""
+        if not history.lost_for:
             self.fingers.hold_here()
             # A sensor failure must not increase the force with which the joints press.
             pressed = max(goal.current[index] for index in self.fingers.indices)
-            history.loss = ContactLoss(min(pressed, self._settings.safety.current_move))
-        loss = history.loss
-        self.fingers.follow_setpoints(goal, loss.current)
-        loss.lost_for += dt
-        if loss.lost_for > _CONTACT_LOSS_TIME:
+            history.lost_current = min(pressed, self._settings.safety.current_move)
+        self.fingers.follow_setpoints(goal, history.lost_current)
+        history.lost_for += dt
+        if history.lost_for > self._doubt_time:
             self._warn("lost", "contact was lost; the joints hold their positions")
-            self._enter(Armed(loss.current))
+            self._enter(Armed(history.lost_current))
 
     def _check_settled(self, state: Gripping, dt: float) -> None:
-        """Enter Settled when force and angle have stayed at their targets for _SETTLING_TIME."""
+        """Enter Settled when force and angle have stayed at their targets."""
         grip, pose, history = self.grip, self.fingers.pose, state.history
         is_reached = True
         if not isinstance(state, Pressing):
@@ -484,7 +465,7 @@ class Control:
             stuck = state.near_for > _STUCK_TIME
             is_reached = is_reached and (stuck or self._is_force_reached(streamed))
         state.reached_for = state.reached_for + dt if is_reached else 0.0
-        if state.reached_for <= _SETTLING_TIME:
+        if state.reached_for <= self._settling_time:
             return
         if pose.valid and math.isnan(grip.target_angle) and not grip.is_blind:
             grip.steer(pose.angle, pose.angle)
@@ -504,7 +485,7 @@ class Control:
         """
         grip = self.grip
         wanted = grip.force.value if is_streamed else grip.target
-        over = _FORCE_TOLERANCE + min(self._settings.control.load_held, _HELD_FORCE_MAX)
+        over = _FORCE_TOLERANCE + min(self._settings.control.load_held, _FRICTION_TOLERANCE)
         off = self.fingers.force - wanted
         is_near = abs(wanted - grip.target) < _STREAM_TOLERANCE * grip.target
         is_there = -_FORCE_TOLERANCE * grip.target < off < over * grip.target

@@ -28,8 +28,6 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
-_PITCH = 1e-9  # tolerance within which two pitches count as equal [m]
-_MONOTONE_POINTS = 257
 _FAULTY = 0.2  # minimum range of an unloaded cell, as a fraction of the median range
 
 
@@ -219,9 +217,8 @@ def difference(file: Sensor, there: Sensor) -> str:
         ("sensor", file.label or "unnamed", there.label or "unnamed"),
         ("grid", f"{file.rows} × {file.cols}", f"{there.rows} × {there.cols}"),
         ("full_count", str(file.full_count), str(there.full_count)),
+        ("pitch", _millimetres(file.pitch), _millimetres(there.pitch)),
     ]
-    if max(abs(a - b) for a, b in zip(file.pitch, there.pitch, strict=True)) > _PITCH:
-        pairs.append(("pitch", _millimetres(file.pitch), _millimetres(there.pitch)))
     return "; ".join(
         f"{name}: found {theirs}, expected {ours}" for name, theirs, ours in pairs if theirs != ours
     )
@@ -339,8 +336,7 @@ def _contradiction(calibration: Calibration) -> str:
         return "equilibrate.gain: found only dead cells (gain 0), expected at least one live cell"
     if calibration.curve:
         converter = Converter(Calibration(sensor=sensor, date="", curve=calibration.curve), 1.0)
-        counts = np.linspace(0, sensor.full_count, min(_MONOTONE_POINTS, sensor.full_count + 1))
-        pressures = [converter.at(int(count)).max() for count in counts]
+        pressures = converter.pressure(np.arange(sensor.full_count + 1.0))
         if not np.isfinite(pressures).all() or (np.diff(pressures) <= 0.0).any():
             return "curve.coefficients: the pressure must increase with the count"
     if calibration.modulus:
@@ -366,4 +362,4 @@ def _usb_serial(settings: Settings, finger: int) -> str:
 
 
 def _millimetres(pitch: tuple[float, float]) -> str:
-    return f"{pitch[0] * 1e3:.4g} × {pitch[1] * 1e3:.4g} mm"
+    return f"{pitch[0] * 1e3:.6g} × {pitch[1] * 1e3:.6g} mm"

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.hand_state import (
     AMPLITUDE,
     ANGLE,
@@ -53,23 +52,19 @@ from softfinger.daemon.perception.hand_state import (
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.lookup import lookup
-from softfinger.kinematics.hand.grasp_state import total_tilt
+from softfinger.kinematics.hand.grasp_state import FloatPair, total_tilt
 
 FloatArray = NDArray[np.float64]
 
 D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
-# A frame is an outlier if its deviation exceeds OUTLIER_GATE standard deviations and one of these
-# limits.
-ANGLE_JUMP = 0.12  # limit for the angle [rad]; correct frames deviate by at most 0.04 rad
-D_JUMP = 1e-3  # limit for the displacement [m]
-REJECTED_MAX = 2  # number of consecutive rejected frames that are tolerated before a sensor fault
+# rad, or fraction of the tip radius: smallest shift of a pressure image that is a fault. A shift by
+# this fraction of the radius changes the angle by 0.06 rad; correct frames are within 0.04 rad.
+IMAGE_SHIFT_MIN = 0.06
 _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
-# Minimum normal force per tip [N]; at a lower force, an object may rock between the tips.
-_NORMAL_FORCE_MIN = 1.0
+_NORMAL_FORCE_MIN = 1.0  # N per tip; below this, an object may rock between the tips
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
-# A footprint that grows during the response time of the cells looks wider and flatter. These
-# factors are the relative changes per var(d)/d². The factors come from fitting a paraboloid to a
-# mean of paraboloids.
+# A footprint that grows during the response time of the cells looks wider and flatter. These are
+# the relative changes per var(d)/d², from fitting a paraboloid to a mean of paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
 _SLOPE_SMOOTHING = 0.9  # low-pass coefficient of ∂ ln F/∂d, applied once per frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
@@ -84,6 +79,18 @@ class FrameContact(NamedTuple):
     tilt_y: float
     gain: float
     shear: float
+
+
+class Scan(NamedTuple):
+    """Predicted motion of one finger from a scan until now, and its state at the scan."""
+
+    d: float  # motion of d since the scan [m]
+    q: float  # joint motion since the scan [rad]
+    rotation: float  # object rotation since the scan [rad]
+    d_rate: float  # at the scan [m/s]
+    theta_rate: float  # at the scan [rad/s]
+    spread: float  # variance of d within the cell response time [m²]
+    relaxation: float  # relaxation factor
 
 
 class FingerMotion(NamedTuple):
@@ -148,6 +155,26 @@ def _rates(
 
 
 @inner_kernel
+def _motion_since(
+    h: HandFilter, history: Records[HistoryRow], finger: int, t: float, sense: float
+) -> Scan:
+    """Return the motion since the scan that the frame with time stamp ``t`` shows."""
+    scan = t - h.mean[LATENCY]
+    row = _motion_at(history, h.newest_row, scan, finger)
+    d_rate, theta_rate = _rates(h, history, finger, scan, sense)
+    travel = h.tip[finger].travel
+    return Scan(
+        travel[0] - row.d,
+        travel[1] - row.q,
+        h.rotation - row.angle,
+        d_rate,
+        theta_rate,
+        row.spread,
+        row.relaxation,
+    )
+
+
+@inner_kernel
 def _set_angle_slopes(h: HandFilter, finger: int, sense: float, theta_rate: float) -> None:
     h.slopes[ANGLE] = 1.0
     h.slopes[TAPER] = 0.5 * sense
@@ -190,37 +217,24 @@ def update(
     d_noise = covariance[0, 0] - systematic[0, 0]
     theta_noise = covariance[1, 1] - systematic[1, 1]
     sense = -1.0 if finger == 0 else 1.0
-    scan = t - h.mean[LATENCY]
-    at_scan = _motion_at(history, h.newest_row, scan, finger)
-    d_rate, theta_rate = _rates(h, history, finger, scan, sense)
-    d_since = tip.travel[0] - at_scan.d
-    q_since = tip.travel[1] - at_scan.q
-    rotation_since = h.rotation - at_scan.angle
-    face = found.theta + sense * (tip.q - q_since)  # face angle at the scan time [rad]
+    scan = _motion_since(h, history, finger, t, sense)
     is_fitted = covariance[3, 3] > 0.0
-    gain_is_fixed = not (is_fitted or h.gain_is_known)
     tilt = total_tilt(found.theta, found.tilt_y)
     frame_force, _, stiffness, _, _, _, _ = lookup(table, found.d, tilt)
     log_slope = stiffness / frame_force
-    d = found.d
-    gain = found.gain
-    if is_fitted:
-        spread = min(at_scan.spread / (d * d), _SPREAD_MAX)
-        gain /= at_scan.relaxation * (1.0 - _FLATTENING * spread)
-        d /= 1.0 + _WIDENING * spread
-    elif h.gain_is_known:
-        d -= math.log(at_scan.relaxation) / log_slope
+    d, gain = _without_lag(h, found, scan, is_fitted, log_slope)
+    face = found.theta + sense * (tip.q - scan.q)  # face angle at the scan [rad]
     is_new_contact = not tip.in_contact
     if is_new_contact:
         tip.touch_time = h.t
-        _begin_contact(h, finger, sense, face + rotation_since)
-    # While the cells are still responding to the touch, they show motion from before the contact
+        _begin_contact(h, finger, sense, face + scan.rotation)
+    # While the cells still respond to the touch, they show motion that precedes the contact
     # history.
     cells_respond = h.t - tip.touch_time < h.response
     if is_new_contact or cells_respond:
-        reset(h, D + finger, d + d_since, (_FIRST_D_ERROR * d) ** 2)
-    d_at_scan = h.mean[D + finger] - d_since
-    angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - rotation_since
+        reset(h, D + finger, d + scan.d, (_FIRST_D_ERROR * d) ** 2)
+    d_at_scan = h.mean[D + finger] - scan.d
+    angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - scan.rotation
     angle_innovation = face - (angle_at_scan + h.mean[ANGLE_BIAS + finger])
     d_innovation = d - (d_at_scan + h.mean[D_BIAS + finger])
     if (
@@ -228,55 +242,72 @@ def update(
         and not cells_respond
         and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN
     ):
-        _set_angle_slopes(h, finger, sense, theta_rate)
-        angle_std = math.sqrt(predicted_variance(h) + theta_noise)
-        h.slopes[:] = 0.0
-        _set_d_slopes(h, finger, 1.0, 1.0, d_rate)
-        d_std = math.sqrt(predicted_variance(h) + d_noise)
-        h.slopes[:] = 0.0
-        # Allow for two velocity counts per joint.
-        joints_move = abs(tip.speed) + abs(other.speed) > 4.0 * h.velocity_unit
-        jump = d_innovation if is_fitted else 0.0
-        if _is_rejected(h.grasp, finger, angle_innovation, angle_std, jump, d_std, joints_move):
+        h.grasp.angle_jump[finger] = angle_innovation
+        h.grasp.d_jump[finger] = d_innovation if is_fitted else 0.0
+        if _is_rejected(h, finger, sense, scan, theta_noise, d_noise):
             return False
     tip.tilt_y = found.tilt_y
-    tip.gain_is_fixed = gain_is_fixed
+    tip.gain_is_fixed = not (is_fitted or h.gain_is_known)
     tip.shear = found.shear
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
-    if gain_is_fixed:  # The gain is a state, so its error is not shared.
+    if tip.gain_is_fixed:  # GAIN is a state, so its part of the error is not shared.
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = not cells_respond
-    _update_angle(h, finger, sense, angle_innovation, theta_noise, theta_rate, is_new_contact)
+    _update_angle(h, finger, sense, angle_innovation, theta_noise, scan.theta_rate, is_new_contact)
     tip.in_contact = True
-    if gain_is_fixed:
+    if tip.gain_is_fixed:
         expected, _, stiffness, _, _, _, _ = lookup(table, max(d_at_scan, D_MIN), tilt)
         smoothing = 0.0 if is_new_contact else _SLOPE_SMOOTHING
         tip.log_slope = interpolate(stiffness / expected, tip.log_slope, smoothing)
-        innovation = math.log(frame_force / (at_scan.relaxation * expected))
+        innovation = math.log(frame_force / (scan.relaxation * expected))
         innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
-        _set_d_slopes(h, finger, tip.log_slope, 0.0, d_rate)
+        _set_d_slopes(h, finger, tip.log_slope, 0.0, scan.d_rate)
         h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0
         _update_footprint(h, finger, innovation, d_noise * log_slope * log_slope)
     else:
-        _set_d_slopes(h, finger, 1.0, 1.0, d_rate)
+        _set_d_slopes(h, finger, 1.0, 1.0, scan.d_rate)
         _update_footprint(h, finger, d_innovation, d_noise)
     if is_fitted and not h.gain_is_known and gain > 0.0:
-        # The errors of d and gain are correlated, and the footprint update has already used the
-        # common part.
-        ratio = (covariance[0, 3] - systematic[0, 3]) / (d_noise * gain)
-        gain_noise = (covariance[3, 3] - systematic[3, 3]) / (gain * gain)
-        own_noise = max(gain_noise - ratio * ratio * d_noise, 0.0)
-        d_residual = d - (h.mean[D + finger] - d_since + h.mean[D_BIAS + finger])
-        innovation = math.log(gain) - ratio * d_residual
-        innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
-        _set_d_slopes(h, finger, -ratio, -ratio, d_rate)
-        h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0
-        variance = own_noise + _AMPLITUDE_ERROR * _AMPLITUDE_ERROR
-        correct(h, AMPLITUDE + finger, innovation, variance, GATE)
+        _update_amplitude(h, finger, scan, (d, gain), covariance - systematic)
     h.mean[D + finger] = max(h.mean[D + finger], D_MIN)
     return True
+
+
+@inner_kernel
+def _without_lag(
+    h: HandFilter, found: FrameContact, scan: Scan, is_fitted: bool, log_slope: float
+) -> tuple[float, float]:
+    """Return d and gain without the effects of slow cells and of the tip's relaxation."""
+    if is_fitted:
+        spread = min(scan.spread / (found.d * found.d), _SPREAD_MAX)
+        flattening = 1.0 - _FLATTENING * spread
+        return found.d / (1.0 + _WIDENING * spread), found.gain / (scan.relaxation * flattening)
+    if h.gain_is_known:
+        return found.d - math.log(scan.relaxation) / log_slope, found.gain
+    return found.d, found.gain
+
+
+@inner_kernel
+def _update_amplitude(
+    h: HandFilter, finger: int, scan: Scan, found: FloatPair, noise: FloatArray
+) -> None:
+    """Update with the fitted amplitude; ``found`` is (d, gain) with the covariance ``noise``.
+
+    The errors of d and gain are correlated, and the footprint has already used the common part.
+    """
+    d, gain = found
+    d_noise = noise[0, 0]
+    ratio = noise[0, 3] / (d_noise * gain)
+    own_noise = max(noise[3, 3] / (gain * gain) - ratio * ratio * d_noise, 0.0)
+    d_residual = d - (h.mean[D + finger] - scan.d + h.mean[D_BIAS + finger])
+    innovation = math.log(gain) - ratio * d_residual
+    innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
+    _set_d_slopes(h, finger, -ratio, -ratio, scan.d_rate)
+    h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0
+    variance = own_noise + _AMPLITUDE_ERROR * _AMPLITUDE_ERROR
+    correct(h, AMPLITUDE + finger, innovation, variance, GATE)
 
 
 @inner_kernel
@@ -296,7 +327,8 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
     for pair in (MODULUS, GAIN, TORQUE, D_BIAS, ANGLE_BIAS):
         state = pair + finger
         reset(h, state, h.prior_mean[state], h.prior_variance[state])
-    h.grasp.rejected_count[:] = 0.0
+    h.grasp.rejects_frames[:] = 0.0
+    h.tip[0].rejected_count = h.tip[1].rejected_count = 0
     h.tip[finger].d_innovation = 0.0
     if h.tip[1 - finger].in_contact:
         return
@@ -355,13 +387,7 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
 
 @inner_kernel
 def _is_rejected(
-    grasp: GraspState,
-    finger: int,
-    angle_innovation: float,
-    angle_std: float,
-    d_innovation: float,
-    d_std: float,
-    joints_move: bool,
+    h: HandFilter, finger: int, sense: float, scan: Scan, theta_noise: float, d_noise: float
 ) -> bool:
     """Return True if a frame is an outlier while an object is held; count these outliers.
 
@@ -371,19 +397,28 @@ def _is_rejected(
     away from the other. The first frame of a real jump is also rejected, because the other tip's
     frame has not arrived yet.
     """
+    grasp = h.grasp
+    tip = h.tip[finger]
     other = 1 - finger
-    last = grasp.angle_innovation[finger]
-    grasp.angle_innovation[finger] = angle_innovation
-    grasp.d_innovation[finger] = d_innovation
-    angle_jumps = abs(angle_innovation) > max(ANGLE_JUMP, OUTLIER_GATE * angle_std)
-    d_jumps = abs(d_innovation) > max(D_JUMP, OUTLIER_GATE * d_std)
-    agreement = angle_innovation * grasp.angle_innovation[other]
-    angle_agrees = agreement > _JUMP_SUPPORT * angle_innovation * angle_innovation
-    d_agrees = abs(grasp.d_innovation[other]) >= _JUMP_SUPPORT * abs(d_innovation)
-    was_rejected = grasp.rejected_count[finger] > 0.0
-    continues = was_rejected and abs(angle_innovation - last) > 0.5 * ANGLE_JUMP
+    _set_angle_slopes(h, finger, sense, scan.theta_rate)
+    angle_std = math.sqrt(predicted_variance(h) + theta_noise)
+    h.slopes[:] = 0.0
+    _set_d_slopes(h, finger, 1.0, 1.0, scan.d_rate)
+    d_std = math.sqrt(predicted_variance(h) + d_noise)
+    h.slopes[:] = 0.0
+    angle = grasp.angle_jump[finger]
+    d = grasp.d_jump[finger]
+    angle_jumps = abs(angle) > max(2.0 * IMAGE_SHIFT_MIN, OUTLIER_GATE * angle_std)
+    d_jumps = abs(d) > max(IMAGE_SHIFT_MIN * h.radius, OUTLIER_GATE * d_std)
+    # Two velocity units per joint
+    joints_move = abs(tip.speed) + abs(h.tip[other].speed) > 4.0 * h.velocity_unit
+    continues = tip.rejected_count > 0 and abs(angle - tip.last_angle_jump) > IMAGE_SHIFT_MIN
+    tip.last_angle_jump = angle
+    angle_agrees = angle * grasp.angle_jump[other] > _JUMP_SUPPORT * angle * angle
+    d_agrees = abs(grasp.d_jump[other]) >= _JUMP_SUPPORT * abs(d)
     is_rejected: bool = (angle_jumps and not (angle_agrees and (joints_move or continues))) or (
         d_jumps and not (d_agrees or joints_move)
     )
-    grasp.rejected_count[finger] = grasp.rejected_count[finger] + 1.0 if is_rejected else 0.0
+    tip.rejected_count = tip.rejected_count + 1 if is_rejected else 0
+    grasp.rejects_frames[finger] = 1.0 if tip.rejected_count >= h.rejected_max else 0.0
     return is_rejected

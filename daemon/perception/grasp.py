@@ -57,9 +57,11 @@ class GraspState(Record):
 
     # Consistency
     nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running average, expected value 1
-    angle_innovation: Pair  # innovation of the newest angle [rad]
-    d_innovation: Pair  # innovation of the newest displacement [m]
-    rejected_count: Pair  # consecutive rejected frames
+    angle_jump: (
+        Pair  # difference between the newest frame of a held object and its prediction [rad]
+    )
+    d_jump: Pair  # the same for the displacement, 0 if the frame does not measure it [m]
+    rejects_frames: Pair  # 1 if more consecutive frames were rejected than may be missing
     d_bias: Pair  # [m]
     d_bias_std: Pair
     angle_bias: Pair  # [rad]
@@ -68,5 +70,5 @@ class GraspState(Record):
     gain_change: Pair  # logarithm of the ratio of the gain to its prior
     gain_std: Pair
     gain_prior_std: Pair
-    current_off_time: Pair  # time for which a joint's current has deviated from its goal [s]
+    has_wrong_current: Pair  # 1 if a joint's current has differed from its goal for too long
     sensor_fault: bool  # True if a channel is faulty, so that the grip force must not increase

@@ -16,13 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.perception.frame_channels import ANGLE_JUMP, REJECTED_MAX
+from softfinger.daemon.perception.frame_channels import IMAGE_SHIFT_MIN
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.hand_state import (
     ANGLE,
     ANGLE_BIAS,
     BALANCE,
-    CURRENT_OFF_TIME_MAX,
     D_BIAS,
     FRICTION,
     GAIN,
@@ -46,17 +45,20 @@ from softfinger.daemon.perception.hand_state import (
     predicted_variance,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.compiled.layout import Pair, Records
 from softfinger.kinematics.contact.lookup import lookup
-from softfinger.kinematics.hand.grasp_state import holding_moment_arms, load_torques, total_tilt
+from softfinger.kinematics.hand.grasp_state import (
+    FloatPair,
+    Motion,
+    holding_moment_arms,
+    load_torques,
+    total_tilt,
+)
 
 FloatArray = NDArray[np.float64]
 
 _SUPPORT_FRICTION = 0.4  # friction between object and table [N]
-# A bias is significant if it exceeds all of these limits and OUTLIER_GATE standard deviations.
-_BIAS_RATIO_MIN = 0.8  # minimum ratio to the other sensor's bias; each bias partly appears in both
 _D_BIAS_MIN = 0.1  # fraction of d
-ANGLE_BIAS_MIN = 0.5 * ANGLE_JUMP  # rad
 
 
 class TipResult(NamedTuple):
@@ -97,7 +99,12 @@ def _log_slope(h: HandFilter, finger: int) -> float:
 
 @inner_kernel
 def _set_torque_slopes(h: HandFilter) -> float:
-    """Set the slopes for the mean joint torque due to the tip forces; return that torque [N·m]."""
+    """Set the slopes for the mean joint torque due to the tip forces; return that torque [N·m].
+
+    Each joint contributes (1 + TORQUE) M, where M is the moment of the tip force about the joint.
+    M is known from the residual, which is the difference between the two. It is proportional to the
+    tip force ρ e^MODULUS F(D, θ), so ∂M/∂MODULUS = M and ∂M/∂D = M ∂ ln F/∂d.
+    """
     expected = 0.0
     for k in range(2):
         scale = 1.0 + h.mean[TORQUE + k]
@@ -147,13 +154,19 @@ def _relative_law_error(tip: TrackedTip, fraction: float) -> float:
 
 
 @inner_kernel
+def _modulus(h: HandFilter, finger: int) -> float:
+    """Return the ratio of a tip's force to the force in its contact table."""
+    return math.exp(h.mean[MODULUS + finger]) * h.tip[finger].relaxation
+
+
+@inner_kernel
 def _write_tip(h: HandFilter, finger: int, theta: float, table: FloatArray) -> TipResult:
     tip = h.tip[finger]
     grasp = h.grasp
     tilt = total_tilt(theta, tip.tilt_y)
     d = h.mean[D + finger]
     force, energy, stiffness, by_tilt, _, _, inside = lookup(table, d, tilt)
-    modulus = math.exp(h.mean[MODULUS + finger]) * tip.relaxation
+    modulus = _modulus(h, finger)
     force *= modulus
     stiffness *= modulus
     grasp.q[finger] = tip.q
@@ -207,6 +220,23 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     grasp.moment_arm[1] = arm2
     grasp.jacobian_rotation[0] = turn1
     grasp.jacobian_rotation[1] = turn2
+    _write_load(h, table1, table2, theta, motion)
+    _write_shear(h)
+    if (left.has_new_frame or right.has_new_frame) and is_held(h) and not h.is_single:
+        left.has_new_frame = right.has_new_frame = False
+        if grasp.load_arm > 0.0 and dt > 0.0:
+            _update_by_torques(h, dt)
+    _write_consistency(h)
+    return GraspResult(result1, result2, angle, width)
+
+
+@inner_kernel
+def _write_load(
+    h: HandFilter, table1: FloatArray, table2: FloatArray, theta: FloatPair, motion: Motion
+) -> None:
+    """Write the normal forces, the shear at equilibrium, and the torques that a load explains."""
+    grasp = h.grasp
+    taper = h.mean[TAPER]
     d = h.mean[D], h.mean[D + 1]
     energy_arm1, energy_arm2, shear, normal1, normal2 = holding_moment_arms(
         table1, table2, d, theta, taper, motion
@@ -217,12 +247,12 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     grasp.shear = 0.0
     if normal1 + normal2 > 0.0:
         grasp.shear = 2.0 * (abs(shear) + abs(by_taper)) / (normal1 + normal2)
-    modulus1 = math.exp(h.mean[MODULUS]) * left.relaxation
-    modulus2 = math.exp(h.mean[MODULUS + 1]) * right.relaxation
+    modulus1 = _modulus(h, 0)
+    modulus2 = _modulus(h, 1)
     grasp.normal[0] = modulus1 * normal1
     grasp.normal[1] = modulus2 * normal2
-    torque1 = left.torque / (1.0 + h.mean[TORQUE])
-    torque2 = right.torque / (1.0 + h.mean[TORQUE + 1])
+    torque1 = h.tip[0].torque / (1.0 + h.mean[TORQUE])
+    torque2 = h.tip[1].torque / (1.0 + h.mean[TORQUE + 1])
     residual1, residual2, grasp.load_arm, curvature = load_torques(
         table1,
         table2,
@@ -236,13 +266,6 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     grasp.torque_residual[0] = modulus1 * residual1
     grasp.torque_residual[1] = modulus2 * residual2
     grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
-    _write_shear(h)
-    if (left.has_new_frame or right.has_new_frame) and is_held(h) and not h.is_single:
-        left.has_new_frame = right.has_new_frame = False
-        if grasp.load_arm > 0.0 and dt > 0.0:
-            _update_by_torques(h, dt)
-    _write_consistency(h)
-    return GraspResult(result1, result2, angle, width)
 
 
 @inner_kernel
@@ -271,11 +294,7 @@ def _write_consistency(h: HandFilter) -> None:
     for k in range(2):
         has_bias = _has_bias(grasp, k)
         grasp.has_bias[k] = 1.0 if has_bias else 0.0
-        if (
-            has_bias
-            or grasp.rejected_count[k] > REJECTED_MAX
-            or grasp.current_off_time[k] > CURRENT_OFF_TIME_MAX
-        ):
+        if has_bias or grasp.rejects_frames[k] or grasp.has_wrong_current[k]:
             grasp.sensor_fault = True
 
 
@@ -284,14 +303,18 @@ def _has_bias(grasp: GraspState, finger: int) -> bool:
     """Return True if a sensor's zero offset or image has shifted significantly."""
     if not (grasp.d_bias_std[finger] > 0.0 and grasp.d[finger] > 0.0):
         return False
-    in_d: bool = abs(grasp.d_bias[finger]) > max(
-        _D_BIAS_MIN * grasp.d[finger],
-        OUTLIER_GATE * grasp.d_bias_std[finger],
-        _BIAS_RATIO_MIN * abs(grasp.d_bias[1 - finger]),
-    )
-    in_angle = abs(grasp.angle_bias[finger]) > max(
-        ANGLE_BIAS_MIN,
-        OUTLIER_GATE * grasp.angle_bias_std[finger],
-        _BIAS_RATIO_MIN * abs(grasp.angle_bias[1 - finger]),
-    )
-    return in_d or in_angle
+    d_min = max(_D_BIAS_MIN * grasp.d[finger], OUTLIER_GATE * grasp.d_bias_std[finger])
+    angle_min = max(IMAGE_SHIFT_MIN, OUTLIER_GATE * grasp.angle_bias_std[finger])
+    in_d = _is_larger_bias(grasp.d_bias, finger, d_min)
+    return in_d or _is_larger_bias(grasp.angle_bias, finger, angle_min)
+
+
+@inner_kernel
+def _is_larger_bias(bias: Pair, finger: int, smallest: float) -> bool:
+    """Return True if a sensor's bias exceeds ``smallest`` and is not below the other sensor's.
+
+    A bias of one sensor also appears, more weakly, in the estimate for the other sensor.
+    """
+    size = abs(bias[finger])
+    is_larger: bool = size > smallest and size >= abs(bias[1 - finger])
+    return is_larger

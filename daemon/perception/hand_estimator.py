@@ -46,7 +46,6 @@ FloatArray = NDArray[np.float64]
 # Standard deviations of the settings.
 _TAPER_ERROR = 0.1  # `object.taper` [rad]
 _LATENCY_ERROR = 0.03  # `tactile.latency` [s]
-_GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
 
 
 class HandEstimator:
@@ -67,7 +66,7 @@ class HandEstimator:
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._estimates_object = settings.scene.object_model
-        self._age_max = settings.safety.frame_age_fault * (1.0 / settings.tactile.rate)
+        self._servo_stiffness = settings.servos.stiffness
         self._tables = tables[0].data, tables[1].data
         self._state = state = HandFilter()
         state.half_separation = 0.5 * hand.pivot_separation
@@ -77,6 +76,10 @@ class HandEstimator:
         state.encoder_resolution = 2.0 * math.pi / (COUNTS_PER_TURN * gear)
         state.velocity_unit = VELOCITY_UNIT / gear
         state.latency = settings.tactile.latency
+        state.frame_rate = settings.tactile.rate
+        state.frame_age_max = settings.safety.frame_age_fault * (1.0 / settings.tactile.rate)
+        state.rejected_max = settings.safety.frame_age_hold
+        self._age_max = state.frame_age_max
         state.response = settings.tactile.response
         state.relaxation[:] = settings.tip.relaxation
         state.relaxation_time[:] = settings.tip.relaxation_times
@@ -142,7 +145,7 @@ class HandEstimator:
         current1, current2 = reading.current
         commanded = 0.0, 0.0
         if goal is not None:
-            commanded = _commanded_current(goal, 0, q1), _commanded_current(goal, 1, q2)
+            commanded = self._commanded_current(goal, 0, q1), self._commanded_current(goal, 1, q2)
         states.predict(
             self._state.array,
             self._history,
@@ -153,6 +156,11 @@ class HandEstimator:
             commanded,
             goal is not None,
         )
+
+    def _commanded_current(self, goal: Goal, finger: int, q: float) -> float:
+        """Return the goal current [A] if the distance from the goal requires it, else 0."""
+        current = goal.current[finger]
+        return current if self._servo_stiffness * (goal.q[finger] - q) > current else 0.0
 
     def update(
         self,
@@ -262,14 +270,6 @@ class HandEstimator:
         contact.nis_angle = nis.item(states.ANGLE_CHANNEL + finger)
         contact.nis_footprint = nis.item(states.FOOTPRINT + finger)
         contact.nis_amplitude = nis.item(states.AMPLITUDE + finger)
-
-
-def _commanded_current(goal: Goal, finger: int, q: float) -> float:
-    """Return the goal current [A] if the joint is far from its goal, otherwise 0.
-
-    A joint that is far from its goal draws the goal current.
-    """
-    return goal.current[finger] if goal.q[finger] - q > _GOAL_DISTANCE else 0.0
 
 
 def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:

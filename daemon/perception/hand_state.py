@@ -42,7 +42,6 @@ ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
 HISTORY_TIME = 0.5  # duration of stored joint motion [s]; older frames are treated as this old
-CURRENT_OFF_TIME_MAX = 0.1  # maximum time for which a current may differ from its goal [s]
 LAW_POINTS = 17  # nodes in d from 0 to the radius
 
 GATE = 3.0  # number of standard deviations above which an innovation has a reduced effect
@@ -62,15 +61,11 @@ _WALK_D_BIAS = 1e-4  # zero drift during sensor warm-up [m]
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
 _WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only the product of force and gain
-# Fraction of the sideways finger motion by which the object may shift in the grip.
-_SIDEWAYS_ERROR = 0.1
 _VELOCITY_TIME = 0.02  # correlation time of velocity rounding [s]
 _VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to the variance before it
-_TOUCH_DELAY = 0.1  # delay from a touch until a frame shows the contact [s]
 _CURRENT_ERROR = 0.25  # allowed relative deviation of a current from its goal
 _CURRENT_NOISE = 0.02  # additional allowed deviation of a current [A]
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
-_NIS_SAMPLES = 100.0  # number of measurements over which squared innovations are averaged
 
 
 class TrackedTip(Record):
@@ -80,6 +75,9 @@ class TrackedTip(Record):
     touch_time: float  # start of the contact [s]
     has_new_frame: bool  # True if a frame has arrived since the last torque update
     gain_is_fixed: bool  # True if the frames measure force times gain but not displacement
+    rejected_count: int  # consecutive rejected frames
+    last_angle_jump: float  # `grasp.angle_jump` of the previous frame [rad]
+    current_off_time: float  # time for which the current has differed from its goal [s]
     tilt_y: float  # [rad]
     shear: float  # shear along the face in the hand plane, from the newest frame of a solid tip [N]
     log_slope: float  # ∂ ln F/∂d, low-pass filtered [1/m]
@@ -125,6 +123,9 @@ class HandFilter(Record):
     encoder_resolution: float  # encoder resolution [rad]
     velocity_unit: float  # [rad/s]
     latency: float  # `tactile.latency` [s]
+    frame_rate: float  # `tactile.rate` [Hz]
+    frame_age_max: float  # time for which a channel may be missing or wrong [s]
+    rejected_max: float  # number of consecutive frames that may be missing
     response: float  # `tactile.response` [s]
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
     relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
@@ -165,16 +166,16 @@ def predicted_variance(h: HandFilter) -> float:
 def correct(h: HandFilter, channel: int, innovation: float, variance: float, gate: float) -> None:
     """Update the state with one scalar measurement, using `slopes`, then set the slopes to 0.
 
-    ``variance`` is the noise variance. If the innovation exceeds ``gate`` standard deviations, the
-    variance is increased until the innovation equals ``gate`` standard deviations. An innovation
-    that is not finite is ignored. `grasp.nis` averages the normalised innovation squared of each
-    ``channel``, limited to ``gate`` squared.
+    ``variance`` is the noise variance. It is increased if the innovation exceeds ``gate`` standard
+    deviations, so that the innovation equals ``gate`` standard deviations. An innovation that is
+    not finite is ignored. `grasp.nis` averages the normalised innovation squared of each
+    ``channel``, limited to ``gate`` squared, over as many measurements as frames arrive in 1 s.
     """
     expected = predicted_variance(h)
     square = innovation * innovation
     nis = min(square / (expected + variance), gate * gate)
     if nis < math.inf:
-        h.grasp.nis[channel] += (nis - h.grasp.nis[channel]) / _NIS_SAMPLES
+        h.grasp.nis[channel] += (nis - h.grasp.nis[channel]) / h.frame_rate
     variance = max(variance, square / (gate * gate) - expected, _VARIANCE_MIN * expected)
     total = expected + variance
     if 0.0 < total < math.inf and abs(innovation) < math.inf:
@@ -263,7 +264,7 @@ def predict(
         return
     for k in range(2):
         tip = h.tip[k]
-        tip.torque = h.torque_constant * _check_current(h.grasp, k, current[k], goal[k], dt)
+        tip.torque = h.torque_constant * _check_current(h, k, current[k], goal[k], dt)
         if not tip.in_contact:
             _measure_free_torque(h, k, t, dt, dq[k] - last_speed[k])
     h.t = t
@@ -308,7 +309,11 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 
 @inner_kernel
 def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
-    """Advance joints, tips and object with the measured velocities ``dq`` [rad/s]."""
+    """Advance joints, tips and object with the measured velocities ``dq`` [rad/s].
+
+    The object rolls by turn1 Δq1 − turn2 Δq2, and both displacements change by the same amount,
+    half the change of d1 + d2 (docs/estimation.md).
+    """
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
@@ -345,23 +350,30 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     if dt > 0.0:
         rotation_error = MODEL_ERROR * rotation
         closing_error = MODEL_ERROR * d_step1
-        sideways_error = 0.5 * _SIDEWAYS_ERROR * (arm1 * step1 - arm2 * step2)
+        sideways_error = MODEL_ERROR * (arm1 * step1 - arm2 * step2)
         samples = MODEL_ERROR_TIME / dt
         h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples
         walk_pair(h, D, closing_error, sideways_error, samples)
-    for k in range(2):
-        # Velocity rounding affects encoder, tips and object together.
-        variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
-        h.scratch[:] = 0.0
-        h.scratch[ENCODER + k] = 1.0
-        h.scratch[ANGLE] = turn1 if k == 0 else -turn2
-        by = by1 if k == 0 else by2
-        for i in range(2):
-            if i == k or not h.is_single:
-                h.scratch[D + i] = by
-        for i in (D, D + 1, ENCODER + k, ANGLE):
-            for j in (D, D + 1, ENCODER + k, ANGLE):
-                h.covariance[i, j] += variance * h.scratch[i] * h.scratch[j]
+    _add_rounding_noise(h, 0, by1, turn1, dt)
+    _add_rounding_noise(h, 1, by2, -turn2, dt)
+
+
+@inner_kernel
+def _add_rounding_noise(h: HandFilter, finger: int, by: float, turn: float, dt: float) -> None:
+    """Add the effect of a joint's velocity rounding on its encoder state, the tips and the object.
+
+    An error of the joint angle changes all of them together: d by ``by`` [m/rad], φ by ``turn``.
+    """
+    variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
+    h.scratch[:] = 0.0
+    h.scratch[ENCODER + finger] = 1.0
+    h.scratch[ANGLE] = turn
+    for i in range(2):
+        if i == finger or not h.is_single:
+            h.scratch[D + i] = by
+    for i in (D, D + 1, ENCODER + finger, ANGLE):
+        for j in (D, D + 1, ENCODER + finger, ANGLE):
+            h.covariance[i, j] += variance * h.scratch[i] * h.scratch[j]
 
 
 @inner_kernel
@@ -406,29 +418,40 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
     """
     tip = h.tip[finger]
     at = ENCODER + finger
-    jump = q - tip.encoder
+    found, spread = _encoder_measurement(h, finger, q, step)
     tip.encoder = q
-    resolution = h.encoder_resolution
-    half = 0.5 * resolution
-    if abs(jump) > half:
-        # The joint has crossed this count edge since the last reading. After a jump of several
-        # counts, the joint angle is only known to within one count.
-        found = q - math.copysign(half, jump)
-        spread = max(step, 0.05 * resolution) if abs(jump) < 1.5 * resolution else resolution
-    elif abs(q - tip.q) > half:
-        found = q - math.copysign(half, q - tip.q)
-        spread = resolution
-    elif h.covariance[at, at] > resolution * resolution / 6.0:
-        found = q
-        spread = resolution
-    else:
+    if spread == 0.0:
         return
     h.slopes[at] = 1.0
     correct(h, ENCODER_CHANNEL + finger, found - tip.q, spread * spread / 12.0, math.inf)
     tip.q += h.mean[at]
     h.mean[at] = 0.0
-    if abs(q - tip.q) > half:
-        tip.q = q - math.copysign(half, q - tip.q)
+    if abs(q - tip.q) > 0.5 * h.encoder_resolution:
+        tip.q = _edge(h, q, q - tip.q)
+
+
+@inner_kernel
+def _edge(h: HandFilter, q: float, direction: float) -> float:
+    """Return the edge of the count ``q`` [rad] that a joint crosses in this ``direction``."""
+    return q - math.copysign(0.5 * h.encoder_resolution, direction)
+
+
+@inner_kernel
+def _encoder_measurement(h: HandFilter, finger: int, q: float, step: float) -> tuple[float, float]:
+    """Return the joint angle and the width of its uniform error [rad]; width 0: no information."""
+    tip = h.tip[finger]
+    resolution = h.encoder_resolution
+    jump = q - tip.encoder
+    if abs(jump) > 0.5 * resolution:
+        # The joint has crossed this count edge since the last reading. After a jump of several
+        # counts, the joint angle is only known to within one count.
+        spread = max(step, 0.05 * resolution) if abs(jump) < 1.5 * resolution else resolution
+        return _edge(h, q, jump), spread
+    if abs(q - tip.q) > 0.5 * resolution:  # The tracked angle has left the count.
+        return _edge(h, q, q - tip.q), resolution
+    if h.covariance[ENCODER + finger, ENCODER + finger] > resolution * resolution / 6.0:
+        return q, resolution
+    return q, 0.0
 
 
 @inner_kernel
@@ -437,14 +460,15 @@ def _measure_free_torque(
 ) -> None:
     """Measure the maximum torque of a freely moving joint, which equals its friction.
 
-    The last _TOUCH_DELAY seconds are excluded, because the tip may already be in contact.
+    The last `frame_age_max` is excluded, because the tip may already be in contact although no
+    frame has shown it yet.
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
     weight = min(dt / _VELOCITY_TIME, 1.0)
     tip.free_torque += (tip.torque - accelerating - tip.free_torque) * weight
     tip.free_torque_max[0] = max(tip.free_torque_max[0], abs(tip.free_torque))
-    if t - tip.window_start > _TOUCH_DELAY:
+    if t - tip.window_start > h.frame_age_max:
         h.grasp.free_torque[finger] = max(h.grasp.free_torque[finger], tip.free_torque_max[1])
         tip.free_torque_max[1] = tip.free_torque_max[0]
         tip.free_torque_max[0] = 0.0
@@ -452,14 +476,15 @@ def _measure_free_torque(
 
 
 @inner_kernel
-def _check_current(grasp: GraspState, finger: int, current: float, goal: float, dt: float) -> float:
+def _check_current(h: HandFilter, finger: int, current: float, goal: float, dt: float) -> float:
     """Return a joint's current [A]: its ``goal`` during a grip, otherwise the measured current.
 
-    Also measure how long goal and measured current have differed by more than a servo's current
-    controller allows.
+    Also check how long the two have differed by more than a servo's current controller allows.
     """
+    tip = h.tip[finger]
     is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + _CURRENT_NOISE
-    grasp.current_off_time[finger] = grasp.current_off_time[finger] + dt if is_off else 0.0
+    tip.current_off_time = tip.current_off_time + dt if is_off else 0.0
+    h.grasp.has_wrong_current[finger] = 1.0 if tip.current_off_time > h.frame_age_max else 0.0
     return goal if goal > 0.0 else current
 
 

@@ -25,10 +25,8 @@ from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAME_COUNT = 16
 _ZERO_INTERVAL = 8  # number of frames between zero updates; thermal drift takes seconds
-_PRESSURE_STEPS = 65535  # number of quantisation steps of a published pressure
+_PRESSURE_STEPS = np.iinfo(np.uint16).max  # quantisation steps of a published pressure
 _STORED_TIME = 2.0  # time for which frames are stored [s]
-_REPEATED_TIME = 0.1  # duration of repetition that indicates a fault [s]
-_REPEATED_COUNT_MIN = 5  # minimum number of repeated frames for a fault
 _CHANGED_CELLS_MIN = 4  # minimum number of changed cells; noisy cells may repeat by chance
 
 
@@ -81,12 +79,15 @@ class RepeatDetector:
     a repetition; the frozen-sensor check handles constant frames.
     """
 
-    def __init__(self, rate: float, enabled: bool = True) -> None:
-        """Create a detector for a frame ``rate`` [Hz]; ``enabled`` makes repetitions a fault."""
+    def __init__(self, rate: float, fault_count: float, enabled: bool = True) -> None:
+        """Create a detector for a frame ``rate`` [Hz].
+
+        If ``enabled``, ``fault_count`` repeated frames are a fault.
+        """
         self._enabled = enabled
         self.period = 0  # repetition period in frames, or 0 without repetition
         self._repeated_count = 0  # number of consecutive frames with this period
-        self._fault_count = max(round(_REPEATED_TIME * rate), _REPEATED_COUNT_MIN)
+        self._fault_count = fault_count
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
         self._last: NDArray[np.uint16] | None = None  # frame
 
@@ -136,8 +137,10 @@ class FingerPerception:
         self.frame_count = 0  # number of received frames
         self.has_changed = True  # True if the newest frame is not a repetition
         self.changed_time = 0.0  # arrival time of the last frame that changed [s]
-        # A recording that is played in a loop repeats its frames.
-        self.repeats = RepeatDetector(settings.tactile.rate, tactile.backend != "replay")
+        # A recording played in a loop repeats its frames.
+        self.repeats = RepeatDetector(
+            tactile.rate, settings.safety.frame_age_fault, tactile.backend != "replay"
+        )
         self.estimate = ContactEstimate()  # estimate from the last valid frame
         active = getattr(sensor, "live", None)  # Some recordings lack cells.
         self._estimator = make_estimator(

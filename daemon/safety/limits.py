@@ -21,10 +21,8 @@ from typing import Literal
 import numpy as np
 
 from softfinger.daemon.control.modes import GRIPPING_MODES, HOLDING_MODES, Mode
-from softfinger.daemon.perception.frame_channels import ANGLE_JUMP, REJECTED_MAX
+from softfinger.daemon.perception.frame_channels import IMAGE_SHIFT_MIN
 from softfinger.daemon.perception.grasp import GraspState
-from softfinger.daemon.perception.grasp_kernels import ANGLE_BIAS_MIN
-from softfinger.daemon.perception.hand_state import CURRENT_OFF_TIME_MAX
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.wiring import WiringWatch
@@ -603,11 +601,11 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
 def _sensor_fault(view: View, state: State, finger: int) -> str:
     """Explain why a sensor's frames are rejected; return "" if they are accepted."""
     side, found = FINGERS[finger], view.grasp
-    if found.rejected_count[finger] > REJECTED_MAX:
-        turned, deeper = found.angle_innovation[finger], 1e3 * found.d_innovation[finger]
+    if found.rejects_frames[finger]:
+        turned, deeper = found.angle_jump[finger], found.d_jump[finger]
         what = f"{math.degrees(abs(turned)):.0f}° in the object's angle"
-        if abs(turned) <= ANGLE_JUMP:
-            what = f"{deeper:+.1f} mm in d"
+        if abs(deeper) > abs(turned) * view.settings.tip.radius:
+            what = f"{1e3 * deeper:+.1f} mm in d"
         return (
             f"the {side} sensor reports a jump of {what}, which is inconsistent with the joints "
             "and the other tip: the sensor has shifted, its frames are old, or the tip is at the "
@@ -615,7 +613,7 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
         )
     if found.has_bias[finger] and view.holds(state):
         off, turned = 1e3 * found.d_bias[finger], math.degrees(found.angle_bias[finger])
-        if abs(found.angle_bias[finger]) > ANGLE_BIAS_MIN:
+        if abs(found.angle_bias[finger]) > IMAGE_SHIFT_MIN:
             return (
                 f"the angle measured by the {side} sensor differs by {turned:+.0f}° from the "
                 "rolling angle computed from the joints: the sensor's image has shifted"
@@ -662,7 +660,7 @@ def _add_consistency_checks(finger: int, side: str) -> None:
     @Limit(f"consistency.{side}_current", "difference between the measured current and the "
         "goal current of a joint in a grip", "warn", (), "servos", in_turn=True)  # fmt: skip
     def _current(view: View, state: State, _: float) -> str:
-        if not view.grasp.current_off_time[finger] > CURRENT_OFF_TIME_MAX:
+        if not view.grasp.has_wrong_current[finger]:
             return ""
         return (
             f"the {side} joint's measured current is {state.reading.current[finger]:.2f} A, but "

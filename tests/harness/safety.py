@@ -27,7 +27,7 @@ class Sensor:
         self.finger = finger
         self.frame: Frame | None = None
         self.changed_time = 0.0
-        self.repeats = RepeatDetector(100.0)
+        self.repeats = RepeatDetector(100.0, 10.0)
         self.estimate = ContactEstimate()
         self.full_count = SETTINGS.tactile.full_count
         self.noise = 0.0

@@ -33,8 +33,6 @@ from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import Publishing
-from softfinger.daemon.perception.frame_channels import REJECTED_MAX
-from softfinger.daemon.perception.hand_state import CURRENT_OFF_TIME_MAX
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, Frame, Goal, Reading
@@ -684,12 +682,12 @@ class Soak:
         for sensor in perception.fingers:
             side, finger = FINGERS[sensor.finger], sensor.finger
             if (
-                found.rejected_count[finger] > REJECTED_MAX
+                found.rejects_frames[finger]
                 or (held and found.has_bias[finger])
                 or sensor.repeats.is_fault
             ):
                 yield f"{side}_sensor"
-            if found.current_off_time[finger] > CURRENT_OFF_TIME_MAX:
+            if found.has_wrong_current[finger]:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from softfinger.daemon.control.envelope import Envelope
+from softfinger.daemon.control.envelope import Envelope, increased_force_limit
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.cli import main
@@ -36,6 +36,16 @@ def test_a_grip_outside_the_map_gets_a_warning_with_the_reason():
     assert Envelope(settings(0.002, law="upright")).warning(10.0) == ""
     other = Settings.model_validate({"tip": {"radius": 0.015}, "object": {"width": 0.002}})
     assert Envelope(other).warning(10.0) == ""
+
+
+def test_the_warning_considers_both_bounds_of_the_force_increase():
+    # 10 N raised to 20 N bears a load of 7.3 N at this friction; an increase by half does not.
+    control = {"tip_friction": 0.25, "object_load": 4.8}
+    assert Envelope(settings(0.040, **control)).warning(10.0) == ""
+    for bound in ({"grip_raise_max": 5.0}, {"grip_raise_share": 0.5}):
+        changed = settings(0.040, **control, **bound)
+        assert increased_force_limit(changed, 10.0) == 15.0
+        assert "slips out" in Envelope(changed).warning(10.0)
 
 
 def test_a_grasp_outside_the_map_is_accepted_with_a_warning():

@@ -262,8 +262,8 @@ def test_each_faulty_channel_is_named():
     judged(judge, state, 0.5)
     assert judge.warnings == [], "must not warn about an uncertain gain"
     grasp.gain_std[1] = 0.1
-    grasp.rejected_count[0], grasp.angle_innovation[0] = 3.0, -0.2
-    grasp.current_off_time[1] = 0.2
+    grasp.rejects_frames[0], grasp.angle_jump[0] = 1.0, -0.2
+    grasp.has_wrong_current[1] = 1.0
     state.reading.current[1], state.goal.current[1] = 0.1, 0.2
     judged(judge, state, 0.5)
     told = {warning.name: warning.text for warning in judge.warnings}

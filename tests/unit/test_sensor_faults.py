@@ -217,5 +217,5 @@ SEQUENCES: dict[str, tuple[Callable[[], list[float]], bool]] = {
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_only_a_recurring_order_is_a_repetition(name: str) -> None:
     frames, expected = SEQUENCES[name]
-    assert given(RepeatDetector(100.0), frames()) is expected
-    assert not given(RepeatDetector(100.0, enabled=False), frames())
+    assert given(RepeatDetector(100.0, 10.0), frames()) is expected
+    assert not given(RepeatDetector(100.0, 10.0, enabled=False), frames())

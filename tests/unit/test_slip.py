@@ -271,7 +271,8 @@ def test_friction_identified_during_the_approach_limits_load_detection():
         for load in np.linspace(0.0, 5.5, 500):
             watched.run(load, 1)
         assert (watched.run(5.5, 100) > FORCE) == raised
-        assert watched.grip.slip.friction == pytest.approx(min(shown, 0.3))
+        # The approach current of 0.15 A bounds the torque.
+        assert watched.grip.slip.friction == pytest.approx(min(shown, 0.15 * 1.78))
 
 
 def test_a_faulty_channel_cancels_the_force_increase_it_caused():
@@ -290,6 +291,26 @@ def test_the_force_increase_is_limited_by_its_setting_and_the_force_limit():
         watched = GripUnderLoad(grip_raise_max=more, grip_raise_share=share)
         watched.grip.begin_holding()
         assert watched.run(50.0, 500) == pytest.approx(expected)
+
+
+def test_the_more_loaded_tip_is_not_pressed_beyond_the_force_limit():
+    """A push across the faces looks like a twist; it presses the object into one tip."""
+    watched = GripUnderLoad(grip_raise_share=10.0)
+    watched.grip.begin_holding()
+    watched.held.force = [FORCE - 9.0, FORCE + 9.0]
+    assert watched.run(50.0, 500) == pytest.approx(0.9 * 30.0 - 9.0)
+    watched.held.force = [FORCE - 18.0, FORCE + 18.0]
+    assert watched.run(50.0, 500) == FORCE, "the commanded force is never reduced"
+
+
+def test_a_push_across_the_faces_causes_no_fault():
+    for push in (14.0, -14.0):
+        with Hand({}) as hand:
+            grasped(hand)
+            hand.plant.apply_load(push, 0.0)
+            hand.watch(0.6)
+            assert hand.mode == "holding"
+            assert hand.plant.force.max() < 30.0
 
 
 def test_a_grip_force_below_the_friction_limit_is_not_raised_by_torques():

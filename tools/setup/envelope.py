@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import (
+    GRAVITY,
     HELD,
     LOST,
     OUTCOME_TEXTS,
@@ -40,7 +41,6 @@ _OBSERVATION_TIME = 1.0  # observation time under the full weight [s]
 _LOAD_STEP_COUNT = 20  # number of steps in the weight ramp
 _TURN_MIN = math.radians(5.0)
 _SLIDE_MAX = 0.010  # displacement along the faces above which the object counts as lost [m]
-_GRAVITY = 9.81  # m/s²
 _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
 
 
@@ -152,7 +152,7 @@ def grasped(
     """
     from softfinger.tools.simulated_daemon import SimulatedDaemon
 
-    weight = mass * _GRAVITY
+    weight = mass * GRAVITY
     changed: dict[str, dict[str, Any]] = settings.model_dump(exclude_unset=True)
     changes: dict[str, dict[str, Any]] = {
         "simulation": {
