@@ -144,10 +144,10 @@ sys.exit(gateway.main(sys.argv[1:]))
 @pytest.mark.parametrize(
     ("bound", "does", "status"),
     [
-        ("STALLED", "while True: pass", -signal.SIGPROF),
-        ("BLOCKED", "select.select([], [], [])", -signal.SIGALRM),
+        ("STEP_CPU_TIME_MAX", "while True: pass", -signal.SIGPROF),
+        ("STEP_TIME_MAX", "select.select([], [], [])", -signal.SIGALRM),
         # This stall resembles a stopped or starved process.
-        ("STALLED", "select.select([], [], [], 0.5)", 0),
+        ("STEP_CPU_TIME_MAX", "select.select([], [], [], 0.5)", 0),
     ],
 )
 def test_a_hanging_gateway_ends_itself_but_not_on_a_busy_machine(bound, does, status):
