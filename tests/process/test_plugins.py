@@ -66,7 +66,7 @@ def test_plugin_errors_are_part_of_the_report():
     for part in (
         "plugins.pulsing.height: found -1",
         "plugins.pulsing.hight: unknown key; nearest: height",
-        "plugins.following: found settings, but plugin following from softfinger-example 1.0 does not ",
+        "plugins.following: found settings, but plugin following from softfinger-example 1.0 does",
         "plugins.nobody: found settings, but no plugin of this name is installed",
     ):
         assert part in report
