@@ -18,8 +18,8 @@ law gives both joints the same torque plus damping, as in the literature on blin
 virtual spring between the fingers places the minimum of the tips' elastic energy at the upright
 object pose, regardless of residual shear in the tips (`hand.upright`). Antisymmetric dither of the
 fingers overcomes joint friction until the object has settled in that minimum. The control law then
-holds the antisymmetric joint angle. Once a command steers the object, the moment arm is the force's
-arm about the pivot.
+holds the antisymmetric joint angle. Once a command steers the object, the moment arm is the
+distance from the pivot to the force's line of action.
 """
 
 from __future__ import annotations

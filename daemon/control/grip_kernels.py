@@ -45,7 +45,7 @@ class GripLaw(Record):
     friction_speed: float  # joint speed at which friction is fully compensated [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
-    turn_decay: float  # decay factor per tick of the rotation rate while no frames arrive
+    turn_decay: float  # decay factor of the rotation rate on each tick without a new frame
     is_blind: bool  # True if dither brings the object upright without using its measured angle
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]

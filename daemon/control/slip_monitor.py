@@ -282,7 +282,8 @@ def _update_needed_force(s: SlipState, needed_force: float, commanded: float) ->
 def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
     """Return the maximum force [N] to which the grip may be increased.
 
-    An increase up to the force for the ``declared`` load requires no confirmation.
+    The force may be increased without confirmation up to the force that the ``declared`` load
+    requires.
     """
     law = s.law
     share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
@@ -383,7 +384,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     _update_offset(s, grasp, residual, torque_change)
-    # A decrease or reversal of friction is not a load.
+    # Friction that decreases or reverses does not count as a load.
     deviation = residual - s.offset
     increase = residual - s.start_offset
     s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))

@@ -385,7 +385,7 @@ def _joint_current(view: View, state: State, _: float, i: int) -> str:
 _FULL_CURRENT = 0.9  # minimum fraction of the goal's current limit that counts as saturated
 
 
-@Limit("joint.stall", "joint that stands still at maximum current without having reached its "
+@Limit("joint.stall", "joint that is stalled at maximum current before it reaches its "
     "goal",
     "fault", ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
     lasts="stall_time").each  # fmt: skip
@@ -475,8 +475,8 @@ def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     )
 
 
-LIMITS.append(Limit("torque.off", "torque off not confirmed within half of servos.watchdog; the "
-    "bus is then kept silent until the watchdogs stop the servos", "fault",
+LIMITS.append(Limit("torque.off", "the servos did not confirm torque off within half the time "
+    "servos.watchdog; the bus is then kept silent until the watchdogs stop the servos", "fault",
     ("servos.watchdog",)))  # fmt: skip
 
 
@@ -507,7 +507,7 @@ LIMITS += [
     Limit("goal.current", "goal current", "limit", ("safety.current_max",)),
     Limit("goal.step", "step of the goal angle while the goal is far from the joint angle", "limit",
         ("safety.goal_reach", "safety.goal_speed")),
-    Limit("goal.slew", "increase of a goal current per tick", "limit", ("safety.current_rate",)),
+    Limit("goal.slew", "increase in goal current per tick", "limit", ("safety.current_rate",)),
 ]  # fmt: skip
 
 

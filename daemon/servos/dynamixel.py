@@ -213,7 +213,7 @@ class DynamixelServos:
             self._exchange(PRESENT, reading)
 
     def _exchange(self, span: Span, reading: Reading) -> GroupRead | None:
-        """Read a span that includes the joint motion and update ``reading``."""
+        """Read a span of registers that includes the joint motion, then update ``reading``."""
         if self._reads is None:
             raise ServoError("servos: not connected")
         reading.seq += 1

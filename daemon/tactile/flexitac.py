@@ -19,7 +19,7 @@ from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
 _SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest frame
-_MARKER_COUNT_MAX = 96  # number of markers stored to recognise another grid size
+_MARKER_COUNT_MAX = 96  # number of markers, stored so that a different grid size is detected
 _GAP_TIME = 1e-3  # minimum gap between frames [s]
 _CELL_COUNT_MIN = 16  # minimum number of cells between markers; a closer ``AA 55`` is image content
 

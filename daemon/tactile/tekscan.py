@@ -173,7 +173,7 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
             header[key] = value
             in_comments = key.startswith("COMMENT")
     raise TekscanError(
-        "the file does not contain a line ASCII_DATA; expected a Tekscan-style export, or an .npz "
+        "the file does not contain an ASCII_DATA line; expected a Tekscan-style export, or an .npz "
         "or .npy file"
     )
 

@@ -73,7 +73,7 @@ KINDS: dict[str, EventKind] = {
         "too many messages.",
     ),
     "record": EventKind(
-        "error", "The recorder of `run --record` ended.", "Check the free disk space."
+        "error", "The recorder started by `run --record` has exited.", "Check the free disk space."
     ),
     # Commands and grips
     "grasp": EventKind(
@@ -141,7 +141,7 @@ KINDS: dict[str, EventKind] = {
     "servos.frozen": EventKind(
         "error",
         "A servo repeats old readings.",
-        "Switch the servo supply off and on; check the cable.",
+        "Switch the servo supply off and on again; check the cable.",
     ),
     "servos.alert": EventKind(
         "error",
@@ -261,8 +261,8 @@ KINDS: dict[str, EventKind] = {
     "tactile.silent": EventKind(
         "error",
         "No valid frame arrived within `safety.frame_age_fault`.",
-        "The text states the reason. If the cell noise exceeds `tactile.noise`, the text also "
-        "states the measured noise. Check the cable, and check the board with `softfinger "
+        "The text states the reason. If the cell noise exceeds `tactile.noise`, this message "
+        "also gives the measured noise. Check the cable, and check the board with `softfinger "
         "doctor`.",
     ),
     "tactile.frozen": EventKind(

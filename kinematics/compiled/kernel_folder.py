@@ -28,7 +28,7 @@ import numpy as np
 
 from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 
-ROOT = Path(__file__).resolve().parents[2]  # directory of the package `softfinger`
+ROOT = Path(__file__).resolve().parents[2]  # directory of the `softfinger` package
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
 # Number of other cache folders to keep, for example those of other checkouts or of the previous

@@ -97,7 +97,7 @@ class Fingertip:
     def theta_limit(self, d: ArrayLike) -> FloatArray:
         """Return the maximum |θ| [rad] at d [m]: asin((a − d)/a), π/2 for d ≤ 0, 0 for d ≥ a.
 
-        The result is a number or an array, like ``d``.
+        The result is a scalar or an array, matching ``d``.
         """
         h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
         # cos θ is the footprint radius divided by a. Unlike asin(h/a), this form is accurate for

@@ -81,7 +81,7 @@ def neighbourhood(frame: FloatArray, height: FloatArray, grid: Grid, at: int) ->
 
 @inner_kernel
 def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> None:
-    """Test the frame for a contact and store the result in ``state.signal``.
+    """Test the frame for contact and store the result in ``state.signal``.
 
     A contact is detected if a cell reads at least `PEAK_LEVEL` · noise and the weighted sum of
     its neighbours exceeds ``patch_level`` standard deviations. A single outlying cell is therefore

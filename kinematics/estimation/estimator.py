@@ -407,7 +407,7 @@ class ContactEstimator:
     @noise.setter
     def noise(self, noise: float) -> None:
         if not (math.isfinite(noise) and noise > 0.0):
-            raise ValueError(f"noise must be a positive number of Pa, got {noise}")
+            raise ValueError(f"noise must be positive [Pa], got {noise}")
         self._options.noise = noise
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:

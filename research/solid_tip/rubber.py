@@ -36,7 +36,8 @@ from research.solid_tip.green import (
 )
 
 WEDGE = 0.1  # angle of the wedge [rad]
-STIFF = 1e3  # stiffness of the spring that holds the mean position of a lying base, in units of E
+# Stiffness, in units of E, of the spring that holds the mean position of a base that is not bonded.
+STIFF = 1e3
 HARMONICS = 9
 AZIMUTHS = 48  # number of azimuths at which the base pressure is evaluated
 SLICES = 8

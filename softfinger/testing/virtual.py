@@ -151,8 +151,8 @@ class VirtualTimeHand(Hand):
         """Advance by the smallest step: a tick, or a recorded message."""
         if self._serving:
             raise RuntimeError(
-                "serve() is running and advances the time itself, so this call must not advance "
-                "the time: use a client, such as Hand(hand.address)"
+                "serve() is running and advances the clock itself, so this call must not: use a "
+                "client such as Hand(hand.address)"
             )
         self._step()
 

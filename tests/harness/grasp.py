@@ -7,10 +7,10 @@ d_t, a tip's energy is
 
 with U₀ and F from the contact table. For a constant modulus, this energy is that of the
 parallel-distributed model, πE[d³/(3cos²θ) + d² d_t tan θ + d d_t²]. The shear force is T = ∂U/∂d_t
-and the normal force is N = ∂U/∂d − T tan θ. Shears follow the rolling increments of
-`reference_hand`. The increments are not integrable in general, so a grasp depends on its path:
-motions are divided into small steps, and the shears of the steps are summed. The grasp is at
-equilibrium if the energy is stationary along the increments.
+and the normal force is N = ∂U/∂d − T tan θ. The shear displacements are computed from the rolling
+increments of `reference_hand`. The increments are not integrable in general, so a grasp depends on
+its path: motions are divided into small steps, and the shears of the steps are summed. The grasp is
+at equilibrium if the energy is stationary along the increments.
 """
 
 from dataclasses import dataclass

@@ -129,7 +129,7 @@ class DirectPort(SerialPort):
 
 
 class RunningBus(EmulatedBus):
-    """Bus served by a thread; the default bus has the servos of the settings."""
+    """Bus served by a thread; by default with the servos listed in the settings."""
 
     def __init__(self, bus: ServoBus | None = None, baud: int = 0, **options: Any) -> None:
         super().__init__(baud=baud, bus=bus or hand_bus(baud=baud, **options))

@@ -26,7 +26,7 @@ def running() -> Iterator[Run]:
 
 @pytest.fixture
 def bus(running: Run) -> RunningBus:
-    """Return a running bus with the settings' servos."""
+    """Return a running bus with the servos defined in the settings."""
     return running()
 
 

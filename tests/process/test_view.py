@@ -453,7 +453,7 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
                 playback.ask(odd)
             playback.ask("speed 0.5")
             playback.ask("play")
-            # The playback starts again from the beginning.
+            # Playback restarts from the beginning.
             until(lambda: 0.0 < playback.position < 1.0)
             until(lambda: kept.newest["place"]["speed"] == 0.5)
             marks = [(kind, text) for _, _, kind, text in kept.scene["marks"]]

@@ -230,7 +230,8 @@ def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
         press("[name=stop]", "disarmed")
         press("[name=arm]", "armed")
         page.browser.open("about:blank")
-        hand.collect(LEASE + 0.5)  # The daemon's clock advances without messages from the page.
+        # The daemon's clock keeps advancing even if the page sends no messages.
+        hand.collect(LEASE + 0.5)
         assert command(commands, "release", client="another")["ok"]
         viewed.end()
 

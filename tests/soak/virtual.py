@@ -364,7 +364,7 @@ class Account:
 
 
 class Soak:
-    """One sequence: a daemon on the virtual clock, random actions, and requirements."""
+    """Random actions on a daemon with the virtual clock, and checks of all requirements."""
 
     def __init__(
         self, seed: int = 1, account: Account | None = None, listener: Listener | None = None

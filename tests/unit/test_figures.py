@@ -198,7 +198,8 @@ def test_compression_with_the_sensor_model(folder: Path) -> None:
         law = columns[f"F of Table I's law at {tilt} deg [N]"]
         expected = np.pi * 0.304 * d**2 / np.cos(np.radians(tilt))
         np.testing.assert_allclose(model, expected, rtol=1e-12)
-        # The quadrature over the cells is less accurate. The paper's sensor has three digits.
+        # The quadrature over the cells is less accurate. The paper gives the readings to three
+        # digits.
         np.testing.assert_allclose(sensed, model, rtol=1e-4)
         # The bounds are the forces for the minimum and the maximum modulus below full compression.
         assert np.all(law[1:] > 0.135 / 0.304 * model[1:])

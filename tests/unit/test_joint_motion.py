@@ -18,7 +18,7 @@ RATE = 0.229 * 2.0 * math.pi / 60.0  # one velocity count [rad/s]
 
 
 class Joint:
-    """A moving joint as reported by its servo: in whole counts and some milliseconds late."""
+    """A moving joint as reported by its servo: in whole counts and a few milliseconds late."""
 
     def __init__(self, seed: int = 1) -> None:
         self.reading = Reading(valid=True, t=0.0)

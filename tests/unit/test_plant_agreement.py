@@ -22,7 +22,7 @@ PALM_STIFFNESS, PALM_LOSS = 1e5, 1e-3
 
 
 def tips(x):
-    """Return both centres, analytic in complex coordinates."""
+    """Return both centres; the formulas also accept complex coordinates."""
     length, half = HAND.finger_length, HAND.half_separation
     return (
         np.array([-half + length * np.sin(x[0]), length * np.cos(x[0])]),

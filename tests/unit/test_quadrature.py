@@ -164,7 +164,7 @@ def test_tilt_limit():
 
 
 def _complex(modulus: float, d: complex, theta: complex) -> tuple[complex, complex]:
-    """Return force and energy in complex arithmetic, for derivatives by the complex step."""
+    """Return force and energy in complex arithmetic, for complex-step differentiation."""
     force = math.pi * modulus * d * d / np.cos(theta)
     return force, force * d / (3 * np.cos(theta))
 

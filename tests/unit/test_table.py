@@ -1,4 +1,4 @@
-"""Test contact tables: accuracy over the domain, error bound, forms, files, special input."""
+"""Test contact tables: accuracy over the domain, error bound, forms, files and edge-case inputs."""
 
 import functools
 import math
@@ -30,7 +30,7 @@ HARD = {
     "s-shaped": Material.from_points(Y, 1e5 * (Y + 0.12 * np.sin(6.0 * Y))),
     "root": Material.from_points(Y, 1e5 * Y**0.7),
 }
-# A loop and a function call may fuse different products with their sums.
+# The compiler may fuse different multiply-adds in a loop than in a function call.
 FUSED = 1e-12
 OUTPUTS = ("force", "energy", "force_d", "force_theta", "energy_d", "energy_theta")
 

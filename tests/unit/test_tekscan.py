@@ -125,6 +125,6 @@ def test_an_export_is_read_as_a_recording(tmp_path):
     assert load_recording(path, 50.0, 100.0).counts[0, 1].tolist() == [140, 5100, 20]
     path.write_text("nothing")
     with pytest.raises(
-        RecordingError, match=r"run\.asf: the file does not contain a line ASCII_DATA"
+        RecordingError, match=r"run\.asf: the file does not contain an ASCII_DATA line"
     ):
         load_recording(path, 4.0, 100.0)

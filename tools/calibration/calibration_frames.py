@@ -143,7 +143,7 @@ def _while_pressed(
     told: str,
     load: Mapping[str, float],
 ) -> NDArray[np.uint16]:
-    """Return the frames before and while a load is applied, and ``--frames`` frames after it."""
+    """Return the frames before and during a load, and ``--frames`` frames after the load."""
     before: deque[NDArray[np.uint16]] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock, clock.now())
     with ThreadPoolExecutor(1) as pool:

@@ -112,7 +112,7 @@ class Terminal:
         with contextlib.suppress(OSError, termios.error, TerminalGone):
             if self._stuck:  # Discard the rest of the page.
                 termios.tcflush(self._output, termios.TCOFLUSH)
-            # Resume a terminal that was stopped by Ctrl-S, because the next write would block.
+            # Resume a terminal that was stopped by Ctrl-S; otherwise the next write would block.
             termios.tcflow(self._output, termios.TCOON)
             self._write(_LEAVE)
 

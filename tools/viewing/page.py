@@ -69,7 +69,7 @@ class _Published(NamedTuple):
 
 
 class Site:
-    """Serve the page, its pictures and commands, and Foxglove clients.
+    """Serve the page and its pictures, carry out its commands, and stream to Foxglove clients.
 
     Requests must name this server as their host. A browser's requests must also come from this
     server's pages. The host rule blocks DNS rebinding, in which the host has another name. The page

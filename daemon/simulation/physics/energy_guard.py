@@ -1,6 +1,6 @@
 """Compute the plant energy, and prevent integration steps from creating energy.
 
-With smooth forces, the integration error is small and decreases with the step size. If forces are
+With smooth forces, the integration error is small, and shorter steps reduce it. If forces are
 not smooth (for example, when a light object hits the stiff rim of the backing plate) or a step is
 too long, the energy could increase by more than the work of the motors and loads. The guard removes
 any excess energy from the kinetic energy. If the kinetic energy is smaller than the excess, the

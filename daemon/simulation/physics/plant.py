@@ -69,10 +69,11 @@ def bounded(value: float, limit: float) -> float:
 
 @inner_kernel
 def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
-    """Add the motors to the load; set the current rates in ``k`` for zero acceleration.
+    """Add the motor torques to the load; set the rates of the currents in ``k``.
 
-    A current lags behind its reference: i' = (r(q, ω) − i)/τ. The current's rate k decreases by
-    (r_q g + r_ω) g/(τ + g) per unit of acceleration; the matrix contains this term.
+    The rates are those at zero acceleration. A current lags behind its reference: i' = (r(q, ω) −
+    i)/τ. The current's rate k decreases by (r_q g + r_ω) g/(τ + g) per unit of acceleration; the
+    matrix contains this term.
     """
     p = plant.parameters
     lag = p.electric_time

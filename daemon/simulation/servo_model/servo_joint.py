@@ -212,7 +212,7 @@ class ServoJoint:
 
 ROOM_TEMPERATURE = 25.0  # °C
 _THERMOMETER_LAG = 4.0  # s
-_CONVECTION = 0.006  # relative increase of the cooling per kelvin of temperature difference [1/K]
+_CONVECTION = 0.006  # relative increase in cooling per kelvin of temperature difference [1/K]
 _STEP_MAX = 1.0  # maximum step [s]
 # Arrival tolerance in counts. Without this tolerance, rounding of the square root would prevent
 # arrival.
