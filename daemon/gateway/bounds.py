@@ -26,6 +26,7 @@ SOCKET_QUEUE_LENGTH = 64  # number of requests, replies or subscriptions queued 
 PART_SIZE_RATIO = 4  # size limit of one message part, as a multiple of commands.max_bytes
 PART_COUNT_MAX = 16  # maximum number of parts in a request, including routing frame and envelope
 ENVELOPE_SIZE_MAX = 1024  # maximum combined size of routing frame and envelope [bytes]
+HANDSHAKES_PER_TURN = 64  # completed before the gateway serves the loop and the stream
 SUBSCRIPTION_SIZE_MAX = 1024  # maximum size [bytes]; handshake messages are longer than topics
 SUBSCRIPTIONS_PER_TURN = 64
 REPEAT_INTERVAL = 0.1  # minimum interval between message repetitions for late subscribers [s]
@@ -52,6 +53,8 @@ STEP_WAIT_MAX = 0.01  # longest wait in a step [s]
 TURN_TIME = 0.004  # time limit for reading requests in a step [s]
 LINGER_TIME = 0.2  # time limit for sending queued messages after the loop has ended [s]
 
+READY = "ready"  # printed by the process once its sockets are bound
+
 
 class Config(NamedTuple):
     """Addresses, limits and stream topics. Empty addresses are not bound."""
@@ -64,5 +67,5 @@ class Config(NamedTuple):
     per_second: float = 200.0  # request rate limit per client
     ipc_mode: int = 0o600  # permissions of an ipc socket file
     keys: str = ""  # folder created by `softfinger keys`
-    stream_key: str = "stream.address"  # setting named in error messages about the stream address
+    stream_setting: str = "stream.address"  # name of the stream address in error messages
     latest: str = ""  # address that publishes the first topic in single frames

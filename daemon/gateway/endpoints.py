@@ -1,4 +1,4 @@
-"""Provide the client sockets and authenticate the clients.
+"""Open the client sockets, authenticate the clients and publish the stream.
 
 Without keys all clients are accepted, but libzmq disconnects peers that do not send a ZMTP 3
 greeting. The greeting excludes web pages, whose POST requests are valid messages in older protocol
@@ -17,86 +17,85 @@ from typing import Any
 
 import zmq
 import zmq.utils.z85
-from zmq.auth.thread import ThreadAuthenticator
 
 from softfinger.daemon.errors import AddressError, KeyFileError, NoDescriptor, SoftfingerError
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.bounds import Config
-from softfinger.daemon.wire.keys import ServerKeys, load_server
+from softfinger.daemon.wire.keys import load_server
+from softfinger.daemon.wire.local_stop import IN_USE, free_socket_path
 from softfinger.daemon.wire.loop_link import repeated
 
 NO_WAIT = int(zmq.NOBLOCK)
-IN_USE = "is in use; is another softfinger running?"
-_DOMAIN = "softfinger"
+_LATEST_TOPIC = 0  # index of the topic that is also published in single frames
 
 
 class RestartNeeded(SoftfingerError):
     """All clients must be disconnected so that they reconnect. The message gives the reason."""
 
 
-class Admission(ThreadAuthenticator):
-    """Authenticate clients for libzmq with the keys that are currently in the folder."""
+class ClientSockets:
+    """Sockets with the gateway's limits, restricted to clients whose keys are in the key folder."""
 
-    def __init__(self, context: zmq.Context[Any], folder: Path | None) -> None:
-        """Load the keys in ``folder`` (see `softfinger keys`).
+    def __init__(self, config: bounds.Config) -> None:
+        """Load the keys; without a key folder, all clients are accepted. Raises KeyFileError."""
+        self._config = config
+        self._folder = Path(config.keys)
+        self._keys = load_server(self._folder) if config.keys else None
+        self._check_at = 0.0  # time of the next check of the key folder
+        self._paths: list[str] = []  # files of ipc sockets
+        self._context: zmq.Context[Any] = zmq.Context()
+        self.handshakes = self._context.socket(zmq.REP)
+        self.handshakes.bind("inproc://zeromq.zap.01")  # ZeroMQ Authentication Protocol, RFC 27
 
-        If ``folder`` is None, all clients are accepted.
+    def open(self, kind: int, address: str, setting: str) -> zmq.Socket[Any]:
+        """Open a socket and bind it, unless the address is empty.
 
-        Raises
-        ------
-        KeyFileError
-            If the keys can't be read.
+        Raises AddressError, which names the ``setting``.
         """
-        super().__init__(context)
-        self._folder = folder
-        self._keys: ServerKeys | None = None if folder is None else load_server(folder)
-        self._look_at = 0.0
-        self.start()
-        if folder is not None:
-            self.configure_curve_callback(_DOMAIN, self)
-
-    def guard(self, socket: zmq.Socket[Any]) -> None:
-        """Restrict a socket to authenticated clients. Call this method before bind."""
+        config, is_router = self._config, kind == zmq.ROUTER
+        part_size = bounds.PART_SIZE_RATIO * config.max_bytes
+        opened: zmq.Socket[Any] = self._context.socket(kind)
+        # Socket options apply only to later connections, so they must be set before bind.
+        for option, value in (
+            (zmq.MAXMSGSIZE, part_size if is_router else bounds.SUBSCRIPTION_SIZE_MAX),
+            (zmq.SNDHWM, bounds.SOCKET_QUEUE_LENGTH if is_router else config.queue),
+            (zmq.RCVHWM, bounds.SOCKET_QUEUE_LENGTH),
+            (zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE_TIMEOUT)),
+            (zmq.ZAP_DOMAIN, b"softfinger"),
+            (zmq.ZAP_ENFORCE_DOMAIN, 1),  # reject every client that is not authenticated
+        ):
+            opened.setsockopt(option, value)
         if self._keys is not None:
-            self._keys.guard(socket)
-        # With these options, libzmq rejects every client if the authenticator fails.
-        socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN.encode())
-        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-        socket.setsockopt(zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE_TIMEOUT))
+            self._keys.guard(opened)
+        if address:
+            try:
+                self._paths.append(bind(opened, address, config.ipc_mode))
+            except AddressError as error:
+                raise AddressError(f"{setting}: {error}") from None
+        return opened
 
-    def callback(self, domain: str, key: bytes) -> bool:
-        """Return True if the client with this key is accepted. Called by the authenticator."""
-        return self._keys is not None and domain == _DOMAIN and key in self._keys.clients
-
-    def curve_user_id(self, client_public_key: bytes) -> str:
-        """Return the name of the client that has this key."""
-        assert self._keys is not None
-        return self._keys.clients.get(zmq.utils.z85.encode(client_public_key), "")
+    def authenticate(self, now: float) -> None:
+        """Accept or reject new clients. Raises RestartNeeded if a key was removed."""
+        self._update_keys(now)
+        with contextlib.suppress(zmq.Again):
+            for _ in range(bounds.HANDSHAKES_PER_TURN):
+                version, number, _, _, _, _, *key = self.handshakes.recv_multipart(NO_WAIT)
+                names = {b"": ""} if self._keys is None else self._keys.clients
+                name = names.get(zmq.utils.z85.encode(b"".join(key)))
+                status, user = (b"400", "") if name is None else (b"200", name)
+                self.handshakes.send_multipart([version, number, status, b"", user.encode(), b""])
 
     def name(self, part: zmq.Frame) -> str:
         """Return the sender's name according to its key, or an empty string without keys."""
         return "" if self._keys is None else str(part.get("User-Id"))
 
-    def look(self, now: float) -> None:
-        """Check the key folder and accept newly added clients.
-
-        Raises
-        ------
-        RestartNeeded
-            If a key was removed or the authenticator has ended.
-        """
-        if now < self._look_at:
+    def _update_keys(self, now: float) -> None:
+        if self._keys is None or now < self._check_at:
             return
-        self._look_at = now + bounds.KEY_CHECK_INTERVAL
-        if not self.is_alive():
-            raise RestartNeeded("the thread that authenticates clients has ended")
-        if self._folder is None or self._keys is None:
-            return
+        self._check_at = now + bounds.KEY_CHECK_INTERVAL
         try:
-            try:
+            found = self._keys.left(self._folder)
+            with contextlib.suppress(NoDescriptor):  # All file descriptors are in use.
                 found = load_server(self._folder)
-            except NoDescriptor:  # All file descriptors are in use, so new keys can't be read.
-                found = self._keys.left(self._folder)
         except KeyFileError as error:
             raise RestartNeeded(str(error)) from None
         gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
@@ -107,19 +106,23 @@ class Admission(ThreadAuthenticator):
             )
         self._keys = found
 
+    def close(self) -> None:
+        """Send queued messages for up to `bounds.LINGER_TIME`, then disconnect all clients."""
+        self._context.destroy(linger=int(1e3 * bounds.LINGER_TIME))
+        for path in filter(None, self._paths):
+            Path(path).unlink(missing_ok=True)
+
 
 def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
     """Bind a socket and return its file path, or an empty string for TCP. Raises AddressError."""
     path = address.removeprefix("ipc://") if address.startswith("ipc://") else ""
-    if path and (trouble := _taken(path)):
-        raise AddressError(f"{address} {trouble}")
     bound.setsockopt(zmq.IPV6, int("[" in address))
-    before = os.umask(0o777 & ~ipc_mode)  # The socket file must never have wider permissions.
+    before = os.umask(0o777 & ~ipc_mode)
     try:
+        if path and (taken := free_socket_path(Path(path), socket.SOCK_STREAM)):
+            raise AddressError(f"{address} {taken}")  # libzmq would replace the file.
         # libzmq binds only to numeric addresses.
         bound.bind(address.replace("tcp://localhost:", "tcp://127.0.0.1:"))
-        if path:
-            Path(path).chmod(ipc_mode)
     except (zmq.ZMQError, OSError) as error:
         if error.errno == errno.EADDRINUSE:
             raise AddressError(f"{address} {IN_USE}") from None
@@ -129,112 +132,56 @@ def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
     return path
 
 
-def _taken(path: str) -> str:
-    """Return the reason why a socket can't replace ``path``, or an empty string if it can."""
-    if not Path(path).exists():
-        return ""
-    if not Path(path).is_socket():
-        return "exists but is not a socket"
-    with socket.socket(socket.AF_UNIX) as trial:
-        trial.setblocking(False)
-        try:
-            trial.connect(path)
-        except (FileNotFoundError, ConnectionRefusedError):  # A killed process left the file.
-            return ""
-        except OSError:  # The socket's queue is full, or this user lacks permission.
-            pass
-    return IN_USE
+def read_parts(source: zmq.Socket[Any]) -> list[zmq.Frame]:
+    """Read the next message's parts, but at most one part more than allowed.
+
+    Returns an empty list if there is no message.
+    """
+    found: list[zmq.Frame] = []
+    with contextlib.suppress(zmq.Again):
+        while not found or found[-1].more:
+            found[bounds.PART_COUNT_MAX :] = [source.recv(NO_WAIT, copy=False)]
+    return found
 
 
-class Endpoint:
-    """Bound socket with the gateway's limits."""
+class StreamEndpoint:
+    """Sockets that publish the stream to subscribers. Slow subscribers miss messages."""
 
-    def __init__(
-        self, admission: Admission, kind: int, address: str, key: str, config: Config, limit: int
-    ) -> None:
-        """Bind a socket; ``key`` names its address setting, ``limit`` is the size per message part.
-
-        Raises
-        ------
-        AddressError
-            If the address can't be bound.
-        """
-        self.socket: zmq.Socket[Any] = admission.context.socket(kind)
-        # Socket options apply only to later connections, so they must be set before bind.
-        self.socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LINGER_TIME))
-        self.socket.setsockopt(zmq.MAXMSGSIZE, limit)
-        self.socket.setsockopt(
-            zmq.SNDHWM, bounds.SOCKET_QUEUE_LENGTH if kind == zmq.ROUTER else config.queue
-        )
-        self.socket.setsockopt(zmq.RCVHWM, bounds.SOCKET_QUEUE_LENGTH)
-        admission.guard(self.socket)
-        try:
-            self._path = bind(self.socket, address, config.ipc_mode)
-        except AddressError as error:
-            self.socket.close()
-            raise AddressError(f"{key}: {error}") from None
-
-    def _parts(self) -> list[zmq.Frame]:
-        """Return the next message's parts, but at most one part more than allowed.
-
-        Empty without message.
-        """
-        found: list[zmq.Frame] = []
-        with contextlib.suppress(zmq.Again):
-            while not found or found[-1].more:
-                found[bounds.PART_COUNT_MAX :] = [self.socket.recv(NO_WAIT, copy=False)]
-        return found
-
-    def close(self) -> None:
-        self.socket.close()
-        if self._path:
-            with contextlib.suppress(OSError):
-                Path(self._path).unlink()
-
-
-class StreamEndpoint(Endpoint):
-    """Socket that publishes the stream to subscribers."""
-
-    def __init__(self, admission: Admission, config: Config) -> None:
-        """Bind the socket. Raises AddressError."""
+    def __init__(self, sockets: ClientSockets, config: bounds.Config) -> None:
+        """Bind the sockets. Raises AddressError."""
+        self.socket = sockets.open(zmq.XPUB, config.stream, config.stream_setting)
+        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # report every subscription to a topic
+        self._latest = sockets.open(zmq.PUB, config.latest, "stream.latest")
+        self._always_wanted = bool(config.latest) << _LATEST_TOPIC
         self._topics = [name.encode() for name in config.topics]
         self._prefixes: set[bytes] = set()
         self._kept: dict[int, deque[bytes]] = {}  # each topic's last messages, for late subscribers
         self._came_late = 0  # bit mask of topics to repeat for late subscribers
-        self._tell_at = 0.0  # earliest time of the next repetition
-        self.wanted = 0  # bit mask of topics with subscribers
-        super().__init__(
-            *(
-                admission,
-                zmq.XPUB,
-                config.stream,
-                config.stream_key,
-                config,
-                bounds.SUBSCRIPTION_SIZE_MAX,
-            )
-        )
-        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # report every subscription to a topic
+        self._repeat_at = 0.0  # earliest time of the next repetition
 
-    def read(self, now: float) -> None:
-        """Read subscriptions, and send stored messages to new subscribers."""
+    def read(self, now: float) -> int:
+        """Read subscriptions, and send stored messages to new subscribers.
+
+        Returns a bit mask of the topics with subscribers.
+        """
         for _ in range(bounds.SUBSCRIPTIONS_PER_TURN):
-            parts = self._parts()
+            parts = read_parts(self.socket)
             if not parts:
                 break
-            change = parts[0].bytes
-            matching = self._matching(change[1:])
-            if change[:1] == b"\1" and matching:
-                self._prefixes.add(change[1:])
+            kind, prefix = parts[0].bytes[:1], parts[0].bytes[1:]
+            matching = self._matching(prefix)
+            if kind == b"\1" and matching:
+                self._prefixes.add(prefix)
                 self._came_late |= matching
-            elif change[:1] == b"\0":
-                self._prefixes.discard(change[1:])
-        self.wanted = self._matching(*self._prefixes)
-        if self._came_late and now >= self._tell_at:
+            elif kind == b"\0":
+                self._prefixes.discard(prefix)
+        if self._came_late and now >= self._repeat_at:
             for topic, kept in self._kept.items():
                 for message in kept if self._came_late >> topic & 1 else ():
-                    self._send(topic, message)
+                    self.publish(topic, 0, message)
             self._came_late = 0
-            self._tell_at = now + bounds.REPEAT_INTERVAL
+            self._repeat_at = now + bounds.REPEAT_INTERVAL
+        return self._matching(*self._prefixes) | self._always_wanted
 
     def _matching(self, *prefixes: bytes) -> int:
         """Return a bit mask of the topics that begin with any of the prefixes."""
@@ -244,8 +191,6 @@ class StreamEndpoint(Endpoint):
         """Send a message; store the topic's last ``keep`` messages for late subscribers."""
         if keep:
             self._kept.setdefault(topic, deque(maxlen=keep)).append(repeated(message))
-        self._send(topic, message)
-
-    def _send(self, topic: int, message: bytes) -> None:
-        """Send one message to all subscribers of its topic. Slow subscribers miss it."""
         self.socket.send_multipart((self._topics[topic], message), NO_WAIT)
+        if self._always_wanted >> topic & 1:
+            self._latest.send(message, NO_WAIT)

@@ -1,12 +1,13 @@
 """Run the gateway process, in which one thread serves the loop and the clients.
 
 The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's
-file descriptor and a `Config` as JSON. The process first binds its sockets, and exits when the loop
-disconnects.
+file descriptor and a `Config` as JSON. It prints `READY` once its sockets are bound, and exits when
+the loop disconnects. If it exits for another reason, it prints the reason.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -16,159 +17,119 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import zmq
 
-from softfinger.daemon.errors import AddressError, KeyFileError
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.commands import CommandEndpoint
-from softfinger.daemon.gateway.endpoints import (
-    NO_WAIT,
-    Admission,
-    Endpoint,
-    RestartNeeded,
-    StreamEndpoint,
+from softfinger.daemon.gateway.endpoints import ClientSockets, StreamEndpoint
+from softfinger.daemon.wire.loop_link import (
+    FENCE,
+    PUBLISH,
+    REPLY,
+    REPORT,
+    Channel,
+    machine_time,
 )
-from softfinger.daemon.wire import loop_link
-from softfinger.daemon.wire.loop_link import Channel
 
 _TIMER_INTERVAL = 0.5  # interval between resets of the timers that end a stalled process [s]
-_LATEST_TOPIC = 0  # index of the topic that is also published in single frames
-# Longest time for which the authenticator thread waits for the interpreter lock during a flood [s].
-_AUTHENTICATOR_WAIT = 5e-4
 
 
 class Server:
     """Serve clients until the loop disconnects; call `step` repeatedly."""
 
     def __init__(
-        self,
-        channel: Channel,
-        config: Config,
-        clock: Callable[[], float] = loop_link.machine_time,
+        self, channel: Channel, config: bounds.Config, clock: Callable[[], float] = machine_time
     ) -> None:
         """Bind the addresses in ``config``; ``channel`` is the gateway's end of the link.
 
-        Raises
-        ------
-        AddressError
-            If an address can't be bound.
-        KeyFileError
-            If the keys can't be read.
+        Raises AddressError, or KeyFileError if the keys can't be read.
         """
         self.channel = channel
         self._clock = clock
-        self._reported: tuple[int, int, int] | None = None  # most recent report to the loop
-        self._context: zmq.Context[Any] = zmq.Context()
-        self._admission = Admission(self._context, Path(config.keys) if config.keys else None)
-        self.stream: StreamEndpoint | None = None
-        self._latest: Endpoint | None = None
-        self.commands: CommandEndpoint | None = None
-        self._poller = zmq.Poller()
-        self._poller.register(channel, zmq.POLLIN)
+        self._sockets = ClientSockets(config)
         try:
-            if config.stream:
-                self.stream = StreamEndpoint(self._admission, config)
-                self._poller.register(self.stream.socket, zmq.POLLIN)
-            if config.latest:
-                place = config.latest, "stream.latest"
-                self._latest = Endpoint(
-                    self._admission, zmq.PUB, *place, config, bounds.SUBSCRIPTION_SIZE_MAX
-                )
-            if config.commands:
-                self.commands = CommandEndpoint(self._admission, config, channel.send, clock)
-                self._poller.register(self.commands.socket, zmq.POLLIN)
+            self.stream = StreamEndpoint(self._sockets, config)
+            self.commands = CommandEndpoint(self._sockets, config, channel, clock)
         except BaseException:
             self.close()
             raise
+        self._reported: tuple[int, ...] = ()
+        self._take: dict[str, Callable[..., None]] = {
+            PUBLISH: self.stream.publish,
+            REPLY: self.commands.reply,
+            FENCE: self.commands.fence,
+        }
+        self._poller = zmq.Poller()
+        endpoints = self._sockets.handshakes, self.stream.socket, self.commands.socket
+        for each in (channel, *endpoints):
+            self._poller.register(each, zmq.POLLIN)
 
     def step(self, seconds: float = bounds.STEP_WAIT_MAX) -> None:
-        """Wait up to ``seconds`` for messages from the loop or clients, and handle them."""
+        """Wait up to ``seconds`` for messages from the loop or clients, and handle them.
+
+        Raises RestartNeeded if a key was removed.
+        """
         self._poller.poll(int(1e3 * seconds))
         now = self._clock()
-        self._admission.look(now)
+        self._sockets.authenticate(now)
         for kind, *fields in self.channel.receive():
-            if kind == loop_link.PUBLISH and self.stream is not None:
-                self.stream.publish(*fields)
-                if self._latest is not None and fields[0] == _LATEST_TOPIC:
-                    self._latest.socket.send(fields[2], NO_WAIT)
-            elif kind == loop_link.REPLY and self.commands is not None:
-                self.commands.reply(*fields)
-            elif kind == loop_link.FENCE and self.commands is not None:
-                self.commands.fence(*fields)
-        wanted = refused = stops = 0
-        if self.stream is not None:
-            self.stream.read(now)
-            wanted = self.stream.wanted | (self._latest is not None) << _LATEST_TOPIC
-        if self.commands is not None:
-            self.commands.read()
-            refused, stops = self.commands.refused, self.commands.stops
-        if (wanted, refused, stops) != self._reported:
-            self._reported = wanted, refused, stops
-            self.channel.send(loop_link.REPORT, *self._reported)
+            self._take[kind](*fields)
+        wanted = self.stream.read(now)
+        self.commands.read()
+        report = wanted, self.commands.refused, self.commands.stops
+        if report != self._reported:
+            self._reported = report
+            self.channel.send(REPORT, *report)
         self.channel.flush()
 
     def close(self) -> None:
-        """Send queued messages for up to `bounds.LINGER_TIME`, then disconnect all clients."""
-        for endpoint in (self.stream, self._latest, self.commands):
-            if endpoint is not None:
-                endpoint.close()
-        self._admission.stop()
-        self._context.term()
+        """Send queued messages for a short time, then disconnect all clients."""
+        self._sockets.close()
 
 
 def main(words: list[str]) -> int:
-    """Serve clients until the loop ends, and return the exit status.
+    """Serve clients until the loop ends.
 
-    Returns
-    -------
-    int
-        0 if the loop has ended, 1 if the sockets could not be bound, `loop_link.RESTART_STATUS` if
-        all clients must reconnect.
+    Returns 1 if the sockets could not be bound or if all clients must reconnect, otherwise 0.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # The loop's last messages must still be sent.
     channel = Channel(socket.socket(fileno=int(words[0])))
+    _limit_resources()
     try:
-        _be_bounded()
-        server = Server(channel, Config(*json.loads(words[1])))
-    except (AddressError, KeyFileError) as error:
-        channel.send(loop_link.FAILED, str(error))
+        with contextlib.closing(Server(channel, bounds.Config(*json.loads(words[1])))) as server:
+            _tell_supervisor(bounds.READY)
+            timers_set = 0.0
+            while not channel.over:
+                server.step()
+                now = time.monotonic()
+                if now - timers_set > _TIMER_INTERVAL:
+                    timers_set = now
+                    # SIGPROF and SIGALRM have no handlers, so these signals end the process.
+                    signal.setitimer(signal.ITIMER_PROF, bounds.STEP_CPU_TIME_MAX)
+                    signal.setitimer(signal.ITIMER_REAL, bounds.STEP_TIME_MAX)
+    except SoftfingerError as reason:
+        _tell_supervisor(str(reason))
         return 1
-    sys.setswitchinterval(_AUTHENTICATOR_WAIT)
-    channel.send(loop_link.READY)
-    lived = 0.0
-    try:
-        while not channel.over:
-            server.step()
-            now = time.monotonic()
-            if now - lived > _TIMER_INTERVAL:
-                lived = now
-                # SIGPROF and SIGALRM have no handlers, so these signals end the process.
-                signal.setitimer(signal.ITIMER_PROF, bounds.STEP_CPU_TIME_MAX)
-                signal.setitimer(signal.ITIMER_REAL, bounds.STEP_TIME_MAX)
-    except RestartNeeded as reason:
-        channel.send(loop_link.NOTICE, str(reason))
-        return loop_link.RESTART_STATUS
-    server.close()
     return 0
 
 
-def _be_bounded() -> None:
+def _tell_supervisor(text: str) -> None:
+    with contextlib.suppress(BrokenPipeError):  # The daemon has ended.
+        os.write(sys.stdout.fileno(), f"{text}\n".encode())
+
+
+def _limit_resources() -> None:
     """Limit memory and file descriptors, raise the OOM score, and drop real-time scheduling."""
     resource.setrlimit(resource.RLIMIT_DATA, (bounds.MEMORY_MAX, bounds.MEMORY_MAX))
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT
-    if most != resource.RLIM_INFINITY:
-        wanted = min(wanted, most)
+    wanted = min(bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT, most)
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
-    try:
+    with contextlib.suppress(OSError):  # These two measures are optional.
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    except OSError:
-        pass  # The daemon also works without these two measures.
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import State, Truth
 from softfinger.daemon.wire.command_server import Handler
+from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
@@ -48,17 +49,10 @@ def command_age_max(settings: Settings, waits: bool) -> float:
 class Commands(Protocol):
     """Command source: `wire.command_server.CommandServer` or a recording."""
 
-    notices: deque[str]  # messages from the gateway process, to be emitted as events
-
-    @property
-    def refused_by_pace(self) -> int:
-        """Number of commands refused because they exceeded the rate limit."""
+    link: Link  # Its notices are emitted as events. A recording uses an unconnected link.
 
     def serve(self, handler: Handler) -> None:
         """Pass each request that is due on this tick to ``handler``."""
-
-    def raise_fence(self) -> None:
-        """After a stop, reject all commands received so far, except stop and status commands."""
 
 
 class Loop:
@@ -240,10 +234,10 @@ class Loop:
             self.command({"command": "stop"})
         if self._server is not None:
             if stopped:
-                self._server.raise_fence()
+                self._server.link.fence()
             self._server.serve(self.command)
-            while self._server.notices:
-                self.emit("warning", "clients", self._server.notices.popleft())
+            while self._server.link.notices:
+                self.emit("warning", "clients", self._server.link.notices.popleft())
         if self._task is not None:
             self._follow(self._task)
         else:
@@ -312,8 +306,8 @@ class Loop:
         """
         name = request["command"]
         if name == "status":
-            if self._server is not None and self._server.refused_by_pace:
-                self._safety.limited["commands.pace"] = self._server.refused_by_pace
+            if self._server is not None and self._server.link.refused:
+                self._safety.limited["commands.pace"] = self._server.link.refused
             return self._requests.carry_out(request)
         try:
             reply = self._requests.carry_out(request, age)

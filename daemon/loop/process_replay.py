@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, Goal, Reading, State
 from softfinger.daemon.wire.command_server import Handler
+from softfinger.daemon.wire.loop_link import Link
 
 
 class ProcessReplay:
@@ -171,11 +171,9 @@ class _Servos:
 class _Commands:
     """Command source that replays the recorded commands of a tick."""
 
-    refused_by_pace = 0
-
     def __init__(self) -> None:
         self.waiting: list[dict[str, Any]] = []
-        self.notices: deque[str] = deque()
+        self.link = Link()
 
     def serve(self, handler: Handler) -> None:
         for request in self.waiting:
@@ -184,9 +182,6 @@ class _Commands:
             except Refused:
                 pass  # The comparison of the states will reveal the difference.
         self.waiting = []
-
-    def raise_fence(self) -> None:
-        pass
 
     def close(self) -> None:
         pass

@@ -16,16 +16,14 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import msgpack
 
 from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.types import NO_LEASE_COMMANDS
+from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
-
-if TYPE_CHECKING:  # The gateway process does not need this module.
-    from softfinger.daemon.wire.local_stop import LocalStop
 
 Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: request and its age [s]
 
@@ -34,15 +32,7 @@ _COMMANDS_PER_TICK = 2  # maximum number of commands per tick, not counting stop
 _UNPACKED_SIZE_MAX = 4096  # number of bytes after which unpacking continues on the next tick
 _OUTCOME_COUNT_MAX = 256  # number of stored outcomes of requests with a key
 _KEY_LENGTH_MAX = 64
-_VALUE_TYPES = (str, int, float)  # bool is a subclass of int
-
-
-class _Outcome(NamedTuple):
-    """Reply to a request that has a key."""
-
-    stops: int  # stop count when the request was first refused or executed
-    changes: int  # number of other commands executed until then
-    reply: bytes  # reply, empty if the request was late and may be repeated
+_VALUE_TYPES = (str, int, float, type(None))  # bool is a subclass of int
 
 
 class CommandServer:
@@ -55,111 +45,92 @@ class CommandServer:
         clock: Callable[[], float] = machine_time,
     ) -> None:
         """Create a server; ``clock`` must be the clock that the gateway uses for time stamps."""
-        self._link = link
-        self.notices = link.notices  # gateway warnings, to be published as events
+        self.link = link
         self._local = local
         self._clock = clock
-        self._stops = 0
         self._changes = 0  # number of executed commands other than status and stop
-        # Outcomes by client name (from its access key) and request, oldest first.
-        self._outcomes: OrderedDict[tuple[str, bytes], _Outcome] = OrderedDict()
-        # Reply to a local stop that awaits the gateway's confirmation.
-        self._stopped: bytes | None = None
-        self._answer_by = 0.0
-        if local is not None:
-            link.watch(local.fileno())
-
-    @property
-    def refused_by_pace(self) -> int:
-        """Number of requests that were refused by rate limits."""
-        return self._link.refused
+        # Outcomes of requests with a key, by client name (from its access key) and request, oldest
+        # first: the reply, or for a late request the counts of stops and changes.
+        self._outcomes: OrderedDict[tuple[str, bytes], bytes | tuple[int, int]] = OrderedDict()
+        self._stopped = b""  # reply to the last local stop
+        self._answer_by = 0.0  # time at which local stops are answered without the gateway
 
     def serve(self, handler: Handler) -> None:
         """Pass this tick's requests to ``handler`` and send its replies.
 
         The handler raises Refused to reject a command.
         """
-        self._link.look()
-        if self._local is not None and (self._link.called or self._stopped is not None):
-            self._serve_local(self._local, handler)
+        self.link.look()
+        if self._local is not None:
+            if self._local.take():
+                self._stopped = self._stop(handler, "")
+                self._answer_by = time.monotonic() + _ANSWER_TIMEOUT
+            if self.link.confirmed == self.link.stops or time.monotonic() > self._answer_by:
+                self._local.answer(self._stopped)
         self._unpack(handler)
-        waiting, done = self._link.unpacked, 0
+        waiting, done = self.link.unpacked, 0
         while waiting and done < _COMMANDS_PER_TICK:
             ask, request = waiting.popleft()
-            done += ask.stops == self._stops
-            self._link.reply(ask, self._answer(ask, request, handler))
+            done += ask.stops == self.link.stops
+            self.link.reply(ask, self._answer(ask, request, handler))
 
-    def raise_fence(self) -> None:
-        """After a stop, refuse all commands that arrived earlier, except stop and status."""
-        self._stops += 1
-        self._link.fence(self._stops)
+    def _stop(self, handler: Handler, client: str) -> bytes:
+        reply = accepted(handler({"command": "stop", "client": client}, 0.0))
+        self.link.fence()  # The client may continue after the reply, so raise the fence first.
+        return reply
 
     def _unpack(self, handler: Handler) -> None:
         """Unpack the arrived requests. Carry out a stop immediately, and only once per call."""
-        stopped, waiting = b"", self._link.unpacked
+        stopped, waiting = b"", self.link.unpacked
         size = 0  # bytes
-        while self._link.asked and size < _UNPACKED_SIZE_MAX:
-            ask = self._link.asked.popleft()
+        while self.link.asked and size < _UNPACKED_SIZE_MAX:
+            ask = self.link.asked.popleft()
             size += len(ask.payload)
             try:
                 request = decode(ask.payload)
                 if ask.urgent and request["command"] != "stop":  # Two keys are named "command".
                     raise _malformed('expected exactly one string under the key "command"')
             except Refused as refused:
-                self._link.reply(ask, refusal(str(refused), refused.reason))
+                self.link.reply(ask, refusal(str(refused), refused.reason))
+                continue
+            if request["command"] == "stop":
+                stopped = stopped or self._stop(handler, ask.name)
+                self.link.reply(ask, stopped)
                 continue
             if ask.name:
                 request["client"] = ask.name
-            if request["command"] == "stop":
-                if not stopped:
-                    stopped = accepted(handler({"command": "stop", "client": ask.name}, 0.0))
-                    # The client may continue after the reply, so raise the fence first.
-                    self.raise_fence()
-                self._link.reply(ask, stopped)
-                continue
             mine = [other for other in waiting if other[0].route[0] == ask.route[0]]
             if mine and _replaces(request, mine[-1][1]):
                 waiting.remove(mine[-1])
                 text = "hold: replaced by a newer hold of the same connection"
-                self._link.reply(mine[-1][0], refusal(text, Reason.SUPERSEDED))
+                self.link.reply(mine[-1][0], refusal(text, Reason.SUPERSEDED))
             waiting.append((ask, request))
 
     def _answer(self, ask: Ask, request: dict[str, Any], handler: Handler) -> bytes:
         """Carry out a request, at most once if it has a key, and return the reply."""
         name, place = request["command"], (ask.name, ask.payload)
         keyed = request.pop("key", None) is not None and name not in NO_LEASE_COMMANDS
-        present = _Outcome(self._stops, self._changes, b"")
-        first = self._outcomes.pop(place, present) if keyed else present
-        reply, late = first.reply, False
-        if not reply:
+        counts = stops, changes = self.link.stops, self._changes
+        first = self._outcomes.pop(place, counts) if keyed else counts
+        reply = outcome = first
+        if not isinstance(reply, bytes):
             try:
-                if first.stops != self._stops or (ask.stops != self._stops and name != "status"):
+                if first[0] != stops or (ask.stops != stops and name != "status"):
                     text = "rejected: received before the last stop, or too soon after it"
                     raise Refused(text, Reason.STOPPED)
-                if first.changes != self._changes:
+                if first[1] != changes:
                     text = f"{name}: another command was carried out after the first attempt"
                     raise Refused(text, Reason.SUPERSEDED)
-                reply = accepted(handler(request, self._clock() - ask.came))
+                reply = outcome = accepted(handler(request, self._clock() - ask.came))
                 self._changes += name != "status"
             except Refused as refused:
-                reply, late = refusal(str(refused), refused.reason), refused.reason == Reason.LATE
+                reply = refusal(str(refused), refused.reason)
+                outcome = first if refused.reason == Reason.LATE else reply
         if keyed:
-            self._outcomes[place] = first._replace(reply=b"" if late else reply)
+            self._outcomes[place] = outcome
             if len(self._outcomes) > _OUTCOME_COUNT_MAX:
                 self._outcomes.popitem(last=False)
         return reply
-
-    def _serve_local(self, local: LocalStop, handler: Handler) -> None:
-        self._link.called = False
-        if local.take():
-            self._stopped = accepted(handler({"command": "stop"}, 0.0))
-            self.raise_fence()
-            self._answer_by = time.monotonic() + _ANSWER_TIMEOUT
-        if self._stopped is not None and (
-            self._link.stops == self._stops or time.monotonic() > self._answer_by
-        ):
-            local.answer(self._stopped)
-            self._stopped = None
 
 
 def _replaces(request: dict[str, Any], other: dict[str, Any]) -> bool:
@@ -195,20 +166,15 @@ def decode(payload: bytes) -> dict[str, Any]:
         raise _malformed(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):
         raise _malformed('expected a string under the key "command"')
-    # Requests are published unchanged, so nested values are rejected.
-    plain = {
-        key: value
-        for key, value in request.items()
-        if isinstance(key, str) and (value is None or isinstance(value, _VALUE_TYPES))
-    }
     if request["command"] == "stop":
-        return plain
-    if len(plain) < len(request):
+        return {"command": "stop"}
+    # Requests are published unchanged, so nested values are rejected.
+    if not all(isinstance(k, str) and isinstance(v, _VALUE_TYPES) for k, v in request.items()):
         raise _malformed("expected strings as keys, and numbers or strings as values")
-    key = plain.get("key", "-")
+    key = request.get("key", "-")
     if not isinstance(key, str) or not 0 < len(key) <= _KEY_LENGTH_MAX:
         raise _malformed(f"key: expected a string of 1 to {_KEY_LENGTH_MAX} characters")
-    return plain
+    return request
 
 
 def _malformed(text: str) -> Refused:

@@ -8,8 +8,6 @@ queue of replies and stops is bounded.
 
 from __future__ import annotations
 
-import contextlib
-import select
 import socket
 import time
 from collections import deque
@@ -24,13 +22,8 @@ REPLY = "reply"  # the request's `Ask.urgent` and `Ask.route`, reply
 FENCE = "fence"  # stop count so far
 
 # From the gateway
-READY = "ready"  # the sockets are bound
-FAILED = "failed"  # bind error
 ASK = "ask"  # the `Ask` fields
-REPORT = "report"  # `Link.wanted`, `Link.refused`, `Link.stops`
-NOTICE = "notice"  # warning text
-
-RESTART_STATUS = 3  # exit status of a gateway that must be restarted and has reported the reason
+REPORT = "report"  # `Link.wanted`, `Link.refused`, `Link.confirmed`
 
 _BUFFER_SIZE = 1 << 20  # requested socket buffer size [bytes]; the kernel may allow less
 _CHUNK = 1 << 16  # maximum number of bytes per receive call
@@ -82,17 +75,16 @@ class Channel:
         self._end = end
         self._unsent = bytearray()
         self._unpacker = msgpack.Unpacker(max_buffer_size=_MESSAGE_SIZE_MAX)
-        self.over = False  # True once the other end has disconnected
+        self.over = False  # True once either end has been closed
 
     def fileno(self) -> int:
         return self._end.fileno()
 
     def send(self, *message: object, droppable: bool = False) -> None:
         """Send a message. If the buffer is full, queue the message, or drop it if ``droppable``."""
-        if self._unsent and not self.flush() and droppable:
-            return
-        self._unsent += msgpack.packb(message)
-        self.flush()
+        if not self.over and (self.flush() or not droppable):
+            self._unsent += msgpack.packb(message)
+            self.flush()
 
     def flush(self) -> bool:
         """Send queued bytes; return True if the queue is then empty."""
@@ -101,8 +93,7 @@ class Channel:
                 del self._unsent[: self._end.send(self._unsent)]
         except BlockingIOError:
             return False
-        except OSError:
-            self.over = True
+        except OSError:  # The other end is closed, but its last messages may be unread.
             self._unsent.clear()
         return True
 
@@ -110,7 +101,7 @@ class Channel:
         """Yield received messages; read at most `_CHUNK` bytes per call."""
         try:
             chunk = self._end.recv(_CHUNK)
-            self.over = self.over or not chunk
+            self.over = not chunk
             self._unpacker.feed(chunk)
         except BlockingIOError:
             pass
@@ -119,6 +110,7 @@ class Channel:
         yield from self._unpacker
 
     def close(self) -> None:
+        self.over = True
         self._end.close()
 
 
@@ -128,112 +120,63 @@ class Link:
     def __init__(self) -> None:
         self.wanted = 0  # bit mask of topics with subscribers
         self.refused = 0  # number of requests that the gateway's rate and queue limits refused
-        self.stops = 0  # stop count with which the gateway stamps new requests
+        self.stops = 0  # number of stops so far
+        self.confirmed = 0  # stop count with which the gateway stamps new requests
         self.asked: deque[Ask] = deque()  # received requests, with urgent requests first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # queued for a later tick
         self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # gateway warnings
-        self.called = False  # True if the descriptor passed to `watch` is readable
-        self._other = -1  # the descriptor passed to `watch`
-        self._fence = 0
         # Last messages of each topic, for a restarted gateway.
         self._kept: dict[int, deque[bytes]] = {}
-        self._channel: Channel | None = None
         self._offered: Channel | None = None
-        self._poll = select.poll()
+        self._channel = Channel(socket.socket())  # replaced by `offer`
+        self._channel.close()
 
     def offer(self, channel: Channel) -> None:
         """Switch to this channel at the next `look`. Any thread may call this method."""
         self._offered = channel
 
-    def watch(self, descriptor: int) -> None:
-        """Poll an additional descriptor; `look` sets `called` when the descriptor is readable."""
-        self._other = descriptor
-        self._poll.register(descriptor, select.POLLIN)
-
-    def look(self) -> None:
-        """Read the gateway's messages; this takes less than 1 µs if no message has arrived."""
-        # The supervisor read the first message, and its receive call may have buffered further
-        # messages.
-        has_more = self._offered is not None
+    def look(self) -> bool:
+        """Read the gateway's messages; return True if all bytes for the gateway have been sent."""
         if self._offered is not None:
-            self._adopt(self._offered)
-        ready = [descriptor for descriptor, _ in self._poll.poll(0)]
-        self.called = self._other in ready
-        if self._channel is None:
-            return
-        self._channel.flush()
-        if has_more or self._channel.fileno() in ready:
-            for kind, *fields in self._channel.receive():
-                if kind == ASK:
-                    ask = Ask(*fields)
-                    (self.asked.appendleft if ask.urgent else self.asked.append)(ask)
-                elif kind == REPORT:
-                    self.wanted, self.refused, self.stops = fields
-                else:
-                    self.notices.extend(fields)
-        if self._channel.over:
-            self._disconnect()
+            self.close()
+            self._channel, self._offered = self._offered, None
+            for topic, kept in self._kept.items():
+                for message in kept:
+                    self._channel.send(PUBLISH, topic, kept.maxlen, repeated(message))
+            self._channel.send(FENCE, self.stops)
+        channel = self._channel
+        if channel.over:
+            return True
+        for kind, *fields in channel.receive():
+            if kind == REPORT:
+                self.wanted, self.refused, self.confirmed = fields
+            else:
+                ask = Ask(*fields)
+                (self.asked.appendleft if ask.urgent else self.asked.append)(ask)
+        if channel.over:
+            self.close()
+        return channel.flush()
 
-    def wait(self, seconds: float) -> None:
-        """Wait up to ``seconds`` for a message, then call `look`.
+    def fence(self) -> None:
+        """After a stop, refuse all requests that arrived earlier, except stop and status.
 
-        Do not call this method within a tick.
+        The gateway receives the stop count with which it must stamp new requests.
         """
-        self.look()
-        channels = [] if self._channel is None else [self._channel]
-        select.select(channels, [], [], seconds)
-        self.look()
-
-    def wait_for_room(self, seconds: float) -> None:
-        """Wait until all bytes have been sent. Do not call this method within a tick.
-
-        Give up if the gateway does not read any bytes for ``seconds``.
-        """
-        self.look()
-        if (channel := self._channel) is not None:
-            while not channel.flush() and select.select([], [channel], [], seconds)[1]:
-                pass
-
-    def _adopt(self, channel: Channel) -> None:
-        """Switch to a new gateway's channel; send the last stop count and the stored messages."""
-        self._disconnect()
-        self._offered, self._channel = None, channel
-        self._poll.register(channel, select.POLLIN)
-        for topic, kept in self._kept.items():
-            for message in kept:
-                channel.send(PUBLISH, topic, kept.maxlen, repeated(message))
-        self.fence(self._fence)
-
-    def _disconnect(self) -> None:
-        if self._channel is not None:
-            self._poll.unregister(self._channel)
-            self._channel.close()
-            self._channel = None
-        self.wanted = self.stops = 0
-        self.asked.clear()
-        self.unpacked.clear()
-
-    def fence(self, stops: int) -> None:
-        """Send the current stop count to the gateway, which stamps requests with this count."""
-        self._fence = stops
-        if self._channel is not None and stops:
-            self._channel.send(FENCE, stops)
+        self.stops += 1
+        self._channel.send(FENCE, self.stops)
 
     def reply(self, ask: Ask, reply: bytes) -> None:
-        if self._channel is not None:
-            self._channel.send(REPLY, ask.urgent, ask.route, reply)
+        self._channel.send(REPLY, ask.urgent, ask.route, reply)
 
     def publish(self, topic: int, message: bytes, keep: int = 0) -> None:
         """Publish a message; repeat the topic's last ``keep`` messages to late subscribers."""
         if keep:
             self._kept.setdefault(topic, deque(maxlen=keep)).append(message)
-        if self._channel is not None:
-            self._channel.send(PUBLISH, topic, keep, message, droppable=True)
+        self._channel.send(PUBLISH, topic, keep, message, droppable=True)
 
     def close(self) -> None:
         """Disconnect. The gateway then sends its queued messages and exits."""
-        self._disconnect()
-        offered, self._offered = self._offered, None
-        if offered is not None:
-            with contextlib.suppress(OSError):
-                offered.close()
+        self._channel.close()
+        self.wanted = self.confirmed = 0
+        self.asked.clear()
+        self.unpacked.clear()

@@ -57,11 +57,12 @@ class Tap(Link):
     def request(self, request: dict[str, Any], t: float) -> None:
         """Add a request that arrives at time ``t`` [s]; the next tick sets its `answer`."""
         urgent = request["command"] == "stop"
-        self.asked.append(Ask(t, self._fence, urgent, "", [_OWN], msgpack.packb(request)))
+        self.asked.append(Ask(t, self.stops, urgent, "", [_OWN], msgpack.packb(request)))
 
-    def look(self) -> None:
-        super().look()
+    def look(self) -> bool:
+        all_sent = super().look()
         self.wanted |= self.tapped
+        return all_sent
 
     def reply(self, ask: Ask, reply: bytes) -> None:
         if ask.route == [_OWN]:

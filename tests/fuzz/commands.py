@@ -117,17 +117,17 @@ class CommandTarget:
         raise AssertionError("no reply")
 
     def _directly(self, message: bytes) -> dict[str, Any]:
-        commands, replies = self.served.service.commands, []
-        with patch.object(
-            commands, "_answer", lambda _, reply: replies.append(msgpack.unpackb(reply))
-        ):
+        commands, sent = self.served.service.commands, []
+        with patch.object(commands, "_send", sent.append):
             commands._take([b"%d" % self.asked, message], "", machine_time())
             for _ in range(3):
                 self.served.serve(self.loop.command)
-                if replies:
+                sent.extend(commands._replies)  # replies that are held back after a stop
+                commands._replies.clear()
+                if sent:
                     break
-        (reply,) = replies
-        return reply
+        (reply,) = sent
+        return msgpack.unpackb(reply[-1])
 
     def _check(self) -> None:
         state, hand = self.loop.state, self.daemon.settings.hand

@@ -59,7 +59,7 @@ class Served:
         if self._clock is not None:
             self._clock.sleep_until(self._clock.now() + bounds.REFUSAL_TIME)
         self.settle()
-        return self.link.stops == self.server._stops
+        return self.link.confirmed == self.link.stops
 
     def settle(self, times: int = 3) -> None:
         """Deliver all messages that are in transit on the link."""
@@ -69,6 +69,11 @@ class Served:
         # A long message takes several steps.
         while select.select([self.service.channel], [], [], 0)[0]:
             self.service.step(0.0)
+
+    def has_request(self) -> bool:
+        """Return True if libzmq has received a request; the gateway only accepts new clients."""
+        self.service._sockets.authenticate(0.0)
+        return bool(self.service.commands.socket.poll(0))
 
     def serve(self, handler: Handler) -> None:
         """Run one gateway step, one loop tick, and one gateway step for the replies."""

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import math
 import os
 import signal
 import stat
@@ -43,7 +42,6 @@ def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Create a runtime folder whose path is short enough for a Unix socket."""
     with TemporaryDirectory(prefix="softfinger-") as folder:
         monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
-        monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
         yield Path(folder) / "softfinger"
 
 
@@ -72,9 +70,9 @@ def test_a_crashed_gateway_is_restarted_while_the_loop_continues(ticking, addres
         hand.arm()
         stream = hand.stream(timeout=60.0)
         next(stream)
-        first, ticks = gateway.process, loop.state.seq
+        first, ticks = gateway.process.pid, loop.state.seq
         os.kill(first, number)
-        until(lambda: gateway.process != first)
+        until(lambda: gateway.process.pid != first)
         # Clients reconnect by themselves and receive the events that they missed.
         with hand.events(timeout=60.0) as told:
             assert any(f"ended (signal {number})" in event.text for event in told)
@@ -162,9 +160,9 @@ def test_a_hanging_gateway_ends_itself_but_not_on_a_busy_machine(bound, does, st
 def test_a_stopped_gateway_is_replaced(addresses):
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
-        stopped = gateway.process
+        stopped = gateway.process.pid
         os.kill(stopped, signal.SIGSTOP)
-        until(lambda: gateway.process != stopped)
+        until(lambda: gateway.process.pid != stopped)
         assert "the gateway process was suspended" in gateway.link.notices
     finally:
         gateway.close()
@@ -173,12 +171,12 @@ def test_a_stopped_gateway_is_replaced(addresses):
 def test_gateway_memory_is_bounded_and_its_priority_is_normal(addresses):
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
-        limits = Path(f"/proc/{gateway.process}/limits").read_text(encoding="ascii")
+        limits = Path(f"/proc/{gateway.process.pid}/limits").read_text(encoding="ascii")
         (data,) = [line for line in limits.splitlines() if line.startswith("Max data size")]
         assert int(data.split()[3]) <= bounds.MEMORY_MAX
         (files,) = [line for line in limits.splitlines() if line.startswith("Max open files")]
         assert int(files.split()[3]) <= bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT
-        assert os.sched_getscheduler(gateway.process) == os.SCHED_OTHER
+        assert os.sched_getscheduler(gateway.process.pid) == os.SCHED_OTHER
     finally:
         gateway.close()
 
@@ -188,12 +186,12 @@ def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses)
     try:
         publisher = Publisher(gateway.link)
         gateway.link.look()
-        os.kill(gateway.process, signal.SIGSTOP)
+        os.kill(gateway.process.pid, signal.SIGSTOP)
         for k in range(50_000):  # The loop would never end if it waited for the gateway.
             publisher.event(0.0, 0.0, "info", "test", f"event {k}")
         assert len(gateway.link._channel._unsent) < 1000, "the queue exceeds its limit"
         with suppress(ProcessLookupError):  # A slow gateway may have been replaced.
-            os.kill(gateway.process, signal.SIGCONT)
+            os.kill(gateway.process.pid, signal.SIGCONT)
     finally:
         gateway.close()
 
@@ -203,7 +201,7 @@ def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses)
 
 def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, inline, monkeypatch):
     # Do not replace a stopped gateway, and allow only local delivery, even on a busy machine.
-    monkeypatch.setattr(supervisor, "_STOPPED_COUNT_MAX", math.inf)
+    monkeypatch.setattr(supervisor, "_SUSPENSION_TIME_MAX", threading.TIMEOUT_MAX)
     monkeypatch.setattr(command_client, "LOCAL_STOP_TIMEOUT", 60.0)
     where = ["--address", ",".join(addresses)]
     with (
@@ -212,7 +210,9 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
     ):
         hand.arm()
         page.shows("ARMED")
-        os.kill(ticking.gateway.process, signal.SIGSTOP)  # The gateway no longer serves clients.
+        os.kill(
+            ticking.gateway.process.pid, signal.SIGSTOP
+        )  # The gateway no longer serves clients.
         try:
             assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
             assert ticking.loop.state.mode == "disarmed"
@@ -228,7 +228,7 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
             with pytest.raises(NoAnswer):
                 send(addresses[1], {"command": "status"}, timeout=0.2)
         finally:
-            os.kill(ticking.gateway.process, signal.SIGCONT)
+            os.kill(ticking.gateway.process.pid, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
         hand.arm()  # The gateway receives all commands that are sent after this reply.
@@ -246,14 +246,15 @@ def test_the_local_socket_is_private_to_the_user(own_folder, addresses):
     assert list(own_folder.iterdir()) == []
 
 
-def test_a_folder_accessible_to_others_is_refused(own_folder, addresses, monkeypatch, tmp_path):
-    own_folder.mkdir(mode=0o755)
+def test_a_folder_that_others_can_write_to_is_refused(own_folder, addresses, monkeypatch, tmp_path):
+    own_folder.mkdir()
+    own_folder.chmod(0o777)
     monkeypatch.setattr("softfinger.daemon.wire.local_stop._folders", lambda: iter([own_folder]))
-    with pytest.raises(AddressError, match="is not private to this user"):
+    with pytest.raises(AddressError, match="other users can write to it"):
         LocalStop(addresses[1])
     own_folder.rmdir()
     own_folder.symlink_to(tmp_path)
-    with pytest.raises(AddressError, match="is not private to this user"):
+    with pytest.raises(AddressError, match="found a link or a file, expected a folder"):
         LocalStop(addresses[1])
     assert stop_locally(addresses[1], 0.1) is None
 
@@ -270,6 +271,21 @@ def test_a_stop_for_another_machine_has_no_effect_here(own_folder, addresses):
     for host in ("hand.example", "192.0.2.1", "127.0.0.2"):
         assert stop_locally(f"tcp://{host}:{place(addresses[1])[1]}", 0.1) is None
     assert not local.take()
+    local.close()
+
+
+@pytest.mark.parametrize(
+    ("bound", "asked"),
+    [
+        ("tcp://192.0.2.1:9873", "tcp://192.0.2.1:9873"),
+        ("tcp://[::1]:9873", "tcp://[::1]:9873"),
+        ("tcp://0.0.0.0:9873", "tcp://localhost:9873"),
+    ],
+)
+def test_a_local_stop_reaches_the_daemon_at_its_command_address(own_folder, bound, asked):
+    local = LocalStop(bound)
+    assert stop_locally(asked, 0.01) is None, "a stop must not be confirmed before it is read"
+    assert local.take()
     local.close()
 
 

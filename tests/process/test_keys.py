@@ -15,7 +15,8 @@ import zmq.auth
 from softfinger import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
-from softfinger.daemon.gateway.endpoints import Admission, RestartNeeded
+from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.endpoints import ClientSockets, RestartNeeded
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import Addresses, until
 from tests.harness.gateway import Served
@@ -112,27 +113,27 @@ def test_keys_that_others_own_or_may_write_are_refused(folder, which, monkeypatc
         load_server(folder)
 
 
-def test_client_keys_are_still_revoked_without_free_file_descriptors(folder, context, monkeypatch):
+def test_client_keys_are_still_revoked_without_free_file_descriptors(folder, monkeypatch):
     def no_descriptor_left(path: Path) -> NoReturn:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), str(path))
 
-    keys = Admission(context, folder)
+    keys = ClientSockets(Config("", "", [], 100, keys=str(folder)))
     clients = folder / "server" / "clients"
     try:
         monkeypatch.setattr(zmq.auth, "load_certificate", no_descriptor_left)
         with pytest.raises(NoDescriptor):
             load_server(folder)
-        keys.look(1.0)
+        keys.authenticate(1.0)
         (clients / "alice.key").unlink()
         with pytest.raises(
             RestartNeeded, match="disconnected the clients that have no key file: alice"
         ):
-            keys.look(2.0)
+            keys.authenticate(2.0)
         clients.chmod(0o777)
         with pytest.raises(RestartNeeded, match="other users can write to it"):
-            keys.look(3.0)
+            keys.authenticate(3.0)
     finally:
-        keys.stop()
+        keys.close()
 
 
 # --- sockets ----------------------------------------------------------------------------------
@@ -222,7 +223,7 @@ def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addr
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.server.raise_fence()  # Every stop raises a fence.
+        guarded.served.link.fence()  # Every stop raises a fence.
         guarded.step()
         return stopper.poll(0)
 

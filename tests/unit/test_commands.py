@@ -15,9 +15,10 @@ import zmq
 from softfinger.daemon.client.command_client import send
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.control.modes import COMMANDS, Mode
-from softfinger.daemon.errors import Reason, Refused
+from softfinger.daemon.errors import AddressError, Reason, Refused
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.endpoints import bind
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
 from softfinger.daemon.loop.loop import command_age_max
@@ -117,7 +118,7 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
         asking = Asking(context, served, addresses[1], "status")
         queue = served.service.commands
         until(lambda: [served.settle(1), len(served.link.asked) + queue.count == 2][1])
-        served.server.raise_fence()
+        served.link.fence()
         assert early.told()["reason"] == "stopped"
         assert asking.told() == {"ok": True, "heard": "status"}, (
             "other requests must not be affected"
@@ -145,7 +146,7 @@ def test_a_request_passes_few_functions(context, addresses):
         asking = Asking(context, served, addresses[1], "arm")
         asking.told()
         asking.send("arm")
-        until(lambda: served.service.commands.socket.poll(0))
+        until(served.has_request)
         sys.setprofile(note)
         try:
             until(lambda: [served.serve(hear), heard][1])
@@ -256,7 +257,7 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
         elif stalled == "gateway":
             # libzmq has received the request or is about to receive it, so its waiting time is
             # unknown.
-            until(lambda: served.service.commands.socket.poll(0))
+            until(served.has_request)
         pass_time(clock, 0.5)
         # After the stall, libzmq's own thread may run later than the gateway's check.
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
@@ -297,7 +298,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
             pass_time(clock, bounds.REFUSAL_TIME / 2)
             served.serve(aged)
         if meanwhile == "signal":
-            served.server.raise_fence()
+            served.link.fence()
         elif meanwhile:
             other = Asking(context, served, addresses[1], meanwhile)
             until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
@@ -327,11 +328,11 @@ def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses
     """After a gap, libzmq's thread may still deliver requests sent before a stop."""
     clock, aged = VirtualClock(), Aged()
     with Served(commands=addresses[1], clock=clock) as served:
-        served.server.raise_fence()
+        served.link.fence()
         served.settle()
         pass_time(clock, 2.0 * bounds.POLL_GAP_MAX)
         served.settle()
-        assert served.link.stops == 0
+        assert served.link.confirmed == 0
         until(lambda: served._is_open())
         asking = Asking(context, served, addresses[1], "arm")
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
@@ -395,7 +396,7 @@ def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
 
 def test_stop_is_accepted_with_unknown_fields():
     more = {"client": "a", "how": ["now"], b"x": 4}
-    assert decode(msgpack.packb({"command": "stop", **more})) == {"command": "stop", "client": "a"}
+    assert decode(msgpack.packb({"command": "stop", **more})) == {"command": "stop"}
     with pytest.raises(Refused, match="numbers or strings as values"):
         decode(msgpack.packb({"command": "arm", "how": ["now"]}))
 
@@ -502,7 +503,7 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
         def all_answered() -> bool:
             served.serve(echo)
             flood.collect(replies)
-            return served.server.refused_by_pace == 40 and quiet.collect(kind) == 3
+            return served.link.refused == 40 and quiet.collect(kind) == 3
 
         until(all_answered)
         until(lambda: [served.serve(echo), flood.collect(replies) == 60][1])
@@ -547,6 +548,11 @@ def test_an_ipc_file_has_the_configured_permissions(tmp_path_factory, mode):
     assert list(folder.iterdir()) == []
 
 
+def test_an_ipc_path_that_cannot_be_examined_is_reported(context):
+    with pytest.raises(AddressError, match="File name too long"):
+        bind(context.socket(zmq.REP), f"ipc:///tmp/{'x' * 300}", 0o600)
+
+
 def test_a_signal_while_sockets_are_created_ends_the_start_up(monkeypatch, addresses):
     made: list[Gateway] = []
 
@@ -564,7 +570,7 @@ def test_a_signal_while_sockets_are_created_ends_the_start_up(monkeypatch, addre
     with pytest.raises(KeyboardInterrupt):
         build.Daemon(Settings.model_validate(wire))
     with pytest.raises(ProcessLookupError):
-        os.kill(made[0].process, 0)
+        os.kill(made[0].process.pid, 0)
 
 
 def heard(mode: Mode) -> set[str]:

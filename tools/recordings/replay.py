@@ -154,6 +154,7 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
 # Maximum number of messages queued for a subscriber. Excess messages are lost.
 _QUEUE_LENGTH = 10_000
 _SEND_TIMEOUT = 1.0  # timeout for the gateway to accept a message [s]
+_POLL_INTERVAL = 1e-3  # s
 
 
 class Wire:
@@ -169,7 +170,7 @@ class Wire:
             raise RecordingError(f"--address: {fault}")
         folder = "" if keys is None else str(keys)
         config = Config(
-            address, "", GATEWAY_TOPICS, _QUEUE_LENGTH, keys=folder, stream_key="--address"
+            address, "", GATEWAY_TOPICS, _QUEUE_LENGTH, keys=folder, stream_setting="--address"
         )
         self._gateway = Gateway(config)
         try:
@@ -180,15 +181,18 @@ class Wire:
         self._link = self._gateway.link
 
     def subscribed(self, seconds: float) -> bool:
-        """Wait up to ``seconds`` for new subscriptions; return True if there are subscribers."""
-        self._link.wait(seconds)
+        """Wait for ``seconds``; return True if there are subscribers."""
+        time.sleep(seconds)
+        self._link.look()
         return bool(self._link.wanted)
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
         """Publish one message as soon as the gateway can accept it."""
         if topic not in schema.TOPICS:  # The topic comes from another version.
             return
-        self._link.wait_for_room(_SEND_TIMEOUT)
+        give_up = time.monotonic() + _SEND_TIMEOUT
+        while not self._link.look() and time.monotonic() < give_up:
+            time.sleep(_POLL_INTERVAL)
         index = GATEWAY_TOPICS.index(topic.decode())
         self._link.publish(index, pack(message), REPEATED_COUNTS.get(topic, 0))
 
