@@ -32,7 +32,7 @@ from softfinger.kinematics.estimation.state import (
 )
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import Weights
-from softfinger.kinematics.sensing.springs_pressure import points_in
+from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
 # Clipping the noise at 0 raises the sums over neighbourhoods. Raising the detection level by this
 # amount restores the false alarm rate.
@@ -252,11 +252,11 @@ def estimate_frame(
 
     ``frame`` is float64 [cells] in counts, ``scale`` is in Pa per count, and ``step`` is the
     quantum size [Pa] or 0. ``rows`` stores the `state.Cells`. ``pixels`` and ``weights`` are the
-    `state.Images` of a solid tip. The remaining arguments are the `PointArrays` of a spring tip.
+    `state.Images` of a solid tip. The remaining arguments are the `SpringPoints` of a spring tip.
     """
     state = states[0]
     cells = cells_in(rows, state.grid)
-    points = points_in(line, inverse, y, across, along, law, sums)
+    points = SpringPoints(line, inverse, y, across, along, law, sums)
     model = Model(points, Images(pixels, weights[0]))
     estimate = state.estimate
     signal = state.signal

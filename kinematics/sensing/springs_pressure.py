@@ -37,6 +37,7 @@ FloatArray = NDArray[np.float64]
 
 STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its partials in d, n_x and n_y
 PLANES = 4
+POINT_X, STRAIN, SLOPE, FACTOR, POINT_STRESS = range(5)  # rows of `SpringPoints.line`
 Cells = tuple[int, int]  # half-open range
 _SPREAD_MIN = 1e-12
 # Gauss-Legendre rule on the rectangle of a point, scaled to a width of 1.
@@ -48,50 +49,19 @@ class SpringPoints(NamedTuple):
 
     Each row of points is one array. Each array contains the points at the first position in each
     cell, followed by the points at the second position, and so on. The array also includes cells
-    outside the grid that are within the range of the blur. One-dimensional arrays allow vectorised
-    loops.
+    outside the grid that are within the range of the blur.
     """
 
-    x: FloatArray  # distance from the tip centre in x [m], one row
-    strain: FloatArray  # scratch, one row
-    slope: FloatArray
-    factor: FloatArray
-    stress: FloatArray
-    inverse: FloatArray  # means of 1/ℓ, all rows
-    inverse_x: FloatArray  # means of x/ℓ
-    inverse_y: FloatArray
+    line: FloatArray  # [5, row]: x from the tip centre [m], and scratch; see the row numbers
+    inverse: FloatArray  # means of 1/ℓ, x/ℓ and y/ℓ [3, all rows]
     y: FloatArray  # one value per row
     across: FloatArray  # weights along x [position, cell offset], see `blur.axis_points`
     along: FloatArray  # weights along y
-    law: FloatArray  # coefficients of the material's σ(ε), by increasing powers
-    sums: FloatArray  # scratch, three rows of cells
+    law: FloatArray  # σ(ε) coefficients of the material, by increasing powers
+    sums: FloatArray  # scratch, three rows of cells [3, cells]
 
 
-class PointArrays(NamedTuple):
-    """`SpringPoints` stored in few arrays, because each array argument of a kernel costs time."""
-
-    line: FloatArray  # [5, row]
-    inverse: FloatArray  # [3, all rows]
-    y: FloatArray
-    across: FloatArray
-    along: FloatArray
-    law: FloatArray
-    sums: FloatArray
-
-
-@inner_kernel
-def points_in(
-    line: FloatArray, inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray,
-    law: FloatArray, sums: FloatArray,
-) -> SpringPoints:  # fmt: skip
-    """Return the points stored in the arrays of :class:`PointArrays`."""
-    return SpringPoints(
-        line[0], line[1], line[2], line[3], line[4], inverse[0], inverse[1], inverse[2],
-        y, across, along, law, sums,
-    )  # fmt: skip
-
-
-def points_of(cells: Grid, material: Material, blur: float, count: tuple[int, int]) -> PointArrays:
+def points_of(cells: Grid, material: Material, blur: float, count: tuple[int, int]) -> SpringPoints:
     """Return the sample points of the cells, with ``count`` (x, y) points per cell side."""
     a = cells.radius
     x, across = axis_points(cells.x, cells.pitch_x, cells.cols, count[0], blur)
@@ -111,7 +81,7 @@ def points_of(cells: Grid, material: Material, blur: float, count: tuple[int, in
     line = np.zeros((5, len(x)))
     line[0] = x
     flat = inverse.reshape(3, -1)
-    return PointArrays(line, flat, y, across, along, material.law, np.zeros(3 * cells.cols))
+    return SpringPoints(line, flat, y, across, along, material.law, np.zeros((3, cells.cols)))
 
 
 @inlined_kernel
@@ -136,10 +106,10 @@ def _set_strains(
     size_x, size_y = half
     rim = a2 - y * y
     least = _SPREAD_MIN * a2 * math.sqrt(a2)
+    line = points.line
     for k in range(first, last):
-        x = points.x[k]
-        # The strain ε is positive where f = ℓ² − z² > 0. Up to the rim and beyond, f is almost
-        # linear.
+        x = line[POINT_X, k]
+        # ε > 0 where f = ℓ² − z² > 0; f is almost linear up to the rim and beyond.
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
         # Width of the uniform distribution of f. The exact width is 4 (big + small²/(3 big)). With
@@ -159,44 +129,36 @@ def _set_strains(
         # Means of ε and 1/ℓ if f is uniformly distributed from 0 to ``part``.
         length = math.sqrt(z * z + part)
         mean = part / (spread * (length + z) + least)
-        g = points.inverse[row + k]
-        whole = 1.0 - (u * g - v * points.inverse_x[row + k] - w * points.inverse_y[row + k])
+        g = points.inverse[0, row + k]
+        whole = 1.0 - (u * g - v * points.inverse[1, row + k] - w * points.inverse[2, row + k])
         cut = part < spread
         strain = (length - z) * mean if cut else whole
         slope = 2.0 * mean if cut else g
-        points.strain[k] = min(max(strain, 0.0), 1.0)
-        points.slope[k] = slope if (strain < 1.0) & (z > 0.0) else 0.0
+        line[STRAIN, k] = min(max(strain, 0.0), 1.0)
+        line[SLOPE, k] = slope if (strain < 1.0) & (z > 0.0) else 0.0
 
 
 @inlined_kernel
-def _start_stresses(points: SpringPoints, first: int, last: int, highest: float) -> None:
-    for k in range(first, last):
-        points.stress[k] = highest
-        points.factor[k] = 0.0
-
-
-@inlined_kernel
-def _raise_power(points: SpringPoints, first: int, last: int, coefficient: float) -> None:
+def _raise_power(line: FloatArray, first: int, last: int, coefficient: float) -> None:
     """Perform one step of Horner's scheme for σ(ε) and its derivative."""
     for k in range(first, last):
-        strain = points.strain[k]
-        points.factor[k] = points.factor[k] * strain + points.stress[k]
-        points.stress[k] = points.stress[k] * strain + coefficient
+        strain = line[STRAIN, k]
+        line[FACTOR, k] = line[FACTOR, k] * strain + line[POINT_STRESS, k]
+        line[POINT_STRESS, k] = line[POINT_STRESS, k] * strain + coefficient
 
 
 @inlined_kernel
-def _sum_points(
-    points: SpringPoints, first: int, last: int, ahead: int, cols: int, weight: float
-) -> None:
+def _sum_points(points: SpringPoints, first: int, last: int, ahead: int, weight: float) -> None:
     """Add the points at the index offset ``ahead`` to the sums of cells ``first`` to ``last``.
 
     The three sums are the stress, its partial in −u, and this partial times x.
     """
+    line = points.line
     for k in range(first, last):
-        slope = weight * points.slope[ahead + k] * points.factor[ahead + k]
-        points.sums[k] += weight * points.stress[ahead + k]
-        points.sums[cols + k] += slope
-        points.sums[cols + cols + k] += slope * points.x[ahead + k]
+        slope = weight * line[SLOPE, ahead + k] * line[FACTOR, ahead + k]
+        points.sums[0, k] += weight * line[POINT_STRESS, ahead + k]
+        points.sums[1, k] += slope
+        points.sums[2, k] += slope * line[POINT_X, ahead + k]
 
 
 @inlined_kernel
@@ -208,33 +170,26 @@ def _press_line(
     Returns the range of affected cells.
     """
     places, reach = points.across.shape
-    wide = points.x.shape[0] // places
-    cols = points.sums.shape[0] // 3
+    wide = points.line.shape[1] // places
+    cols = points.sums.shape[1]
     law = points.law
     order = law.shape[0]
     low = max(first - reach + 1, 0)
     high = min(last, cols)
-    for j in range(low, high):
-        points.sums[j] = points.sums[cols + j] = points.sums[2 * cols + j] = 0.0
+    points.sums[:, low:high] = 0.0
     row = index(i * places * wide)
     for m in range(places):
         begin = index(m * wide + first)
         end = index(m * wide + last)
         _set_strains(points, row, begin, end, points.y[i], face, a2, half)
-        _start_stresses(points, begin, end, law[order - 1])
-        for j in range(order - 2, -1, -1):
-            _raise_power(points, begin, end, law[j])
+        points.line[FACTOR:, begin:end] = 0.0
+        for j in range(order - 1, -1, -1):
+            _raise_power(points.line, begin, end, law[j])
         for q in range(reach):
             start = max(first - q, 0)
             count = min(last - q, cols) - start
-            _sum_points(
-                points,
-                index(start),
-                index(start + count),
-                index(m * wide + q),
-                index(cols),
-                points.across[m, q],
-            )
+            ahead = index(m * wide + q)
+            _sum_points(points, index(start), index(start + count), ahead, points.across[m, q])
     return low, high
 
 
@@ -254,14 +209,13 @@ def _add_row(
     v = face.v
     w = face.w
     c = weight * math.sqrt(1.0 + v * v + w * w)
-    cols = points.sums.shape[0] // 3
     for j in range(low, high):
         # Partials of the pressure with respect to −u, v and w.
-        by_u = points.sums[cols + j]
-        by_v = points.sums[2 * cols + j]
+        by_u = points.sums[1, j]
+        by_v = points.sums[2, j]
         by_w = y * by_u
         along = v * by_v + w * by_w - u * by_u
-        out[STRESS, row, j] += weight * points.sums[j]
+        out[STRESS, row, j] += weight * points.sums[0, j]
         out[BY_D, row, j] += c * by_u
         out[BY_X, row, j] += c * (by_v + v * along)
         out[BY_Y, row, j] += c * (by_w + w * along)
@@ -289,12 +243,9 @@ def press_springs(
     last_row = min((last_line + count_y - 1) // count_y, grid.rows)
     if not first_row < last_row or first_line == last_line:
         return 0, 0
-    for plane in range(PLANES):
-        for i in range(first_row, last_row):
-            for j in range(grid.cols):
-                out[plane, i, j] = 0.0
-    start = points.x[0] - size_x
-    wide = points.x.shape[0] // count_x
+    out[:, first_row:last_row] = 0.0
+    start = points.line[POINT_X, 0] - size_x
+    wide = points.line.shape[1] // count_x
     for i in range(first_line, last_line):
         y = points.y[i]
         left, right = line_span(around, a, y)
@@ -317,7 +268,7 @@ def render(
     sums: FloatArray,
 ) -> Cells:  # fmt: skip
     """Run :func:`press_springs` with the first of ``faces``; the second is scratch memory."""
-    points = points_in(line, inverse, y, across, along, law, sums)
+    points = SpringPoints(line, inverse, y, across, along, law, sums)
     return press_springs(points, grids[0], faces[0], faces[1], planes)
 
 
