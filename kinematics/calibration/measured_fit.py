@@ -11,14 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger import SoftfingerError
-from softfinger.kinematics.contact.tip_curves import (
-    POWERS,
-    SQUARES,
-    Curve,
-    FloatArray,
-    TipCurves,
-    rises,
-)
+from softfinger.kinematics.compiled.layout import FloatArray
+from softfinger.kinematics.contact.tip_curves import POWERS, SQUARES, Curve, TipCurves, rises
 from softfinger.kinematics.estimation.measured import sum_weights
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 

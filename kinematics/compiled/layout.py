@@ -29,6 +29,8 @@ from typing import Annotated, Any, Generic, Protocol, Self, TypeVar, get_type_hi
 import numpy as np
 from numpy.typing import NDArray
 
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 Pair = Annotated[NDArray[np.float64], 2]  # (left, right)
 Each = TypeVar("Each", bound="Record", covariant=True)
 

@@ -1,9 +1,9 @@
 """Exact contact formulas for a soft hemispherical fingertip of constant modulus on a plane.
 
-The module defines the fingertip's geometry and computes force, energy and partial derivatives, both
-for arrays and as kernels. The tip is a hemisphere of radius a on a rigid base. Each point of the
-base carries an independent spring that is normal to the base. The object's face is displaced by d
-along its normal, which is tilted by θ from the base normal. With h = a − d:
+The module defines the fingertip's geometry and computes force, energy and partial derivatives. The
+tip is a hemisphere of radius a on a rigid base. Each point of the base carries an independent
+spring that is normal to the base. The object's face is displaced by d along its normal, which is
+tilted by θ from the base normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
@@ -19,14 +19,13 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from softfinger.kinematics.compiled.kernel import inner_kernel
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.tip_curves import TipCurves
 
 __all__ = ["ClosedForms", "Fingertip", "closed_forms"]
 
-FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
 RADIUS_MAX = 1.0  # maximum radius [m]; a larger value was probably given in millimetres
@@ -117,18 +116,6 @@ class ClosedForms(NamedTuple):
     force_theta: FloatArray  # ∂F/∂θ [N/rad]
     energy_d: FloatArray  # ∂U/∂d, the force along the face's normal [N]
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
-
-
-@inner_kernel
-def theta_limit(radius: float, d: float) -> float:
-    """Return asin((a − d)/a) [rad], clamped to [0, π/2]; NaN input gives NaN."""
-    if d <= 0.0:
-        return HALF_PI
-    if d >= radius:
-        return 0.0
-    h = radius - d
-    # cos θ is the footprint radius divided by a. Unlike asin(h/a), it is accurate for small d.
-    return math.atan2(h, math.sqrt(d * (radius + h)))
 
 
 def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:

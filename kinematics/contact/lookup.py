@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
-from softfinger.kinematics.compiled.layout import Records
-from softfinger.kinematics.contact.closed_form import theta_limit
+from softfinger.kinematics.compiled.layout import FloatArray, Records
+from softfinger.kinematics.contact.closed_form import HALF_PI
 from softfinger.kinematics.contact.solid_lookup import (
     solid_lookup,
     solid_normal,
-    solid_stiffness_ahead,
 )
 from softfinger.kinematics.contact.table_record import (
     OCTAVES,
@@ -38,9 +37,6 @@ from softfinger.kinematics.contact.table_record import (
     lanes,
 )
 
-FloatArray = NDArray[np.float64]
-
-HALF_PI = math.pi / 2
 H_END = 0.5**OCTAVES  # h at the end of the domain
 _H_MIN = H_END * (1.0 + 2.0**-52)  # smallest number above H_END
 _END = H_END * (1.0 - 1e-12)  # limit of h at the end of the domain, with a margin for rounding
@@ -77,11 +73,6 @@ def _ratios(table: Table, h: float, y: float) -> Lanes:
 @inner_kernel
 def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate :func:`lookup` for a spring tip."""
-    if math.isnan(d) or math.isnan(theta):
-        nan = math.nan
-        return nan, nan, nan, nan, nan, nan, False
-    if d <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
     radius = table.radius
     h = (radius - d) * table.inverse_radius
     inside = h >= _END
@@ -92,7 +83,7 @@ def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
     c = math.cos(theta)
     gap = c * c - d * table.inverse_radius * (1.0 + h)
     if not (gap >= 0.0 and abs(theta) <= HALF_PI):
-        limit = theta_limit(radius, d)
+        limit = math.atan2(h, math.sqrt(d * table.inverse_radius * (1.0 + h)))
         # Because of rounding, a point exactly at the limit may reach this branch.
         inside = inside and abs(theta) <= limit * (1.0 + 1e-12)
         angle = min(max(theta, -limit), limit)
@@ -123,6 +114,11 @@ def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
 @inner_kernel
 def lookup_at(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate :func:`lookup` for a single table record."""
+    if math.isnan(d) or math.isnan(theta):
+        nan = math.nan
+        return nan, nan, nan, nan, nan, nan, False
+    if d <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
     if table.is_solid:
         return solid_lookup(table, d, theta)
     return _springs_lookup(table, d, theta)
@@ -145,11 +141,13 @@ def normal_at(
 
 @inner_kernel
 def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
-    """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m].
+    """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m], for a solid tip by Hertz's theory.
 
     ``scale`` is 2πE [Pa], where E is the modulus at zero strain.
     """
-    return solid_stiffness_ahead(table, scale, depth) if table.is_solid else scale * depth
+    if not table.is_solid:
+        return scale * depth
+    return 0.5 * scale / math.pi * 3.75 * table.at_first * math.sqrt(depth * table.radius)
 
 
 @kernel

@@ -13,14 +13,13 @@ from fractions import Fraction
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from softfinger.kinematics.compiled.kernel import inner_kernel
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.material_fit import MaterialError, fit_law
 
 __all__ = ["Material"]
 
-FloatArray = NDArray[np.float64]
 
 # Measured tangent modulus [Pa] of the polyurethane tip versus strain, from Table I of the paper.
 # The paper also gives the maximum modulus, 0.304 MPa, at strains above 100 %.
@@ -31,26 +30,6 @@ TABLE_I_MAXIMUM = 0.304e6
 # through these values and has zero slope at zero strain. The stress σ is the integral of the
 # modulus.
 _TABLE_I = "135000 0 610000/9 4671875/12 -3015625/3 14453125/18 -4296875/21"
-
-
-@inner_kernel
-def stress_at(law: FloatArray, strain: float) -> float:
-    """Return σ(ε) [Pa] of ``law`` [order]; 0 for ε ≤ 0, extrapolated linearly above ε = 1."""
-    if strain <= 0.0:
-        return 0.0
-    order = law.shape[0]
-    if not strain < 1.0:
-        value: float = 0.0
-        slope: float = 0.0
-        for j in range(order):
-            value += law[j]
-            slope += j * law[j]
-        more: float = strain - 1.0
-        return value + more * slope
-    result: float = law[order - 1]
-    for j in range(order - 2, -1, -1):
-        result = result * strain + law[j]
-    return result
 
 
 @dataclass(frozen=True)

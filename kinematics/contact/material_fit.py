@@ -10,13 +10,13 @@ import math
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from softfinger import SoftfingerError
+from softfinger.kinematics.compiled.layout import FloatArray
 
 __all__ = ["MaterialError"]
 
-FloatArray = NDArray[np.float64]
 
 MIN_POINTS = 4
 _DEGREES = range(11)  # polynomial degrees of the modulus, in the order in which they are tried
@@ -60,15 +60,10 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
             f"{y[i]:.6g} Pa"
         )
     top = float(np.max(np.abs(y))) if y.size else 0.0
-    if x.size and abs(x[0]) <= 1e-9 and abs(y[0]) > 1e-3 * top:
-        wrong.append(
-            f"the curve must start at zero stress, but its first point has {y[0]:.6g} Pa at zero "
-            "strain; subtract this offset first"
-        )
-    elif x.size and x[0] > 1e-9 and y[0] <= 0.0:
+    if x.size and (abs(y[0]) > 1e-3 * top if abs(x[0]) <= 1e-9 else x[0] > 0.0 >= y[0]):
         wrong.append(
             f"the curve must start at zero stress, but its first point has {y[0]:.6g} Pa at "
-            f"strain {x[0]:.6g}"
+            f"strain {x[0]:.6g}; subtract the offset first"
         )
     if not wrong and x[-1] > 2.0:
         wrong.append(f"strain reaches {x[-1]:.6g}; strain must be a ratio, not a percentage")

@@ -20,21 +20,16 @@ as the face approaches the rim.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.contact.closed_form import (
-    ClosedForms,
-    Fingertip,
-    closed_forms,
-    flatten,
-)
+from softfinger.kinematics.compiled.layout import FloatArray
+from softfinger.kinematics.contact.closed_form import ClosedForms, Fingertip, closed_forms, flatten
 from softfinger.kinematics.contact.material import Material
-
-FloatArray = NDArray[np.float64]
 
 # Number of Gauss points per piece. With 14 points, ∂F/∂θ has an error of 1e-10. With 18 points,
 # only rounding errors remain.
@@ -57,11 +52,6 @@ def circle_rule(degree: int) -> FloatArray:
     return np.stack([np.cos(angles), np.sin(angles) ** 2])
 
 
-def nodes_for(degree: int) -> int:
-    """Return the number of Gauss points per piece for a material law of ``degree``."""
-    return _NODES if degree <= 8 else _NODES_HIGH_DEGREE
-
-
 @inner_kernel
 def _horner(table: FloatArray, row: int, u: float) -> float:
     order = table.shape[1]
@@ -72,15 +62,10 @@ def _horner(table: FloatArray, row: int, u: float) -> float:
 
 
 @inner_kernel
-def ratios(
-    gauss: FloatArray,
-    circle: FloatArray,
-    polynomials: FloatArray,
-    delta: float,
-    h: float,
-    s: float,
-    c: float,
-) -> tuple[float, float, float, float, float]:
+def _ratios(
+    gauss: FloatArray, circle: FloatArray, polynomials: FloatArray,
+    delta: float, h: float, s: float, c: float,
+) -> tuple[float, float, float, float, float]:  # fmt: skip
     """Return the ratios of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ to their closed forms for modulus E₀.
 
     The integrals use
@@ -118,6 +103,7 @@ def ratios(
     first_s = polynomials[0, 0]
     first_t = polynomials[2, 0]
     count = circle.shape[1]
+    share = 1.0 / count
     nodes = gauss.shape[1]
     # The integrand has poles at y² = −2 sin θ and, unless y0 = 0, at y = 0. For h = 0, the
     # integrand has no poles.
@@ -152,17 +138,12 @@ def ratios(
             for j in range(count):
                 strain = mean + amplitude * circle[0, j]
                 u = min(max(strain, 0.0), 1.0)
-                a_s1 += _horner(polynomials, 0, u)
-                a_w1 += _horner(polynomials, 1, u)
-                a_t1 += _horner(polynomials, 2, u)
-                curvature = circle[1, j] * t * q / p2
-                a_s2 += _horner(polynomials, 3, u) + curvature * _horner(polynomials, 4, u)
-                a_t2 += _horner(polynomials, 5, u) + curvature * _horner(polynomials, 6, u)
-            a_s1 /= count
-            a_w1 /= count
-            a_t1 /= count
-            a_s2 /= count
-            a_t2 /= count
+                a_s1 += share * _horner(polynomials, 0, u)
+                a_w1 += share * _horner(polynomials, 1, u)
+                a_t1 += share * _horner(polynomials, 2, u)
+                curvature = share * circle[1, j] * t * q / p2
+                a_s2 += share * _horner(polynomials, 3, u) + curvature * _horner(polynomials, 4, u)
+                a_t2 += share * _horner(polynomials, 5, u) + curvature * _horner(polynomials, 6, u)
             dv = gauss[1, i] * width * 2.0 * y / delta
             scale = dv / (c * p)
             sum_f += scale * v * v * a_s1
@@ -184,20 +165,37 @@ def ratios(
 
 @kernel
 def ratios_at(
-    gauss: FloatArray,
-    circle: FloatArray,
-    polynomials: FloatArray,
+    gauss: FloatArray, circle: FloatArray, polynomials: FloatArray,
+    delta: FloatArray, h: FloatArray, s: FloatArray, c: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Evaluate :func:`_ratios` at each of δ, h, s and c [n] into ``out`` [5, n]."""
+    for i in range(delta.shape[0]):
+        out[0, i], out[1, i], out[2, i], out[3, i], out[4, i] = _ratios(
+            gauss, circle, polynomials, delta[i], h[i], s[i], c[i]
+        )
+
+
+@lru_cache(maxsize=8)
+def _rules(material: Material, nodes: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return gauss_rule(nodes), circle_rule(material.degree), material.expansions()
+
+
+def ratios(
+    material: Material,
     delta: FloatArray,
     h: FloatArray,
     s: FloatArray,
     c: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Evaluate :func:`ratios` at each of δ, h, s and c [n] into ``out`` [5, n]."""
-    for i in range(delta.shape[0]):
-        (out[0, i], out[1, i], out[2, i], out[3, i], out[4, i]) = ratios(
-            gauss, circle, polynomials, delta[i], h[i], s[i], c[i]
-        )
+    nodes: int | None = None,
+) -> FloatArray:
+    """Return the ratios [5, n] of a material law at δ, h, s and c [n]; see :func:`_ratios`.
+
+    ``nodes`` is the number of Gauss points per piece; by default it depends on the law's degree.
+    """
+    out = np.empty((5, delta.size))
+    usual = _NODES if material.degree <= 8 else _NODES_HIGH_DEGREE
+    ratios_at(*_rules(material, nodes or usual), delta, h, s, c, out)
+    return out
 
 
 def integrate(
@@ -206,8 +204,8 @@ def integrate(
     """Integrate force, energy and first partials for any material, to a relative error of 1e-14.
 
     ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. The results are NaN
-    outside the domain, which ends at d = a and at the limit on θ. ``nodes`` is the number of Gauss
-    points per piece; by default it depends on the degree of the law.
+    outside the domain, which ends at d = a and at the limit on θ. ``nodes`` is as in
+    :func:`ratios`.
     """
     shape, (depth, tilt) = flatten(d, theta)
     radius = tip.radius
@@ -215,18 +213,14 @@ def integrate(
     within = np.flatnonzero(inside)
     found = np.full((5, depth.size), np.nan)
     found[:, depth <= 0.0] = 1.0
-    some = np.empty((5, within.size))
-    ratios_at(
-        gauss_rule(nodes or nodes_for(material.degree)),
-        circle_rule(material.degree),
-        material.expansions(),
+    found[:, within] = ratios(
+        material,
         depth[within] / radius,
         (radius - depth[within]) / radius,
         np.abs(np.sin(tilt[within])),
         np.cos(tilt[within]),
-        some,
+        nodes,
     )
-    found[:, within] = some
     r_f, r_u, r_fd, r_ft, r_ut = found
     closed = closed_forms(material.reference_modulus, depth, tilt)
     six = (

@@ -32,9 +32,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip
-
-FloatArray = NDArray[np.float64]
 
 _FILE = Path(__file__).with_name("solid_tip.npz")
 

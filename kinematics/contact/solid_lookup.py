@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import HALF_PI, Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.material_fit import MaterialError
-from softfinger.kinematics.contact.solid_data import FloatArray, solid_data, with_partials
+from softfinger.kinematics.contact.solid_data import solid_data, with_partials
 from softfinger.kinematics.contact.table_record import (
     Lanes,
     SixFloats,
@@ -67,9 +68,14 @@ def _table(radius: float, root: float, square: float, energy: FloatArray) -> Tab
 
 
 @inlined_kernel
-def energy_lanes(table: Table, t: float, square: float) -> Lanes:
-    """Return g(t, sin² θ), ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ."""
-    return lanes(table, ENERGY, t * table.by_root - 1.0, square * table.by_square - 1.0)
+def normal_force(table: Table, t: float, square: float) -> Lanes:
+    """Return N/a² [Pa], its partials in d and sin² θ, U/a³ [Pa] and its partial in sin² θ."""
+    place = t * table.by_root - 1.0, square * table.by_square - 1.0
+    g, g_t, g_tt, g_s, g_ts = lanes(table, ENERGY, *place)
+    size = table.modulus * t * t * t
+    by_d = 0.25 * table.modulus * table.inverse_radius * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
+    by_square = size * (2.5 * g_s + 0.5 * t * g_ts)
+    return size * (2.5 * g + 0.5 * t * g_t), by_d, by_square, size * t * t * g, size * t * t * g_s
 
 
 @inlined_kernel
@@ -90,11 +96,6 @@ def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     If |θ| is beyond the data, the energy is assumed not to depend on θ, and the partials are those
     of this energy. The force continues to vary with cos θ.
     """
-    if math.isnan(d) or math.isnan(theta):
-        nan = math.nan
-        return nan, nan, nan, nan, nan, nan, False
-    if d <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
     within = abs(theta) <= table.tilt
     inside = within and d <= table.deepest
     angle = min(max(theta, -HALF_PI), HALF_PI)
@@ -102,32 +103,21 @@ def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     c = math.cos(angle)
     t = math.sqrt(min(d, table.deepest) * table.inverse_radius)
     square = s * s if within else 2.0 / table.by_square
-    g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, square)
     # The chain rule gives d(sin² θ)/dθ = 2 sin θ cos θ.
     chain = 2.0 * s * c if within else 0.0
     a = table.radius
-    size = table.modulus * a * a * t * t * t
-    depth = a * t * t
-    normal = size * (2.5 * g + 0.5 * t * g_t)
-    stiffness = 0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
-    normal_theta = chain * size * (2.5 * g_s + 0.5 * t * g_ts)
+    area = a * a
+    normal, stiffness, normal_s, energy, energy_s = normal_force(table, t, square)
     held, held_t, held_s = _clamped(table, t, square)
     return (
-        c * normal * held,
-        size * depth * g,
-        c * (stiffness * held + normal * held_t * 0.5 / (a * t)),
-        (c * normal_theta - s * normal) * held + c * normal * chain * held_s,
-        normal,
-        chain * size * depth * g_s,
+        c * area * normal * held,
+        a * area * energy,
+        c * area * (stiffness * held + normal * held_t * 0.5 / (a * t)),
+        area * ((c * chain * normal_s - s * normal) * held + c * normal * chain * held_s),
+        area * normal,
+        chain * a * area * energy_s,
         inside,
     )
-
-
-@inner_kernel
-def solid_stiffness_ahead(table: Table, scale: float, depth: float) -> float:
-    """Evaluate `lookup.stiffness_ahead` using Hertz's ∂N/∂d at d = ``depth``."""
-    stiffness = 0.5 * scale / math.pi * 3.75 * table.at_first
-    return stiffness * math.sqrt(depth * table.radius)
 
 
 @inner_kernel
@@ -136,12 +126,8 @@ def solid_normal(table: Table, d: float, theta: float) -> ThreeFloats:
     within = abs(theta) <= table.tilt
     s = math.sin(theta)
     t = math.sqrt(d * table.inverse_radius)
-    g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, s * s if within else 2.0 / table.by_square)
+    square = s * s if within else 2.0 / table.by_square
+    normal, stiffness, normal_s, _, _ = normal_force(table, t, square)
     chain = 2.0 * s * math.cos(theta) if within else 0.0
-    a = table.radius
-    size = table.modulus * a * a * t * t * t
-    return (
-        size * (2.5 * g + 0.5 * t * g_t),
-        0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt)),
-        chain * size * (2.5 * g_s + 0.5 * t * g_ts),
-    )
+    area = table.radius * table.radius
+    return area * normal, area * stiffness, area * chain * normal_s

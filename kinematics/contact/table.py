@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
 from softfinger.kinematics.contact.lookup import lookup, lookups
 from softfinger.kinematics.contact.material import Material
@@ -21,8 +22,6 @@ from softfinger.kinematics.contact.table_build import build
 from softfinger.kinematics.contact.table_record import Table
 
 __all__ = ["Certificate", "ContactForces", "ContactTable"]
-
-FloatArray = NDArray[np.float64]
 
 
 class ContactForces(NamedTuple):
@@ -111,7 +110,6 @@ class ContactTable:
         self.data: Any = table.array
         self.is_solid = table.is_solid
         self.max_error = table.max_error
-        self._error = (self.max_error,)
 
     def __repr__(self) -> str:
         radius = f"radius {1e3 * self.header.radius:.4g} mm"
@@ -197,28 +195,23 @@ class ContactTable:
         TypeError
             If an argument is not a real number.
         """
-        point: tuple[float, float] | None = None
-        if type(d) is float and type(theta) is float:
-            point = d, theta
-        else:
+        if type(d) is not float or type(theta) is not float:
             shape, (depth, tilt) = flatten(d, theta)
-            if not shape:
-                point = depth.item(), tilt.item()
-        if point is not None:
-            found = lookup(self.data, *point)
-            if not (found[6] or edge):
-                self._warn(*np.reshape(point, (2, 1)))
-            numbers: ContactForces = _numbers(ContactForces, found + self._error)
-            return numbers
-        out = np.empty((6, depth.size))
-        within = np.empty(depth.size, dtype=np.bool_)
-        lookups(self.data, depth, tilt, out, within)
-        if not (edge or within.all()):
-            self._warn(depth, tilt)
-        f, u, f_d, f_theta, u_d, u_theta = (row.reshape(shape) for row in out)
-        return ContactForces(
-            f, u, f_d, f_theta, u_d, u_theta, within.reshape(shape), self.max_error
-        )
+            if shape:
+                out = np.empty((6, depth.size))
+                within = np.empty(depth.size, dtype=np.bool_)
+                lookups(self.data, depth, tilt, out, within)
+                if not (edge or within.all()):
+                    self._warn(depth, tilt)
+                f, u, f_d, f_theta, u_d, u_theta = out.reshape(6, *shape)
+                inside = within.reshape(shape)
+                return ContactForces(f, u, f_d, f_theta, u_d, u_theta, inside, self.max_error)
+            d, theta = depth.item(), tilt.item()
+        found = lookup(self.data, d, theta)
+        if not (found[6] or edge):
+            self._warn(np.array([d]), np.array([theta]))
+        numbers: ContactForces = _numbers(ContactForces, (*found, self.max_error))
+        return numbers
 
     def _warn(self, d: FloatArray, theta: FloatArray) -> None:
         """Issue a RuntimeWarning in the caller's code for points outside the domain, except NaN."""

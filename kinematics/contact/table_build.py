@@ -12,24 +12,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import H_END
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.quadrature import (
-    circle_rule,
-    gauss_rule,
-    nodes_for,
-    ratios_at,
-)
+from softfinger.kinematics.contact.quadrature import ratios
 from softfinger.kinematics.contact.solid_data import to_powers
 from softfinger.kinematics.contact.table_record import (
     LANES,
@@ -43,10 +37,12 @@ from softfinger.kinematics.contact.table_record import (
     set_piece,
 )
 
-FloatArray = NDArray[np.float64]
-
 # Rounding error of the closed forms and of the last products in the kernel.
-ROUNDING = 16.0 * np.finfo(float).eps
+_ROUNDING = 16.0 * np.finfo(float).eps
+# Bound on the relative rounding error of a piece. An error analysis of the pieces of seven laws of
+# degree 7 to 11 gives at most 3.5e-13. The largest part comes from y², because cos² θ − ρ² cancels
+# near the limit on θ.
+_PIECE_ROUNDING = 1e-12
 # Number of additional Chebyshev coefficients in h and y that are computed but not stored.
 _EXTRA_V, _EXTRA_U = 4, 6
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
@@ -65,36 +61,14 @@ class _WorstError(NamedTuple):
     y: float
 
 
-@dataclass(frozen=True)
-class LawTerms:
-    """Material law in the form that the quadrature kernels use."""
-
-    material: Material
-    gauss: FloatArray
-    circle: FloatArray
-    polynomials: FloatArray
-    modulus: float
-
-    @classmethod
-    def of(cls, material: Material) -> LawTerms:
-        """Return the quadrature rules and expansions of ``material``."""
-        return cls(
-            material,
-            gauss_rule(nodes_for(material.degree)),
-            circle_rule(material.degree),
-            material.expansions(),
-            material.reference_modulus,
-        )
-
-
 def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
     """Build the smallest table that meets ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must be between 0 and 1, got {tolerance!r}")
-    law, splits = LawTerms.of(material), 1
+    splits = 1
     while True:
         last = material.is_linear or splits == SPLITS_MAX
-        table = _build_pieces(tip, law, tolerance, splits, math.inf if last else tolerance)
+        table = _build_pieces(tip, material, tolerance, splits, math.inf if last else tolerance)
         if table.max_error <= tolerance:
             return table
         if last:
@@ -107,16 +81,16 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
 
 
 def _build_pieces(
-    tip: Fingertip, law: LawTerms, tolerance: float, splits: int, limit: float
+    tip: Fingertip, material: Material, tolerance: float, splits: int, limit: float
 ) -> Table:
     """Build a table with ``splits`` pieces per slab; stop if its error exceeds ``limit``."""
     table = Table()
-    table.is_closed, table.splits, table.tolerance = law.material.is_linear, splits, tolerance
-    table.radius, table.modulus = tip.radius, law.modulus
+    table.is_closed, table.splits, table.tolerance = material.is_linear, splits, tolerance
+    table.radius, table.modulus = tip.radius, material.reference_modulus
     table.inverse_radius = 1.0 / tip.radius
     table.deepest = (1.0 - H_END) * tip.radius
-    worst = _WorstError(ROUNDING, 0.5, 0.0)
-    for found in () if table.is_closed else _fill(table, law):
+    worst = _WorstError(_ROUNDING, 0.5, 0.0)
+    for found in () if table.is_closed else _fill(table, material):
         worst = max(worst, found)
         if worst.bound > limit:
             break
@@ -125,7 +99,7 @@ def _build_pieces(
     return table
 
 
-def _fill(table: Table, law: LawTerms) -> Iterator[_WorstError]:
+def _fill(table: Table, material: Material) -> Iterator[_WorstError]:
     """Set the coefficients piece by piece; yield the error bound of each piece."""
     # Additional coefficients in each direction give the truncation error.
     rows, width = POWERS_V + _EXTRA_V, POWERS_U + _EXTRA_U
@@ -137,7 +111,7 @@ def _fill(table: Table, law: LawTerms) -> Iterator[_WorstError]:
         h = 0.5 * (low + high) + 0.5 * (high - low) * x
         for split in range(splits):
             y = (split + u) / splits
-            values = _ratios_at(law, h[:, None], y[None, :])
+            values = _ratios_at(material, h[:, None], y[None, :])
             terms = _terms(values)
             powers = np.einsum(
                 "ai,bj,kij->kba",
@@ -147,13 +121,10 @@ def _fill(table: Table, law: LawTerms) -> Iterator[_WorstError]:
                 optimize=True,
             )
             set_piece(table, slab * splits + split, powers)
-            rounding = _rounding(terms * mask, (high + low) / (high - low), low, splits)
-            yield _bound(values, terms * ~mask, rounding, h, y)
+            yield _bound(values, terms * ~mask, h, y)
 
 
-def _bound(
-    values: FloatArray, lost: FloatArray, rounding: FloatArray, h: FloatArray, y: FloatArray
-) -> _WorstError:
+def _bound(values: FloatArray, lost: FloatArray, h: FloatArray, y: FloatArray) -> _WorstError:
     """Return the bound on a piece's relative error and the approximate location of the maximum.
 
     ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` contains the Chebyshev
@@ -161,7 +132,7 @@ def _bound(
     coefficients bounds the difference. Higher coefficients, which are not computed, contribute less
     than twice the last two coefficients in each direction, because each coefficient is less than
     half of its predecessor. The coefficients decrease this fast because the ratios are analytic
-    well beyond the piece. ``rounding`` [5] is absolute.
+    well beyond the piece.
     """
     everywhere = _dense_nodes(len(h)) @ _terms(values) @ _dense_nodes(len(y)).T
     size = np.abs(everywhere)
@@ -169,34 +140,13 @@ def _bound(
     smallest = 0.99 * size.min(axis=(1, 2))
     each = np.abs(lost)
     beyond = each[:, -2:].sum(axis=(1, 2)) + each[:, :, -2:].sum(axis=(1, 2))
-    total = each.sum(axis=(1, 2)) + 2.0 * beyond + rounding
-    bounds = total / smallest
+    bounds = (each.sum(axis=(1, 2)) + 2.0 * beyond) / smallest + _PIECE_ROUNDING
     k = int(np.argmax(bounds))
     here = np.abs(_dense_nodes(len(h)) @ lost[k] @ _dense_nodes(len(y)).T)
     i, j = np.unravel_index(int(np.argmax(here)), here.shape)
     # The dense points are in ascending order, four per node, whereas the nodes are in descending
     # order.
-    return _WorstError(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
-
-
-def _rounding(terms: FloatArray, steep: float, low: float, splits: int) -> FloatArray:
-    """Return bounds on the rounding errors of a piece's five ratios from their Chebyshev ``terms``.
-
-    There are three sources. There are four rounding errors. First, each sum of powers has at most
-    about 32 roundings. Second, h has an error of two ulps, and ``steep`` is the ratio of h to half
-    the width of the piece. Third, y² has an error of 4 ulps divided by h², because cos² θ − ρ²
-    cancels near the limit on θ. At this limit, the slope of the ratios in y is 0, so the second
-    derivative bounds the error due to y². Fourth, y has an error of ``splits`` ulps.
-    """
-    i, j = np.arange(terms.shape[1])[:, None], np.arange(terms.shape[2])
-    size = np.abs(terms)
-    powers = np.abs(to_powers(len(i))), np.abs(to_powers(len(j)))
-    sums = 32.0 * np.einsum("ai,bj,kij->k", *powers, size, optimize=True)
-    by_h = 2.0 * (steep + 1.0) * (i**2 * size).sum(axis=(1, 2))
-    by_y = 4.0 * splits * (j**2 * size).sum(axis=(1, 2))
-    second = 4.0 * splits**2 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
-    total: FloatArray = np.finfo(float).eps * (sums + by_h + by_y + 2.0 * second / low**2)
-    return total
+    return _WorstError(float(bounds[k]), float(h[-1 - i // 4]), float(y[-1 - j // 4]))
 
 
 def _terms(values: FloatArray) -> FloatArray:
@@ -225,7 +175,7 @@ def _tilt(at: _WorstError) -> float:
     return math.asin(min(at.h * math.sqrt((1.0 - at.y) * (1.0 + at.y) / complement), 1.0))
 
 
-def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
+def _ratios_at(material: Material, h: FloatArray, y: FloatArray) -> FloatArray:
     """Return the ratios [5, …] at broadcast coordinates h in (0, 1) and y in [0, 1]."""
     h, y = np.broadcast_arrays(h, y)
     delta = 1.0 - h
@@ -233,8 +183,5 @@ def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
     complement = (1.0 - y + delta * y) * (1.0 + h * y)
     c = np.sqrt(delta * (1.0 + h) / complement)
     s = h * np.sqrt((1.0 - y) * (1.0 + y) / complement)
-    out = np.empty((LANES, h.size))
-    ratios_at(
-        law.gauss, law.circle, law.polynomials, delta.ravel(), h.ravel(), s.ravel(), c.ravel(), out
-    )
-    return out.reshape(LANES, *h.shape)
+    found = ratios(material, delta.ravel(), h.ravel(), s.ravel(), c.ravel())
+    return found.reshape(LANES, *h.shape)

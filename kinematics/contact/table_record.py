@@ -9,16 +9,12 @@ from __future__ import annotations
 
 from typing import Annotated, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import index, inlined_kernel
-from softfinger.kinematics.compiled.layout import Record
+from softfinger.kinematics.compiled.layout import FloatArray, Record
 
 __all__ = ["TableError"]
 
-FloatArray = NDArray[np.float64]
 Lanes: TypeAlias = tuple[float, float, float, float, float]
 SixFloats: TypeAlias = tuple[float, float, float, float, float, float, bool]
 ThreeFloats: TypeAlias = tuple[float, float, float]

@@ -19,9 +19,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval2d
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from softfinger.kinematics.compiled.layout import FloatArray
+
 POWERS = 6  # number of powers of t
 SQUARES = 3  # number of powers of q
 FIRST = 3  # lowest power of t in ``push``

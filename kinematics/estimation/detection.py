@@ -8,24 +8,52 @@ from __future__ import annotations
 
 import math
 
-from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.estimation.cell_centres import next_above, totals
-from softfinger.kinematics.estimation.state import OUTLIERS_MAX, Cells, EstimatorState
-from softfinger.kinematics.sensing.footprint import (
-    FloatArray,
-    Grid,
-    line_span,
-    set_around,
-    set_face,
-    steps,
-)
+import numpy as np
 
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inner_kernel
+from softfinger.kinematics.compiled.layout import FloatArray
+from softfinger.kinematics.estimation.state import (
+    DEPTH,
+    TILT_X,
+    TILT_Y,
+    Cells,
+    EstimatorState,
+)
+from softfinger.kinematics.sensing.footprint import Grid, line_span, set_around, set_face, steps
+
+# Levels of the activity test, in noise standard deviations. Common errors and correlated noise
+# increase the second one.
+PEAK_LEVEL, PATCH_LEVEL = 3.0, 4.9
+OUTLIERS_MAX = 6  # maximum number of outliers that are excluded from a frame
 # Ratio of the detection level during a contact to the level before it. The ratio avoids flicker.
 _HYSTERESIS = 0.5
-# Peak reading above which the largest cell is tested first, in noise standard deviations.
-STRONG_PEAK = 6.0
 _NOISE_RATIO = 1.75  # ratio of measured noise to noise setting above which a frame is noisy
 _SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviations
+
+
+@fast_inner_kernel
+def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
+    """Return Σ p, Σ p² and the maximum of 0 and all p; non-finite cells make Σ p non-finite."""
+    total = 0.0
+    energy = 0.0
+    peak = np.int64(0)
+    for k in range(index(0), index(frame.shape[0])):
+        value = frame[k] if height[k] >= 0.0 else 0.0
+        total += value
+        energy += value * value
+        # Non-negative floats have the same order as their bit patterns. Comparing the bit patterns
+        # avoids special cases for NaN.
+        bits = np.float64(value).view(np.int64)
+        peak = bits if bits > peak else peak
+    return total, energy, np.int64(peak).view(np.float64)
+
+
+@inner_kernel
+def next_above(frame: FloatArray, height: FloatArray, start: int, last: int, level: float) -> int:
+    """Return the first cell in start..last with a reading ≥ ``level``, or ``last`` if none."""
+    while start < last and not (frame[start] >= level and height[start] >= 0.0):
+        start += 1
+    return start
 
 
 @inner_kernel
@@ -34,7 +62,7 @@ def neighbourhood(frame: FloatArray, height: FloatArray, grid: Grid, at: int) ->
 
     The weights of the 5 × 5 window are (1, 2, 2, 2, 1) in both directions; the cell itself is
     excluded. The standard deviation assumes a cell noise of 1. Cells with negative ``height``
-    (see :mod:`estimation.cell_centres`) are excluded as well.
+    (see `state.Cells`) are excluded as well.
     """
     cols = grid.cols
     i = at // cols
@@ -55,7 +83,7 @@ def neighbourhood(frame: FloatArray, height: FloatArray, grid: Grid, at: int) ->
 def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> None:
     """Test the frame for a contact and store the result in ``state.signal``.
 
-    A contact is detected if a cell reads at least ``peak_level`` · noise and the weighted sum of
+    A contact is detected if a cell reads at least `PEAK_LEVEL` · noise and the weighted sum of
     its neighbours exceeds ``patch_level`` standard deviations. A single outlying cell is therefore
     not detected as a contact. A cell and its neighbours are statistically independent. At levels of
     3 and 4.9, the false alarm rate for white noise on 788 cells is therefore 788 · 1.35e-3 · 4.8e-7
@@ -73,17 +101,15 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
     signal.energy = energy
     contact = False
     cell = -1
-    level = state.options.peak_level * signal.noise
+    level = PEAK_LEVEL * signal.noise
     patch = signal.patch_level * signal.noise
     if signal.is_finite and peak >= level:
-        if peak > STRONG_PEAK * signal.noise:
-            cell = next_above(frame, height, 0, last, peak)
-            contact = neighbourhood(frame, height, grid, cell) > patch
+        cell = next_above(frame, height, 0, last, peak)
+        contact = neighbourhood(frame, height, grid, cell) > patch
         at = last if contact else next_above(frame, height, 0, last, level)
         while at < last:
-            cell = at if frame[at] == peak else cell
-            contact = contact or neighbourhood(frame, height, grid, at) > patch
-            at = next_above(frame, height, at + 1, last, level)
+            contact = neighbourhood(frame, height, grid, at) > patch
+            at = last if contact else next_above(frame, height, at + 1, last, level)
     signal.contact = contact
     signal.row = cell // grid.cols if cell >= 0 else -1
     signal.col = cell - signal.row * grid.cols if cell >= 0 else -1
@@ -144,11 +170,11 @@ def presses_outside(
     a = grid.radius
     cols = grid.cols
     face = state.around
-    estimate = state.estimate
+    guess = state.estimate.guess
     margin = 2.0 * math.hypot(grid.pitch_x, grid.pitch_y) + 3.0 * state.options.blur
-    if math.sqrt(max(estimate.d * (2.0 * a - estimate.d), 0.0)) + margin >= 0.99 * a:
+    if math.sqrt(max(guess[DEPTH] * (2.0 * a - guess[DEPTH]), 0.0)) + margin >= 0.99 * a:
         return False
-    set_face(face, a, estimate.d, estimate.n_x, estimate.n_y)
+    set_face(face, a, guess[DEPTH], guess[TILT_X], guess[TILT_Y])
     set_around(face, face, a, margin)
     for i in range(grid.rows):
         left, right = line_span(face, a, grid.y + (i + 0.5) * grid.pitch_y)
@@ -163,9 +189,6 @@ def presses_outside(
                 return True
             at = next_above(frame, height, at + 1, start + cols, level)
     return False
-
-
-_MASK_DEPTH = 1e3  # depth that lowers masked cells beyond the reach of any face [m]
 
 
 @inner_kernel
@@ -196,10 +219,7 @@ def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) ->
 
 @inner_kernel
 def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArray) -> int:
-    """Run :func:`activity` with outliers masked and return the number of outliers.
-
-    Call :func:`restore_outliers` to unmask them.
-    """
+    """Run :func:`activity` with outliers masked and return the number of outliers."""
     signal = state.signal
     cols = state.grid.cols
     rejected = 0
@@ -210,18 +230,8 @@ def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArra
         and rejected < OUTLIERS_MAX
         and _is_outlier(state, frame, height)
     ):
-        at = signal.row * cols + signal.col
-        height[at] -= _MASK_DEPTH
+        height[signal.row * cols + signal.col] = -math.inf
         signal.number -= 1
-        state.outliers[rejected] = at
         rejected += 1
         activity(state, frame, height)
     return rejected
-
-
-@inner_kernel
-def restore_outliers(state: EstimatorState, rejected: int, height: FloatArray) -> None:
-    """Unmask the first ``rejected`` outliers."""
-    for k in range(rejected):
-        height[state.outliers[k]] += _MASK_DEPTH
-        state.signal.number += 1

@@ -33,6 +33,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inner_kernel
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.state import (
@@ -40,26 +41,18 @@ from softfinger.kinematics.estimation.state import (
     DEPTHS,
     GAIN,
     PARAMETERS,
-    PLACE_X,
-    PLACE_Y,
-    PRESSURE,
-    SCALING,
-    SHIFT,
-    SLOPE_X,
-    SLOPE_Y,
     SOURCES,
     TILT_X,
     TILT_Y,
     Cells,
     EstimatorState,
 )
-from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 __all__ = ["Uncertainty"]
 
-NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
-NEIGHBOURS[2, 2] = 0.0
+_NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
+_NEIGHBOURS[2, 2] = 0.0
 _NOISE_PEAK = 4.5  # maximum reading that noise alone causes, in standard deviations
 _CELL_COUNT_MIN = 48.0  # minimum number of cells for separating smooth and rough misfits
 # Fractions of a smooth error's energy that appear in d (and in the gain), in each tilt, and in the
@@ -141,10 +134,10 @@ def set_budget(
     """
     budget, options = state.budget, state.options
     modulus = 0.0 if options.free_gain else math.hypot(known.modulus, known.gain)
-    budget.sizes[[SHIFT, SLOPE_X, SLOPE_Y]] = known.baseline, known.slope, known.slope
-    budget.sizes[[PLACE_X, PLACE_Y, SCALING]] = known.centre, known.centre, known.pitch
-    budget.sizes[SHIFT] = math.hypot(known.baseline, material.fit_error)
-    budget.sizes[PRESSURE] = modulus
+    shift = math.hypot(known.baseline, material.fit_error)
+    budget.sizes[:] = (
+        shift, known.slope, known.slope, known.centre, known.centre, known.pitch, modulus
+    )  # fmt: skip
     budget.baseline, budget.slope = known.baseline, known.slope
     budget.smooth, budget.rotation = known.smooth, known.rotation
     budget.tilt_error = _SOLID_TILT_ERROR if options.is_solid else 0.0
@@ -152,7 +145,7 @@ def set_budget(
         max(*budget.sizes, budget.smooth, budget.rotation, budget.tilt_error) > 0.0
     )
     budget.cells_per_sample = 1.0
-    level, weights = options.patch_level, NEIGHBOURS if pattern is None else pattern
+    level, weights = options.patch_level, _NEIGHBOURS if pattern is None else pattern
     norm = float(np.sqrt((weights**2).sum()))
     if known.correlation is not None and known.correlation.size > 1:
         rho = mirrored(known.correlation)
@@ -161,37 +154,25 @@ def set_budget(
         if known.correlation.shape[1] > 1:
             budget.row_correlation = float(known.correlation[0, 1])
         _set_widening(state, rho, grid, tip, material)
-        with_centre = float((weights * _cropped(rho, 5)).sum()) if pattern is None else 0.0
-        variance = float(quadratic(weights, rho)) - with_centre**2
+        centre = np.zeros(weights.shape)
+        if pattern is None:
+            centre[2, 2] = 1.0
+        (variance, with_centre), _ = quadratic(np.stack([weights, centre], axis=2), rho)
+        variance -= with_centre**2
         level = (level * math.sqrt(max(variance, 0.0)) + _NOISE_PEAK * max(with_centre, 0.0)) / norm
     # A zero shift of twice the standard deviation ``baseline`` must not be detected as a contact.
     shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
     options.patch_level = level + max(shift, 0.0)
 
 
-def mirrored(correlation: FloatArray | None) -> FloatArray:
+def mirrored(correlation: FloatArray) -> FloatArray:
     """Extend a correlation to positive and negative lags, [2 rows − 1, 2 cols − 1]."""
-    assert correlation is not None
-    rows, cols = correlation.shape
-    return np.asarray(
-        correlation[np.abs(np.arange(1 - rows, rows))][:, np.abs(np.arange(1 - cols, cols))]
-    )
-
-
-def _cropped(rho: FloatArray, size: int) -> FloatArray:
-    """Return the central part [size, size] of ``rho``, padded with zeros."""
-    out = np.zeros((size, size))
-    for i in range(size):
-        for j in range(size):
-            at = i - size // 2 + rho.shape[0] // 2, j - size // 2 + rho.shape[1] // 2
-            if 0 <= at[0] < rho.shape[0] and 0 <= at[1] < rho.shape[1]:
-                out[i, j] = rho[at]
-    return out
+    rows, cols = (np.abs(np.arange(1 - count, count)) for count in correlation.shape)
+    return np.asarray(correlation[np.ix_(rows, cols)])
 
 
 def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
-    """Return Σ field · ρ · field over pairs of cells, for fields [rows, cols] or […, n]."""
-    several = fields.reshape(*fields.shape[:2], -1)
+    """Return Σ field_i · ρ · field_j over pairs of cells [n, n], for ``fields`` [rows, cols, n]."""
     shape = [n + m for n, m in zip(fields.shape[:2], rho.shape, strict=True)]
     kernel = np.zeros(shape)
     kernel[: rho.shape[0], : rho.shape[1]] = rho
@@ -199,9 +180,8 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
     # A measured correlation may imply negative power at some frequencies, so clip the power at
     # zero.
     power = np.maximum(np.fft.fft2(kernel).real, 0.0)
-    waves = np.fft.fft2(several, shape, axes=(0, 1))
-    out = np.einsum("xyi,xy,xyj->ij", waves.conj(), power, waves).real / power.size
-    return np.asarray(out if fields.ndim == 3 else out[0, 0])
+    waves = np.fft.fft2(fields, shape, axes=(0, 1))
+    return np.asarray(np.einsum("xyi,xy,xyj->ij", waves.conj(), power, waves).real / power.size)
 
 
 def _set_widening(
@@ -210,20 +190,12 @@ def _set_widening(
     """Tabulate the widening by correlated noise at zero tilt, and the fit's degrees of freedom."""
     options = state.options
     first = 0 if options.free_gain else 1
+    step = 1e-3
+    steps = (0, 0, 0), (-step, 0, 0), (0, step, 0), (0, -step, 0), (0, 0, step), (0, 0, -step)
     for k in range(DEPTHS):
         d = options.deepest * ((k + 1) / DEPTHS) ** 2
-
-        def at(d: float, x: float = 0.0, y: float = 0.0) -> FloatArray:
-            return grid.pressure(tip, material, d, x, y)
-
-        step = 1e-3
-        less = d * (1.0 - step)
-        columns = [
-            at(d),
-            (at(d) - at(less)) / (d - less),
-            (at(d, step) - at(d, -step)) / (2.0 * step),
-            (at(d, 0.0, step) - at(d, 0.0, -step)) / (2.0 * step),
-        ]
+        frames = [grid.pressure(tip, material, d + d * by_d, x, y) for by_d, x, y in steps]
+        columns = [frames[0], *(frames[j] - frames[j + 1] for j in (0, 2, 4))]
         jacobian = np.stack(columns[first:], axis=2)
         jacobian /= np.sqrt((jacobian**2).sum(axis=(0, 1)))
         white = np.linalg.inv(np.einsum("xyi,xyj->ij", jacobian, jacobian))
@@ -238,7 +210,7 @@ def widen_covariance(state: EstimatorState) -> float:
     """Widen ``fit.inverse`` for correlated noise; return the degrees of freedom used by the fit."""
     inverse = state.fit.inverse
     table = state.budget.widening
-    t = DEPTHS * math.sqrt(state.fit.d / state.options.deepest) - 1.0
+    t = DEPTHS * math.sqrt(state.fit.contact[DEPTH] / state.options.deepest) - 1.0
     t = min(max(t, 0.0), DEPTHS - 1.001)
     k = int(t)
     t -= k
@@ -279,12 +251,10 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
     """
     fit = state.fit
     variance = state.signal.variance
-    cols = state.grid.cols
     # Near the floor, clipping raises the mean reading above the pressure.
     lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip_noise
-    total, number = _neighbours_products(
-        cells, lowest, index(fit.first_row * cols), index(fit.last_row * cols)
-    )
+    first, last = index(fit.first_cell), index(fit.last_cell)
+    total, number = _neighbours_products(cells, lowest, first, last)
     # The residuals do not yet include the decrement of the last step.
     total -= number * variance * state.budget.row_correlation + fit.decrement
     total = beyond if number < _CELL_COUNT_MIN else min(total, beyond)
@@ -294,50 +264,44 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
 
 
 @fast_inner_kernel
-def _project(
-    state: EstimatorState, cells: Cells, column: int, values: FloatArray, first: int, last: int
-) -> None:
-    """Set Jᵀq of one Jacobian column, and qᵀq, for all patterns except the pressure."""
+def product(a: FloatArray, b: FloatArray, first: int, last: int) -> float:
+    """Return the sum of products of two rows over a range of cells."""
+    total = 0.0
+    for k in range(first, last):
+        total += a[k] * b[k]
+    return total
+
+
+@fast_inner_kernel
+def _set_errors(state: EstimatorState, cells: Cells, first: int, last: int) -> None:
+    """Set the patterns of the common errors, as changes of the readings per unit error.
+
+    The patterns are in the order of `Budget.sizes`. Differences between neighbours are not
+    available in the first and last two rows.
+    """
     one = index(1)
     two = index(2)
     cols = index(state.grid.cols)
     both = cols + cols
-    per_x = 1.0 / (12.0 * state.grid.pitch_x)
-    per_y = 1.0 / (12.0 * state.grid.pitch_y)
+    gain = state.fit.contact[GAIN]
+    per_x = gain / (12.0 * state.grid.pitch_x)
+    per_y = gain / (12.0 * state.grid.pitch_y)
     per_radius = 1.0 / state.grid.radius
-    end = index(cells.stress.shape[0]) - both
-    p = cells.stress
-    q0 = q1 = q2 = q3 = q4 = q5 = n0 = n1 = n2 = n3 = n4 = n5 = 0.0
-    for k in range(max(first, both), min(last, end)):
-        counts = cells.factor[k] > 0.0
-        own = cells.factor[k] * values[k]
-        x = cells.x[k] if counts else 0.0
-        y = cells.y[k] if counts else 0.0
+    p = cells.sensitivity[GAIN]
+    errors = cells.errors
+    for k in range(max(first, both), min(last, index(p.shape[0]) - both)):
+        counts = 1.0 if cells.factor[k] > 0.0 else 0.0
         by_x = per_x * (8.0 * (p[k + one] - p[k - one]) - p[k + two] + p[k - two])
         by_y = per_y * (8.0 * (p[k + cols] - p[k - cols]) - p[k + both] + p[k - both])
-        by_x = by_x if counts else 0.0
-        by_y = by_y if counts else 0.0
-        by_pitch = x * by_x + y * by_y
-        q0 += own
-        q1 += own * x
-        q2 += own * y
-        q3 += own * by_x
-        q4 += own * by_y
-        q5 += own * by_pitch
-        n0 += 1.0 if counts else 0.0
-        n1 += x * x
-        n2 += y * y
-        n3 += by_x * by_x
-        n4 += by_y * by_y
-        n5 += by_pitch * by_pitch
-    responses = state.budget.responses
-    squares = state.budget.squares
-    responses[column, SHIFT], squares[SHIFT] = q0, n0
-    responses[column, SLOPE_X], squares[SLOPE_X] = per_radius * q1, per_radius * per_radius * n1
-    responses[column, SLOPE_Y], squares[SLOPE_Y] = per_radius * q2, per_radius * per_radius * n2
-    responses[column, PLACE_X], squares[PLACE_X] = q3, n3
-    responses[column, PLACE_Y], squares[PLACE_Y] = q4, n4
-    responses[column, SCALING], squares[SCALING] = q5, n5
+        errors[3, k] = counts * by_x
+        errors[4, k] = counts * by_y
+        errors[5, k] = counts * (cells.x[k] * by_x + cells.y[k] * by_y)
+    for k in range(first, last):
+        counts = 1.0 if cells.factor[k] > 0.0 else 0.0
+        errors[0, k] = counts
+        errors[1, k] = counts * per_radius * cells.x[k]
+        errors[2, k] = counts * per_radius * cells.y[k]
+        errors[6, k] = gain * cells.jacobian[GAIN, k]
 
 
 @inner_kernel
@@ -350,54 +314,45 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     fit = state.fit
     budget = state.budget
     shared = budget.shared
-    inverse = fit.inverse
-    gain = fit.gain
-    first = index(fit.first_row * state.grid.cols)
-    last = index(fit.last_row * state.grid.cols)
-    _project(state, cells, GAIN, cells.stress, first, last)
-    _project(state, cells, DEPTH, cells.by_d, first, last)
-    _project(state, cells, TILT_X, cells.by_x, first, last)
-    _project(state, cells, TILT_Y, cells.by_y, first, last)
-    pressure: float = fit.normal[GAIN, GAIN]
-    budget.squares[PRESSURE] = pressure
-    for i in range(PARAMETERS):
-        factor = gain if i > GAIN else 1.0
-        for source in range(PRESSURE):
-            budget.responses[i, source] *= factor
-        budget.responses[i, PRESSURE] = fit.normal[i, GAIN]
-    smooth = budget.smooth * budget.smooth * gain * gain * pressure
+    response = budget.response
+    displacement = budget.displacement
+    gain, d, n_x, n_y = (
+        fit.contact[GAIN],
+        fit.contact[DEPTH],
+        fit.contact[TILT_X],
+        fit.contact[TILT_Y],
+    )
+    first, last = index(fit.first_cell), index(fit.last_cell)
+    _set_errors(state, cells, first, last)
+    smooth = (budget.smooth * gain) ** 2 * fit.normal[GAIN, GAIN]
     deep = math.sqrt(_SMOOTH_IN_DEPTH * smooth)
     tilted = math.sqrt(_SMOOTH_IN_TILT * smooth)
     parts = (deep, deep, tilted, tilted)
     for i in range(4):
         for j in range(4):
-            shared[i, j] = parts[i] * parts[j] * inverse[i, j]
-    remaining = _SMOOTH_IN_RESIDUALS * smooth
-    displacement = budget.displacement
+            shared[i, j] = parts[i] * parts[j] * fit.inverse[i, j]
+    remaining: float = _SMOOTH_IN_RESIDUALS * smooth
     for source in range(SOURCES):
         size = budget.sizes[source]
         if size == 0.0:
             continue
-        # Patterns that shift or scale the pressure image are proportional to the gain, but offsets
-        # are not.
-        size *= gain if source >= PLACE_X else 1.0
-        remaining += size * size * budget.squares[source]
+        pattern = cells.errors[source]
+        remaining += size * size * product(pattern, pattern, first, last)
+        for i in range(PARAMETERS):
+            response[i] = size * product(cells.jacobian[i], pattern, first, last)
         for i in range(PARAMETERS):
             displacement[i] = 0.0
             for j in range(PARAMETERS):
-                displacement[i] += inverse[i, j] * budget.responses[j, source] * size
+                displacement[i] += fit.inverse[i, j] * response[j]
+            remaining -= displacement[i] * response[i]
         for i in range(PARAMETERS):
-            remaining -= displacement[i] * budget.responses[i, source] * size
             for j in range(PARAMETERS):
                 shared[i, j] += displacement[i] * displacement[j]
-    along = budget.tilt_error * fit.d / state.grid.radius
-    for i in range(2):
-        for j in range(2):
-            # Split the pattern into components along and across the tilt direction.
-            n_i = fit.n_y if i else fit.n_x
-            n_j = fit.n_y if j else fit.n_x
-            m_i = fit.n_x if i else -fit.n_y
-            m_j = fit.n_x if j else -fit.n_y
-            more = along * along * n_i * n_j + budget.rotation * budget.rotation * m_i * m_j
-            shared[TILT_X + i, TILT_X + j] += more
+    # Variances along and across the tilt direction.
+    along = (budget.tilt_error * d / state.grid.radius) ** 2
+    across = budget.rotation**2
+    shared[TILT_X, TILT_X] += along * n_x * n_x + across * n_y * n_y
+    shared[TILT_Y, TILT_Y] += along * n_y * n_y + across * n_x * n_x
+    shared[TILT_X, TILT_Y] += (along - across) * n_x * n_y
+    shared[TILT_Y, TILT_X] += (along - across) * n_x * n_y
     return 4.0 * max(remaining, 0.0)

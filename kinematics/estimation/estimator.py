@@ -13,18 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.solid_data import solid_data
-from softfinger.kinematics.estimation.cell_centres import cell_centres
-from softfinger.kinematics.estimation.error_budget import NEIGHBOURS, Uncertainty, set_budget
+from softfinger.kinematics.estimation.detection import PATCH_LEVEL
+from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budget
 from softfinger.kinematics.estimation.frame_pipeline import D_MAX, estimate_frame
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.kinematics.estimation.moments import tabulate_moments
-from softfinger.kinematics.estimation.state import HEIGHT, PATTERN, ROWS, EstimatorState, Y
-from softfinger.kinematics.sensing.footprint import FloatArray, Grid
+from softfinger.kinematics.estimation.state import PATTERN, REACH, ROWS, SHEAR_X, EstimatorState, Y
+from softfinger.kinematics.sensing.footprint import Grid, axes
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.kinematics.sensing.solid_pressure import Weights, padded, weights_of
+from softfinger.kinematics.sensing.solid_pressure import Weights, pixels_of, weights_of
 from softfinger.kinematics.sensing.springs_pressure import count_for, points_of
 
 __all__ = ["ContactEstimate", "ContactEstimator", "Readings"]
@@ -178,6 +179,8 @@ class Readings:
     quantum: float = 0.0
 
     def __post_init__(self) -> None:
+        if self.saturation is not None and not self.saturation > 0.0:
+            raise ValueError(f"saturation must be positive, got {self.saturation}")
         for name in ("threshold", "quantum"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
@@ -188,23 +191,36 @@ _RESULTS = (
     "rejected_count", "contact", "has_second_contact", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
-# Default parameters of the fit and of the activity test. `ContactEstimator.state` contains the
-# values in use.
 _TOLERANCE = 16.0  # squared ratio of step to noise floor below which the iteration ends
-_ITERATIONS = 20
-PEAK_LEVEL = 3.0  # detection level in noise standard deviations, see `detection.activity`
-PATCH_LEVEL = 4.9
-_R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
 # Minimum number of model points per tip radius, for linear and for nonlinear material laws. With a
 # noise of 0.2 % of the modulus and tilts of up to 25°, the bias is at most a quarter of the noise
 # floor. Within 4° of the domain limit, the bias is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum d/a and sin θ in a spring fit
 _STEP_MARGIN = 1.01  # factor by which the fit of a solid tip may exceed the range of the data
-_SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear force, relative to its normal force
 # Width of the excluded rim of a solid tip, relative to the radius.
 _RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
 CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact and shear
+
+
+def cell_centres(
+    grid: Grid, active: NDArray[np.bool_], radius: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return height, x and y of the cells as flat arrays; ``active`` [rows, cols] masks cells.
+
+    The height is √(a² − x² − y²) at the cell centre, or at the corner nearest to the tip centre if
+    the cell centre is outside the rim. The height is −∞ for inactive cells and for cells outside
+    the disc of ``radius`` [m] around the tip centre.
+    """
+    a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
+    x, y = np.meshgrid(*axes(grid))
+    nearest_x = np.maximum(np.abs(x) - 0.5 * pitch_x, 0.0)
+    nearest_y = np.maximum(np.abs(y) - 0.5 * pitch_y, 0.0)
+    touched = nearest_x**2 + nearest_y**2 < radius * radius
+    near = np.maximum(a * a - nearest_x**2 - nearest_y**2, 0.0)
+    inside = a * a - x * x - y * y
+    height = np.sqrt(np.where(inside > 0.0, inside, near))
+    return np.where(touched & active, height, -math.inf).ravel(), x.ravel(), y.ravel()
 
 
 def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
@@ -217,13 +233,9 @@ def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> ND
     uncertainty of the tip position into account.
     """
     margin = max(_RIM_WIDTH[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
-    cells = grid.on(tip)
     x, y = (
-        np.abs(start + pitch * (np.arange(count) + 0.5)) + 0.5 * pitch
-        for start, pitch, count in (
-            (cells.x, cells.pitch_x, cells.cols),
-            (cells.y, cells.pitch_y, cells.rows),
-        )
+        np.abs(middle) + 0.5 * pitch
+        for middle, pitch in zip(axes(grid.on(tip)), grid.pitches, strict=True)
     )
     return np.asarray(np.hypot(x, y[:, None]) < tip.radius - margin - grid.blur)
 
@@ -248,6 +260,12 @@ class ContactEstimator:
     known
         Other uncertainties of the sensor. These uncertainties, together with the material's
         ``fit_error``, widen the covariance and reduce the sensitivity of the contact detection.
+
+    Attributes
+    ----------
+    saturation
+        Reading at which a cell saturates, as in `Readings`. Update it when the zero offset that is
+        subtracted from the readings changes.
 
     Raises
     ------
@@ -281,7 +299,6 @@ class ContactEstimator:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
         readings = readings or Readings()
         self.grid = grid
-        self._full = math.nan  # saturation value for the type of the last frame
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         known = known or Uncertainty()
@@ -297,24 +314,20 @@ class ContactEstimator:
         state = self.state = EstimatorState()
         options = self._options = state.options
         self.noise = noise
-        options.saturation = math.inf
         # Counts are rounded, so the smallest count covers readings down to half a count below
         # itself.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
-        options.tolerance, options.iterations = _TOLERANCE, _ITERATIONS
-        options.peak_level, options.patch_level = PEAK_LEVEL, PATCH_LEVEL
-        options.r_squared_min = _R_SQUARED_MIN
+        options.tolerance, options.patch_level = _TOLERANCE, PATCH_LEVEL
         options.modulus = material.reference_modulus
         options.blur, options.rotation = grid.blur, grid.rotation
-        options.is_solid, options.shear_prior = is_solid, _SHEAR_PRIOR
+        options.is_solid = is_solid
         self._lay_out(tip, material, alive)
         pattern = None
         if is_solid:
             pattern = self._pattern(tip, alive)
             known = _with_data_errors(known, tip, options.free_gain)
         set_budget(state, known, grid, tip, material, pattern)
-        options.undetected = self._smallest_detectable_d(tip, material, pattern)
         tabulate_moments(state.moments, grid, tip, material, options.deepest)
         records: Any = state.estimate.array
         self._estimate = records
@@ -325,6 +338,7 @@ class ContactEstimator:
             covariance=state.estimate.covariance,
             systematic=state.estimate.systematic,
         )
+        options.undetected = self._smallest_detectable_d(tip, material)
 
     def __repr__(self) -> str:
         rows, cols = self.grid.shape
@@ -348,15 +362,13 @@ class ContactEstimator:
         self._frame = np.zeros(alive.shape)
         self._flat = self._frame.reshape(-1)
         self._rows = np.zeros((ROWS, alive.size))
-        self._rows[HEIGHT : Y + 1] = cell_centres(cells, alive, tip.radius + 3.0 * grid.blur)
-        state.signal.number = int(np.count_nonzero(self._rows[HEIGHT] >= 0.0))
-        model_cells, pixels, weights = cells, np.zeros(0), Weights()
+        self._rows[REACH : Y + 1] = cell_centres(cells, alive, tip.radius + 3.0 * grid.blur)
+        options.number = int(np.count_nonzero(self._rows[REACH] >= 0.0))
+        pixels, weights = np.zeros((0, 0)), Weights()
         if options.is_solid:
-            model_cells = Grid()  # no points
-            model_cells.assign(cells)
-            model_cells.rows = model_cells.cols = 0
             images = grid.images(tip).reshape(-1, *grid.shape)[:, *self._window]
-            pixels = padded(images.reshape(len(images), -1))
+            images = images.reshape(-1, alive.size)
+            pixels, self._rows[SHEAR_X:REACH] = pixels_of(images[:-2]), images[-2:]
             weights = weights_of(tip, material)
             options.deepest, options.sine_max = weights.table.deepest, math.sin(weights.table.tilt)
             options.step_deepest = _STEP_MARGIN * options.deepest
@@ -364,9 +376,8 @@ class ContactEstimator:
         else:
             options.deepest = options.step_deepest = _DEEPEST * tip.radius
             options.sine_max = options.step_sine = _SINE_MAX
-
         fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
-        points = points_of(model_cells, material, grid.blur, count_for(cells, fineness))
+        points = points_of(cells, material, grid.blur, count_for(cells, fineness))
         # These are all arguments of the kernel except the state and the frame.
         self._arrays = self._rows, pixels, weights.array, *points
 
@@ -378,48 +389,15 @@ class ContactEstimator:
         self._rows[PATTERN] = pattern[self._window].ravel()
         return np.asarray(pattern)
 
-    def _smallest_detectable_d(
-        self, tip: Fingertip, material: Material, pattern: FloatArray | None
-    ) -> float:
-        """Return the smallest d [m] of an upright contact that the activity test detects.
-
-        The test compares a frame with the ``pattern``. If ``pattern`` is None, the test examines
-        the cells around the largest reading.
-        """
-        options = self._options
-        uses_pattern = pattern is not None
-        pattern = NEIGHBOURS if pattern is None else pattern
-        noise = math.hypot(options.noise, self._quantum / math.sqrt(12.0))
-        level = options.patch_level * noise * math.sqrt((pattern**2).sum())
-        rows, cols = pattern.shape
-        deepest = min(options.deepest, D_MAX * tip.radius)
-        low, high = 1e-6 * deepest, deepest
+    def _smallest_detectable_d(self, tip: Fingertip, material: Material) -> float:
+        """Return the smallest d [m] of an upright contact that the activity test detects."""
+        high = min(self._options.deepest, D_MAX * tip.radius)
+        low = 1e-6 * high
         for _ in range(14):
             d = math.sqrt(low * high)
-            frame = self.grid.pressure(tip, material, d)
-            is_detected = True
-            if not uses_pattern:
-                is_detected = frame.max() > options.peak_level * noise
-                row, col = np.unravel_index(frame.argmax(), frame.shape)
-                frame = np.pad(frame, (rows // 2, cols // 2))[row : row + rows, col : col + cols]
-            is_detected = is_detected and (pattern * frame).sum() > level
-            low, high = (low, d) if is_detected else (d, high)
+            self(self.grid.pressure(tip, material, d))
+            low, high = (low, d) if self.state.signal.contact else (d, high)
         return high
-
-    @property
-    def saturation(self) -> float | None:
-        """Reading at which a cell saturates; None means the integer type's maximum.
-
-        Update this value when the zero offset that is subtracted from the readings changes. Setting
-        a value that is not positive raises ValueError.
-        """
-        return self._saturation
-
-    @saturation.setter
-    def saturation(self, reading: float | None) -> None:
-        if reading is not None and not reading > 0.0:
-            raise ValueError(f"saturation must be positive, got {reading}")
-        self._saturation, self._full = reading, math.nan
 
     @property
     def noise(self) -> float:
@@ -486,15 +464,13 @@ class ContactEstimator:
             raise ValueError(f"a frame must have shape {self.grid.shape}, got {frame.shape}")
         if not 0.0 < pascal_per_count < math.inf:
             raise ValueError(f"pascal_per_count must be positive, got {pascal_per_count}")
-        if full != self._full:
-            self._full = full
-            self._options.saturation = full if self._saturation is None else self._saturation
+        saturation = full if self.saturation is None else self.saturation
         # Copy the frame, so that the compiled code accepts any type, memory layout and write
         # protection.
         self._frame[...] = frame[self._window]
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(
-            self.state.array, self._flat, float(pascal_per_count), float(step),
+            self.state.array, self._flat, float(pascal_per_count), float(step), float(saturation),
             *self._arrays,
         )  # fmt: skip
         result = self._last

@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.compiled.layout import FloatArray, Records
 from softfinger.kinematics.estimation.detection import (
-    STRONG_PEAK,
+    OUTLIERS_MAX,
     is_noisy,
     presses_outside,
-    restore_outliers,
     shows_pattern,
     without_outliers,
 )
@@ -22,23 +21,26 @@ from softfinger.kinematics.estimation.gauss_newton import fit, squared_sum
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.estimation.moments import start
 from softfinger.kinematics.estimation.state import (
-    OUTLIERS_MAX,
+    DEPTH,
+    GAIN,
+    TILT_X,
+    TILT_Y,
     Cells,
     EstimatorState,
-    Images,
-    Matrix,
     Model,
     cells_in,
 )
-from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
+# Noise standard deviations; a solid tip's signal above it without the contact pattern is a fault.
+_STRONG_SIGNAL = 6.0
 # Clipping the noise at 0 raises the sums over neighbourhoods. Raising the detection level by this
 # amount restores the false alarm rate.
 CLIPPED_LEVEL_INCREASE = 0.5
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # range of the gain for a contact of this tip on this sensor
 D_MAX = 0.75  # maximum valid d, relative to the radius
+R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
 # Maximum relative error of d that a smooth misfit may cause. The curved face of a disc causes an
 # error of this size, which the covariance includes. A smaller limit applies if the gain is far from
 # 1. Such a gain together with a smooth misfit indicates a different tip, which the covariance does
@@ -70,11 +72,11 @@ def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Ce
         if attempt == 1:
             start(state, frame, cells)
         if not options.free_gain:
-            estimate.gain = 1.0
+            estimate.guess[GAIN] = 1.0
         tolerance = options.tolerance if attempt == 0 else min(options.tolerance, 1.0)
         if fit(state, model, frame, cells, tolerance):
             misfit, scatter = _set_r_squared(state)
-            if estimate.r_squared < options.r_squared_min:
+            if estimate.r_squared < R_SQUARED_MIN:
                 reason = Invalid.MODEL_MISMATCH
                 continue
             # Search for a second contact only if the residual exceeds the noise and a small
@@ -96,10 +98,13 @@ def _check_fit_of_tip(state: EstimatorState) -> Invalid:
     zero = math.hypot(state.budget.baseline, state.budget.slope)
     if estimate.shared > SHARED_MAX or zero > ZERO_MAX * estimate.peak:
         return Invalid.UNCERTAIN
-    near = 1.0 / GAIN_FAR < estimate.gain < GAIN_FAR
-    if estimate.undetected > (UNDETECTED_MAX if near else UNDETECTED_MAX_FAR_GAIN):
+    gain = estimate.guess[GAIN]
+    near = 1.0 / GAIN_FAR < gain < GAIN_FAR
+    undetected_max = UNDETECTED_MAX if near else UNDETECTED_MAX_FAR_GAIN
+    if estimate.undetected > undetected_max or not GAIN_MIN < gain < GAIN_MAX:
         return Invalid.MODEL_MISMATCH
-    return Invalid.NONE
+    within = estimate.guess[DEPTH] < D_MAX * state.grid.radius
+    return Invalid.NONE if within else Invalid.OUT_OF_RANGE
 
 
 @inner_kernel
@@ -124,33 +129,38 @@ def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
 
 
 @inner_kernel
-def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> None:
-    """Convert the estimate from normals in sensor axes to tilts in finger axes.
-
-    The ``covariance`` is converted into ``rotated`` and overwritten.
-    """
+def _set_results(state: EstimatorState) -> None:
+    """Convert the fit parameters and their covariance to d, tilts in finger axes, and gain."""
     estimate = state.estimate
+    fit = state.fit
+    guess = estimate.guess
     c = math.cos(state.options.rotation)
     s = math.sin(state.options.rotation)
-    n_x = c * estimate.n_x - s * estimate.n_y
-    n_y = s * estimate.n_x + c * estimate.n_y
-    estimate.tilt_x = math.asin(n_x)
-    estimate.tilt_y = math.asin(n_y)
-    # Because ∂tilt/∂n = 1/cos tilt, only the two middle rows and columns must be scaled.
+    n_x = c * guess[TILT_X] - s * guess[TILT_Y]
+    n_y = s * guess[TILT_X] + c * guess[TILT_Y]
+    estimate.d, estimate.gain = guess[DEPTH], guess[GAIN]
+    estimate.tilt_x, estimate.tilt_y = math.asin(n_x), math.asin(n_y)
+    if not fit.variance > 0.0:
+        return
+    # ∂tilt/∂n = 1/cos tilt.
     per_x = 1.0 / math.sqrt(1.0 - n_x * n_x)
     per_y = 1.0 / math.sqrt(1.0 - n_y * n_y)
-    for j in range(4):
-        along = covariance[1, j]
-        across = covariance[2, j]
-        covariance[1, j] = per_x * (c * along - s * across)
-        covariance[2, j] = per_y * (s * along + c * across)
+    partials = fit.to_results
+    partials[0, DEPTH] = partials[3, GAIN] = 1.0
+    partials[1, TILT_X], partials[1, TILT_Y] = per_x * c, -per_x * s
+    partials[2, TILT_X], partials[2, TILT_Y] = per_y * s, per_y * c
     for i in range(4):
-        along = covariance[i, 1]
-        across = covariance[i, 2]
-        rotated[i, 0] = covariance[i, 0]
-        rotated[i, 1] = per_x * (c * along - s * across)
-        rotated[i, 2] = per_y * (s * along + c * across)
-        rotated[i, 3] = covariance[i, 3]
+        for j in range(i + 1):
+            noise = other = 0.0
+            for k in range(4):
+                for m in range(4):
+                    both = partials[i, k] * partials[j, m]
+                    noise += both * fit.inverse[k, m]
+                    other += both * state.budget.shared[k, m]
+            other *= fit.widening
+            noise = fit.variance * noise + other
+            estimate.covariance[i, j] = estimate.covariance[j, i] = noise
+            estimate.systematic[i, j] = estimate.systematic[j, i] = other
 
 
 @inner_kernel
@@ -174,40 +184,31 @@ def _fault_in_readings(
 @inner_kernel
 def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
     """Estimate the contact in a frame; return the reason if the estimate is invalid."""
-    estimate = state.estimate
-    reason = _fit_frame(state, model, frame, cells)
     fit = state.fit
+    reason = _fit_frame(state, model, frame, cells)
+    _set_results(state)
     if state.options.is_solid and reason == Invalid.NOT_CONVERGED:
         # For a contact of this tip, the fit either converges within the data range or explains the
         # frame at the limit of the range.
-        unexplained = fit.misfit > (1.0 - state.options.r_squared_min) * fit.readings
+        unexplained = fit.misfit > (1.0 - R_SQUARED_MIN) * fit.readings
         reason = Invalid.MODEL_MISMATCH if unexplained or not fit.is_limited else reason
-    if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
-        reason = Invalid.MODEL_MISMATCH
-    if reason == Invalid.NONE and not estimate.d < D_MAX * state.grid.radius:
-        reason = Invalid.OUT_OF_RANGE
     if reason != Invalid.NONE:
         reason = _fault_in_readings(state, frame, cells.height, reason)
-    _to_tilts(state, state.fit.covariance, estimate.covariance)
-    if state.budget.has_common_errors or estimate.undetected > 0.0:
-        _to_tilts(state, state.budget.covariance, estimate.systematic)
-        for i in range(4):
-            for j in range(4):
-                estimate.covariance[i, j] += estimate.systematic[i, j]
     return reason
 
 
 @inner_kernel
-def _reset_results(state: EstimatorState, scale: float, step: float) -> None:
+def _reset_results(state: EstimatorState, scale: float, step: float, saturation: float) -> None:
     """Set the frame unit and clear all previous results except the contact."""
     options = state.options
     signal = state.signal
     grid = state.grid
+    signal.number = options.number
     signal.scale = scale
     signal.is_clipped = step > 0.0
     signal.variance = options.noise**2 + step * step / 12.0
     signal.noise = math.sqrt(signal.variance) / scale
-    signal.saturation = options.saturation * scale
+    signal.saturation = saturation * scale
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
     # A contact that is no wider than a cell causes a strain of at most about pitch²/2a². Allow for
@@ -215,59 +216,44 @@ def _reset_results(state: EstimatorState, scale: float, step: float) -> None:
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate
-    estimate.chi2 = 0.0
-    estimate.tilt_x = 0.0
-    estimate.tilt_y = 0.0
-    estimate.r_squared = 0.0
-    estimate.cells = 0
-    estimate.iterations = 0
+    estimate.gain = 1.0
+    estimate.d = estimate.tilt_x = estimate.tilt_y = estimate.shear_x = estimate.shear_y = 0.0
+    estimate.chi2 = estimate.r_squared = estimate.undetected = estimate.shared = 0.0
+    estimate.cells = estimate.iterations = 0
     estimate.has_second_contact = False
-    estimate.undetected = 0.0
-    estimate.shared = 0.0
-    estimate.shear_x = 0.0
-    estimate.shear_y = 0.0
     estimate.covariance[:] = 0.0
     estimate.systematic[:] = 0.0
-    state.budget.covariance[:] = 0.0
 
 
 @kernel
 def estimate_frame(
-    states: Records[EstimatorState],
-    frame: FloatArray,
-    scale: float,
-    step: float,
-    rows: FloatArray,
-    pixels: FloatArray,
-    weights: Records[Weights],
-    line: FloatArray,
-    inverse: FloatArray,
-    y: FloatArray,
-    across: FloatArray,
-    along: FloatArray,
-    law: FloatArray,
-    sums: FloatArray,
-) -> None:
+    states: Records[EstimatorState], frame: FloatArray, scale: float, step: float,
+    saturation: float, rows: FloatArray, pixels: FloatArray, weights: Records[Weights],
+    line: FloatArray, inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray,
+    law: FloatArray, sums: FloatArray,
+) -> None:  # fmt: skip
     """Estimate the contact in one frame and store the result in the state (compiled entry point).
 
-    ``frame`` is float64 [cells] in counts, ``scale`` is in Pa per count, and ``step`` is the
-    quantum size [Pa] or 0. ``rows`` stores the `state.Cells`. ``pixels`` and ``weights`` are the
-    `state.Images` of a solid tip. The remaining arguments are the `SpringPoints` of a spring tip.
+    ``frame`` is float64 [cells] in counts, ``scale`` is in Pa per count, ``step`` is the quantum
+    size [Pa] or 0, and cells saturate at ``saturation`` counts. ``rows`` stores the `state.Cells`.
+    ``pixels`` and ``weights`` are the images of a solid tip. The remaining arguments are the
+    `SpringPoints` of a spring tip.
     """
     state = states[0]
     cells = cells_in(rows, state.grid)
     points = SpringPoints(line, inverse, y, across, along, law, sums)
-    model = Model(points, Images(pixels, weights[0]))
+    model = Model(points, pixels, weights[0])
     estimate = state.estimate
     signal = state.signal
-    _reset_results(state, scale, step)
+    _reset_results(state, scale, step, saturation)
+    cells.height[:] = cells.reach
     rejected = without_outliers(state, frame, cells.height)
     strong = False
     if state.options.is_solid and signal.is_finite:
         # Every contact of a solid tip matches the pattern, so a strong signal without the pattern
         # is not a contact of this tip. A small common zero offset does not count as a signal.
         level = max(signal.mean, signal.peak - signal.mean)
-        strong = signal.contact and level > STRONG_PEAK * signal.noise
+        strong = signal.contact and level > _STRONG_SIGNAL * signal.noise
         signal.contact = shows_pattern(state, frame, cells)
     unexplained = not signal.contact and (strong or is_noisy(state, frame, cells.height))
     estimate.peak = signal.peak * scale
@@ -277,10 +263,6 @@ def estimate_frame(
     if signal.contact:
         reason = _estimate(state, model, frame, cells)
     else:
-        estimate.d = 0.0
-        estimate.n_x = 0.0
-        estimate.n_y = 0.0
-        estimate.gain = 1.0
         estimate.covariance[0, 0] = state.options.undetected**2
         estimate.systematic[0, 0] = state.options.undetected**2
         if unexplained:
@@ -294,4 +276,3 @@ def estimate_frame(
     elif rejected == OUTLIERS_MAX:
         reason = Invalid.OUTLIERS
     estimate.invalid = reason
-    restore_outliers(state, rejected, cells.height)

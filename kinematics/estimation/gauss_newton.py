@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inner_kernel
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.estimation.error_budget import (
+    product,
     set_shared_errors,
     undetected_misfit,
     widen_covariance,
@@ -25,13 +27,10 @@ from softfinger.kinematics.estimation.state import (
     Cells,
     EstimatorState,
     Fit,
-    Images,
-    Matrix,
     Model,
-    Normal,
     Options,
 )
-from softfinger.kinematics.sensing.footprint import FloatArray, set_face
+from softfinger.kinematics.sensing.footprint import set_face
 from softfinger.kinematics.sensing.solid_pressure import own_shear, press_solid
 from softfinger.kinematics.sensing.springs_pressure import press_springs
 
@@ -39,7 +38,9 @@ from softfinger.kinematics.sensing.springs_pressure import press_springs
 # determined by comparing squared errors with the linear prediction, using simulated frames over the
 # operating range.
 _GAIN_CURVATURE = 6.0
+_ITERATIONS = 20
 _HALVINGS_MAX = 5
+_SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear force, relative to its normal force
 _LIMITED_MAX = 4  # maximum number of consecutive steps that are clamped to the limits of the model
 # Minimum pivot of a scaled normal matrix. For a 2 × 2 matrix, the pivot is the determinant divided
 # by the product of the diagonal elements, with a rounding error of 1e-12.
@@ -61,49 +62,17 @@ def parameters(options: Options) -> tuple[int, int]:
     return GAIN if options.free_gain else DEPTH, PARAMETERS if options.is_solid else SHEAR_X
 
 
-@fast_inner_kernel
-def _set_model(gain: float, cells: Cells, first: int, last: int) -> None:
-    for k in range(first, last):
-        cells.model[k] = gain * cells.stress[k]
-
-
-@fast_inner_kernel
-def _add_shear(images: Images, x: float, y: float, cells: Cells, image: int, count: int) -> None:
-    for k in range(index(0), count):
-        cells.model[k] += x * images.pixels[image + k] + y * images.pixels[image + count + k]
-
-
 @inner_kernel
 def press(state: EstimatorState, model: Model, cells: Cells) -> tuple[int, int]:
     """Evaluate the model at the current contact; return the range of affected cells."""
     fit = state.fit
+    d, n_x, n_y = fit.contact[DEPTH], fit.contact[TILT_X], fit.contact[TILT_Y]
     if state.options.is_solid:
-        images = model.images
-        count = cells.stress.shape[0]
-        weights = images.weights
-        press_solid(weights, images.pixels, fit.d, fit.n_x, fit.n_y, cells.planes)
-        _set_model(fit.gain, cells, index(0), index(count))
-        shear = index(weights.images * count)
-        _add_shear(images, fit.shear[0], fit.shear[1], cells, shear, index(count))
-        return 0, count
-    set_face(fit.face, state.grid.radius, fit.d, fit.n_x, fit.n_y)
+        press_solid(model.weights, model.pixels, d, n_x, n_y, cells.sensitivity[:SHEAR_X])
+        return 0, cells.height.shape[0]
+    set_face(fit.face, state.grid.radius, d, n_x, n_y)
     first, last = press_springs(model.points, state.grid, fit.face, state.around, cells.planes)
-    first *= state.grid.cols
-    last *= state.grid.cols
-    _set_model(fit.gain, cells, index(first), index(last))
-    return first, last
-
-
-@fast_inner_kernel
-def _energy_inside(frame: FloatArray, cells: Cells, first: int, last: int) -> tuple[float, float]:
-    """Return Σ p² over the cells that the model presses, and their number."""
-    energy = 0.0
-    number = 0.0
-    for k in range(first, last):
-        inside = (cells.stress[k] != 0.0) & (cells.height[k] >= 0.0)
-        energy += frame[k] * frame[k] if inside else 0.0
-        number += 1.0 if inside else 0.0
-    return energy, number
+    return first * state.grid.cols, last * state.grid.cols
 
 
 @inner_kernel
@@ -137,7 +106,7 @@ def squared_sum(state: EstimatorState) -> float:
     return energy
 
 
-@inner_kernel
+@fast_inner_kernel
 def _clip_noise(
     state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int
 ) -> float:
@@ -146,24 +115,29 @@ def _clip_noise(
     If the unloaded cells do not show noise, a correction is not needed.
     """
     signal = state.signal
-    inside, inside_number = _energy_inside(frame, cells, index(first), index(last))
+    energy = number = 0.0
+    for k in range(first, last):
+        inside = (cells.sensitivity[GAIN, k] != 0.0) & (cells.height[k] >= 0.0)
+        energy += frame[k] * frame[k] if inside else 0.0
+        number += 1.0 if inside else 0.0
     clip = math.sqrt(signal.variance)
-    number = float(signal.number) - inside_number
+    number = float(signal.number) - number
     if number >= 16.0:
-        free_square = max(squared_sum(state) - inside * signal.scale * signal.scale, 0.0) / number
+        free_square = max(squared_sum(state) - energy * signal.scale * signal.scale, 0.0) / number
         clip = min(clip, free_noise(free_square, signal.floor))
     return clip
 
 
 @fast_inner_kernel
 def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
-    """Compute ``residual`` and ``factor`` of each cell, and their sums, from readings and model.
+    """Compute the model, residual and response of each cell, and their sums.
 
     A cell never reads below the floor, and never below 0 even where the rubber is in tension. A
     saturated cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the
     noise is clipped at the floor; otherwise, cells with a model below the floor are excluded.
     """
     fit = state.fit
+    gain, shear_x, shear_y = fit.contact[GAIN], fit.contact[SHEAR_X], fit.contact[SHEAR_Y]
     saturation = state.signal.saturation
     scale = state.signal.scale
     floor = state.signal.floor
@@ -175,7 +149,8 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
     misfit = readings = weight = 0.0
     for k in range(first, last):
         raw = frame[k] * scale
-        model = cells.model[k]
+        model = gain * cells.sensitivity[GAIN, k]
+        model += shear_x * cells.sensitivity[SHEAR_X, k] + shear_y * cells.sensitivity[SHEAR_Y, k]
         pressure = max(model, 0.0)
         response = 1.0 if model > 0.0 else 0.0
         reading = max(raw, floor)
@@ -190,9 +165,10 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
             rise = above * (above * rise - (2.0 / CLIP_END) * base)
             residual = reading - max(pressure, floor) - clip * above * above * base
             response *= 1.0 + rise if depth >= 0.0 else -rise
-        inside = (cells.stress[k] != 0.0) & (cells.height[k] >= 0.0)
+        inside = (cells.sensitivity[GAIN, k] != 0.0) & (cells.height[k] >= 0.0)
         counts = inside & ((raw < saturation) | (model < saturation)) & (pressure >= lower)
         residual = residual if counts else 0.0
+        cells.model[k] = model
         cells.residual[k] = residual
         cells.factor[k] = response if counts else 0.0
         misfit += residual * residual
@@ -204,64 +180,23 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
 
 
 @fast_inner_kernel
-def _accumulate(fit: Fit, cells: Cells, first: int, last: int) -> None:
-    """Compute JᵀJ and Jᵀr over the cells for the gain, d and the tilts."""
-    gain = fit.gain
-    s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
-    r0 = r1 = r2 = r3 = 0.0
+def _weigh(cells: Cells, row: int, gain: float, first: int, last: int) -> None:
+    """Set one row of the Jacobian."""
     for k in range(first, last):
-        factor = cells.factor[k]
-        residual = cells.residual[k]
-        a0 = factor * cells.stress[k]
-        a1 = factor * cells.by_d[k]
-        a2 = factor * cells.by_x[k]
-        a3 = factor * cells.by_y[k]
-        s00 += a0 * a0
-        s01 += a0 * a1
-        s02 += a0 * a2
-        s03 += a0 * a3
-        s11 += a1 * a1
-        s12 += a1 * a2
-        s13 += a1 * a3
-        s22 += a2 * a2
-        s23 += a2 * a3
-        s33 += a3 * a3
-        r0 += a0 * residual
-        r1 += a1 * residual
-        r2 += a2 * residual
-        r3 += a3 * residual
-    g2 = gain * gain
-    fit.gradient[0], fit.gradient[1] = r0, gain * r1
-    fit.gradient[2], fit.gradient[3] = gain * r2, gain * r3
-    fit.normal[0, 0], fit.normal[1, 0], fit.normal[2, 0] = s00, gain * s01, gain * s02
-    fit.normal[3, 0], fit.normal[1, 1], fit.normal[2, 1] = gain * s03, g2 * s11, g2 * s12
-    fit.normal[3, 1], fit.normal[2, 2], fit.normal[3, 2] = g2 * s13, g2 * s22, g2 * s23
-    fit.normal[3, 3] = g2 * s33
+        cells.jacobian[row, k] = gain * cells.factor[k] * cells.sensitivity[row, k]
 
 
-@fast_inner_kernel
-def _accumulate_shear(
-    fit: Fit, images: Images, cells: Cells, row: int, first: int, second: int
-) -> None:
-    """Compute the entries of the normal equations for the shear image that starts at ``first``."""
-    t0 = t1 = t2 = t3 = own = other = right = 0.0
-    for k in range(index(0), index(cells.factor.shape[0])):
-        factor = cells.factor[k]
-        image = factor * images.pixels[first + k]
-        along = factor * image
-        t0 += along * cells.stress[k]
-        t1 += along * cells.by_d[k]
-        t2 += along * cells.by_x[k]
-        t3 += along * cells.by_y[k]
-        own += image * image
-        other += along * images.pixels[second + k]
-        right += image * cells.residual[k]
-    gain = fit.gain
-    normal = fit.normal
-    normal[row, 0], normal[row, 1], normal[row, 2] = t0, gain * t1, gain * t2
-    normal[row, 3], normal[row, row] = gain * t3, own
-    normal[SHEAR_Y, SHEAR_X] = other
-    fit.gradient[row] = right
+@inner_kernel
+def _accumulate(state: EstimatorState, cells: Cells, begin: int, end: int) -> None:
+    """Compute the Jacobian J, JᵀJ and Jᵀr over the cells from ``begin`` to ``end``."""
+    fit = state.fit
+    rows = cells.jacobian
+    _, last = parameters(state.options)
+    for i in range(last):
+        _weigh(cells, i, fit.contact[GAIN] if DEPTH <= i <= TILT_Y else 1.0, begin, end)
+        fit.gradient[i] = product(rows[i], cells.residual, begin, end)
+        for j in range(i + 1):
+            fit.normal[i, j] = product(rows[i], rows[j], begin, end)
 
 
 @inner_kernel
@@ -271,28 +206,21 @@ def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
     The shear force has a prior whose standard deviation is proportional to the normal force.
     """
     fit = state.fit
-    images = model.images
-    first, last = press(state, model, cells)
-    fit.first_row = first // state.grid.cols
-    fit.last_row = last // state.grid.cols
+    fit.first_cell, fit.last_cell = press(state, model, cells)
+    first, last = index(fit.first_cell), index(fit.last_cell)
     fit.clip_noise = 0.0
     if state.signal.is_clipped:
         fit.clip_noise = _clip_noise(state, frame, cells, first, last)
-    compare(state, frame, cells, index(first), index(last))
-    _accumulate(fit, cells, index(first), index(last))
+    compare(state, frame, cells, first, last)
+    _accumulate(state, cells, first, last)
     cost: float = fit.misfit - fit.readings
     if state.options.is_solid:
-        weights = images.weights
-        one = index(weights.images * last)
-        two = index((weights.images + 1) * last)
-        _accumulate_shear(fit, images, cells, SHEAR_X, one, two)
-        _accumulate_shear(fit, images, cells, SHEAR_Y, two, one)
-        likely = state.options.shear_prior * max(fit.gain * weights.value[0], 1e-9)
+        likely = _SHEAR_PRIOR * max(fit.contact[GAIN] * model.weights.values[0, 0], 1e-9)
         prior = state.signal.variance / (likely * likely)
-        for k in range(2):
-            fit.normal[SHEAR_X + k, SHEAR_X + k] += prior
-            fit.gradient[SHEAR_X + k] -= prior * fit.shear[k]
-            cost += prior * fit.shear[k] * fit.shear[k]
+        for k in range(SHEAR_X, PARAMETERS):
+            fit.normal[k, k] += prior
+            fit.gradient[k] -= prior * fit.contact[k]
+            cost += prior * fit.contact[k] * fit.contact[k]
     return cost
 
 
@@ -304,42 +232,34 @@ def solve(fit: Fit, first: int, last: int) -> bool:
     all parameters.
     """
     normal = fit.normal
-    lower = fit.lower
+    inverse = fit.inverse
     scale = fit.scale
+    inverse[:] = 0.0
     for i in range(first, last):
         if not normal[i, i] > 0.0:
             return False
         scale[i] = 1.0 / math.sqrt(normal[i, i])
-    # Compute the Cholesky factor, and store its inverse in place.
-    for j in range(first, last):
-        pivot = 1.0
-        for k in range(first, j):
-            pivot -= lower[j, k] * lower[j, k]
+        for j in range(first, i + 1):
+            inverse[i, j] = inverse[j, i] = normal[i, j] * scale[i] * scale[j]
+    # Sweeping the matrix on each diagonal element in turn replaces it by its negative inverse.
+    for k in range(first, last):
+        pivot = inverse[k, k]
         if not pivot > _PIVOT_MIN:
             return False
-        lower[j, j] = math.sqrt(pivot)
-        for i in range(j + 1, last):
-            value = normal[i, j] * scale[i] * scale[j]
-            for k in range(first, j):
-                value -= lower[i, k] * lower[j, k]
-            lower[i, j] = value / lower[j, j]
-    for j in range(first, last):
-        lower[j, j] = 1.0 / lower[j, j]
-        for i in range(j + 1, last):
-            value = 0.0
-            for k in range(j, i):
-                value -= lower[i, k] * lower[k, j]
-            lower[i, j] = value / lower[i, i]
-    fit.inverse[:] = 0.0
+        for i in range(first, last):
+            for j in range(first, last):
+                if i != k and j != k:
+                    inverse[i, j] -= inverse[i, k] * inverse[k, j] / pivot
+        for i in range(first, last):
+            inverse[i, k] /= pivot
+            inverse[k, i] = inverse[i, k]
+        inverse[k, k] = -1.0 / pivot
     fit.step[:] = 0.0
     fit.decrement = 0.0
     for i in range(first, last):
         for j in range(first, last):
-            value = 0.0
-            for k in range(max(i, j), last):
-                value += lower[k, i] * lower[k, j]
-            fit.inverse[i, j] = value * scale[i] * scale[j]
-            fit.step[i] += fit.inverse[i, j] * fit.gradient[j]
+            inverse[i, j] *= -scale[i] * scale[j]
+            fit.step[i] += inverse[i, j] * fit.gradient[j]
         fit.decrement += fit.step[i] * fit.gradient[i]
     return math.isfinite(fit.decrement)
 
@@ -349,33 +269,25 @@ def _apply_step(state: EstimatorState) -> bool:
     """Apply the step, clamped to the model's limits; return False if d was clamped."""
     fit = state.fit
     options = state.options
-    shallow = fit.d
-    fit.gain = max(fit.gain + fit.step[GAIN], 0.2 * fit.gain)
-    fit.n_x += fit.step[TILT_X]
-    fit.n_y += fit.step[TILT_Y]
-    fit.shear[0] += fit.step[SHEAR_X]
-    fit.shear[1] += fit.step[SHEAR_Y]
-    tilt = math.hypot(fit.n_x, fit.n_y)
+    contact = fit.contact
+    for i in range(PARAMETERS):
+        fit.previous[i] = contact[i]
+        contact[i] += fit.step[i]
+    contact[GAIN] = max(contact[GAIN], 0.2 * fit.previous[GAIN])
+    tilt = math.hypot(contact[TILT_X], contact[TILT_Y])
     fit.is_limited = tilt > options.step_sine
     if fit.is_limited:
-        fit.n_x *= options.step_sine / tilt
-        fit.n_y *= options.step_sine / tilt
-    d = fit.d + fit.step[DEPTH]
+        contact[TILT_X] *= options.step_sine / tilt
+        contact[TILT_Y] *= options.step_sine / tilt
+    d = contact[DEPTH]
     fit.is_limited = fit.is_limited or d > options.step_deepest
-    fit.d = min(max(d, 0.3 * shallow, 1e-4 * state.grid.radius), options.step_deepest)
-    return bool(d == fit.d)
+    least = max(0.3 * fit.previous[DEPTH], 1e-4 * state.grid.radius)
+    contact[DEPTH] = min(max(d, least), options.step_deepest)
+    return bool(d == contact[DEPTH])
 
 
 @inner_kernel
-def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
-    """Set the covariance of (d, n_x, n_y, gain) from the covariance of the fit parameters."""
-    for i in range(4):
-        for j in range(4):
-            out[(i + 3) % 4, (j + 3) % 4] = variance * inverse[i, j]
-
-
-@inner_kernel
-def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
+def _check_fit(state: EstimatorState, cells: Cells) -> float:
     """Compute χ² of the solved fit, and the covariance due to common errors and smooth misfit.
 
     Returns the noise variance [Pa²], or a negative value if there are too few cells. The variance
@@ -395,11 +307,11 @@ def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
     budget.shared[:] = 0.0
     if budget.has_common_errors:
         expected = set_shared_errors(state, cells)
-        estimate.shared = math.sqrt(budget.shared[DEPTH, DEPTH]) / fit.d
+        estimate.shared = math.sqrt(budget.shared[DEPTH, DEPTH]) / fit.contact[DEPTH]
     beyond = misfit - expected - variance * freedom
     if beyond > variance * math.sqrt(2.0 * max(freedom, 0.0)):
         undetected = undetected_misfit(state, cells, beyond)
-        estimate.undetected = math.sqrt(undetected * fit.inverse[DEPTH, DEPTH]) / fit.d
+        estimate.undetected = math.sqrt(undetected * fit.inverse[DEPTH, DEPTH]) / fit.contact[DEPTH]
         for i in range(PARAMETERS):
             for j in range(PARAMETERS):
                 budget.shared[i, j] += undetected * fit.inverse[i, j]
@@ -413,36 +325,40 @@ def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
 
 @inner_kernel
 def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) -> bool:
-    """Set the estimate and its covariance after the fit; return False for too few cells."""
+    """Set the estimate after the fit; return False for too few cells.
+
+    ``fit.inverse`` times ``fit.variance`` is the covariance due to noise, and ``budget.shared``
+    times ``fit.widening`` the covariance due to other errors.
+    """
     fit = state.fit
     estimate = state.estimate
     options = state.options
-    square = fit.n_x * fit.n_x + fit.n_y * fit.n_y
+    contact = estimate.guess
+    contact[:] = fit.contact
+    d = contact[DEPTH]
+    square = contact[TILT_X] * contact[TILT_X] + contact[TILT_Y] * contact[TILT_Y]
     if options.is_solid:
         area = state.grid.radius * state.grid.radius
         along = area * math.cos(options.rotation)
         across = area * math.sin(options.rotation)
-        own = fit.gain * own_shear(model.images.weights, fit.d, square)
-        x = fit.shear[0] + own * fit.n_x
-        y = fit.shear[1] + own * fit.n_y
+        own = contact[GAIN] * own_shear(model.weights, d, square)
+        x = contact[SHEAR_X] + own * contact[TILT_X]
+        y = contact[SHEAR_Y] + own * contact[TILT_Y]
         estimate.shear_x = along * x - across * y
         estimate.shear_y = across * x + along * y
     # Clamp the result, because noise may push the fit beyond the limits of the model.
     within = min(1.0, options.sine_max / max(math.sqrt(square), 1e-9))
-    estimate.d = min(fit.d, options.deepest)
-    estimate.n_x = within * fit.n_x
-    estimate.n_y = within * fit.n_y
-    estimate.gain = fit.gain
-    estimate.shear[:] = fit.shear
+    contact[DEPTH] = min(d, options.deepest)
+    contact[TILT_X] *= within
+    contact[TILT_Y] *= within
     estimate.iterations = iterations
-    variance = _check_fit(state, model, cells)
-    wider = 1.0
+    variance = _check_fit(state, cells)
+    fit.widening = 1.0
     if options.free_gain:
         # The larger the uncertainty of d, the less linear is the relation between d and the gain.
         uncertain = variance * fit.inverse[DEPTH, DEPTH] + state.budget.shared[DEPTH, DEPTH]
-        wider += _GAIN_CURVATURE * min(uncertain / (fit.d * fit.d), 1.0)
-    set_covariance(fit.inverse, wider * variance, fit.covariance)
-    set_covariance(state.budget.shared, wider, state.budget.covariance)
+        fit.widening += _GAIN_CURVATURE * min(uncertain / (d * d), 1.0)
+    fit.variance = fit.widening * variance
     return bool(variance > 0.0)
 
 
@@ -450,7 +366,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
 def fit(
     state: EstimatorState, model: Model, frame: FloatArray, cells: Cells, tolerance: float
 ) -> bool:
-    """Run the Gauss-Newton method from the contact in ``state.estimate``; store the result there.
+    """Run the Gauss-Newton method from the guess in ``state.estimate``; store the result there.
 
     The iteration stops if the predicted decrement is below ``tolerance`` · variance, where
     ``tolerance`` is the squared ratio of the step to the noise floor. Returns False if the frame
@@ -458,41 +374,27 @@ def fit(
     the limits of the model.
     """
     fit = state.fit
-    estimate = state.estimate
     variance = state.signal.variance
     first, last = parameters(state.options)
-    fit.d = min(estimate.d, state.options.deepest)
-    fit.n_x = estimate.n_x
-    fit.n_y = estimate.n_y
-    fit.gain = estimate.gain
-    fit.shear[:] = estimate.shear
-    d = n_x = n_y = gain = shear_x = shear_y = 0.0  # parameter values before the last step
+    fit.variance = 0.0
+    fit.contact[:] = state.estimate.guess
+    fit.contact[DEPTH] = min(fit.contact[DEPTH], state.options.deepest)
     before = math.inf
     halvings = 0
     limited = 0
     solved = False
-    for iteration in range(state.options.iterations):
+    for iteration in range(_ITERATIONS):
         cost = linearise(state, model, frame, cells)
         if solved and not cost <= before + variance and halvings < _HALVINGS_MAX:
             # The cost has increased, so halve the step.
-            fit.d = 0.5 * (fit.d + d)
-            fit.n_x = 0.5 * (fit.n_x + n_x)
-            fit.n_y = 0.5 * (fit.n_y + n_y)
-            fit.gain = 0.5 * (fit.gain + gain)
-            fit.shear[0] = 0.5 * (fit.shear[0] + shear_x)
-            fit.shear[1] = 0.5 * (fit.shear[1] + shear_y)
+            for i in range(PARAMETERS):
+                fit.contact[i] = 0.5 * (fit.contact[i] + fit.previous[i])
             halvings += 1
             continue
         before = cost
         solved = solve(fit, first, last)
         if not solved:
             return False
-        d = fit.d
-        n_x = fit.n_x
-        n_y = fit.n_y
-        gain = fit.gain
-        shear_x = fit.shear[0]
-        shear_y = fit.shear[1]
         halvings = 0
         kept = not _apply_step(state)
         limited = limited + 1 if fit.is_limited else 0

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.tip_curves import Curve
 from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.frame_pipeline import ABOVE_FRACTION, ABOVE_PEAK
 from softfinger.kinematics.estimation.invalid import Invalid
-from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _CONTACT_SIGMA = 5.0  # contact threshold of the sum of readings, in standard deviations
@@ -192,16 +192,27 @@ class MeasuredEstimator:
             t = self._root_of(force, s * s, t)
             if abs(step) < _TOLERANCE:
                 break
-        c_x, c_y = (along / moment, across / moment) if moment > 0.0 else (1.0, 0.0)
-        std, covariances = self._covariances(t, s, c_x, c_y)
-        s *= 1.0 - std * std / (std * std + self._tilt_sine_max * self._tilt_sine_max)
-        t = self._root_of(force, s * s, t)
+        direction = np.array([along, across]) / moment if moment > 0.0 else np.array([1.0, 0.0])
+        n = s * direction
+        inverse, errors = self._errors(t, n)
+        std = math.sqrt(direction @ errors[1:, 1:] @ direction)
+        # Where the centroid hardly determines the tilt, the tilt range of the calibration presses
+        # serves as a prior. As in a Kalman update, the prior pulls the tilt towards 0; this error
+        # is common to all frames.
+        prior = self._tilt_sine_max**2 * np.eye(2)
+        pull = errors[:, 1:] @ np.linalg.inv(errors[1:, 1:] + prior)
+        n -= pull[1:] @ n
+        covariance = errors - pull @ errors[1:]
+        inverse -= pull @ inverse[1:]
+        systematic = covariance - inverse @ self._noise[:3, :3] @ inverse.T
+        square_n = float(n @ n)
+        t = self._root_of(force, square_n, t)
         result.d = self._law.radius * t * t
-        result.tilt_x, result.tilt_y = math.asin(s * c_x), math.asin(s * c_y)
+        result.tilt_x, result.tilt_y = np.arcsin(n).tolist()
         per_tilt = np.array([1.0, 1.0 / math.cos(result.tilt_x), 1.0 / math.cos(result.tilt_y)])
-        for found, out in zip(covariances, (result.covariance, result.systematic), strict=True):
-            out[:3, :3] = found * np.outer(per_tilt, per_tilt)
-        extent = force * _curve(self._law.extent, t, s * s)[0]
+        result.covariance[:3, :3] = covariance * np.outer(per_tilt, per_tilt)
+        result.systematic[:3, :3] = systematic * np.outer(per_tilt, per_tilt)
+        extent = force * _curve(self._law.extent, t, square_n)[0]
         # A second contact would change the mean squared radius by more than this tolerance.
         tolerance = _EXTENT_ERROR_MAX * extent + _CONTACT_SIGMA * math.sqrt(self._noise[3, 3])
         agrees = abs(square - extent) < tolerance
@@ -210,49 +221,26 @@ class MeasuredEstimator:
             return Invalid.OUT_OF_RANGE
         return Invalid.NONE if agrees else Invalid.MODEL_MISMATCH
 
-    def _covariances(
-        self, t: float, s: float, c_x: float, c_y: float
-    ) -> tuple[float, tuple[FloatArray, FloatArray]]:
-        """Return the standard deviation of sin θ due to errors in the sums, and two covariances.
+    def _errors(self, t: float, n: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the partials of (d, n_x, n_y) in the sums, and the covariance of (d, n_x, n_y).
 
-        Both covariances are those of (d, n_x, n_y): one for all errors, and one for the errors
-        common to all frames. The errors of the sum and of both moments are propagated through the
-        partials, in axes along and across the tilt. Where the centroid hardly determines the tilt,
-        the tilt range of the calibration presses serves as a prior. As in a Kalman update, the
-        prior pulls the tilt towards 0; this error is common to all frames.
+        The covariance includes the noise of the sums and the errors that are common to all frames.
         """
-        law, known, q = self._law, self._known, s * s
+        law, known, q = self._law, self._known, float(n @ n)
         shown, shown_t, shown_q = _curve(law.shown, t, q)
         lever, lever_t, lever_q = _curve(law.lever, t, q)
+        moment, moment_q = shown * lever, shown_q * lever + shown * lever_q
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        # Partial derivatives of the sum and of the moment along the tilt with respect to d and s,
-        # followed by the derivative of the moment across the tilt with respect to the tilt in that
-        # direction.
-        by_d = shown_t * per_d, s * (shown_t * per_d * lever + shown * lever_t * per_d)
-        b = 2.0 * s * shown_q
-        by_s = b, shown * lever + s * (b * lever + shown * 2.0 * s * lever_q)
-        partials = np.array(
-            [[by_d[0], by_s[0], 0.0], [by_d[1], by_s[1], 0.0], [0.0, 0.0, shown * lever]]
-        )
-        jacobian = np.linalg.inv(partials)
-        rotation = np.array([[1.0, 0.0, 0.0], [0.0, c_x, c_y], [0.0, -c_y, c_x]])
-        random = rotation @ self._noise[:3, :3] @ rotation.T
-        shift = rotation @ self._shift[:3]
-        by_gain = known.gain * shown * np.array([1.0, lever * s, 0.0])
-        centre_error = math.hypot(law.lever_error, known.centre)
-        rotation_error = math.hypot(centre_error, known.rotation * lever * s)
-        curve_errors = (shown * np.array([law.force_error, centre_error, rotation_error])) ** 2
-        curve_errors[1:] += self._zero_moment**2
-        shared = np.outer(shift, shift) + np.outer(by_gain, by_gain) + np.diag(curve_errors)
-        errors = jacobian @ (random + shared) @ jacobian.T
-        prior = self._tilt_sine_max * self._tilt_sine_max
-        shrinkage = np.array([[errors[0, 1], 0.0], [errors[1, 1], 0.0], [0.0, errors[2, 2]]]) / (
-            errors.diagonal()[1:] + prior
-        )
-        jacobian -= shrinkage @ jacobian[1:]
-        prior_error = prior * shrinkage @ shrinkage.T
-        both = (
-            rotation.T @ (jacobian @ each @ jacobian.T + prior_error) @ rotation
-            for each in (random + shared, shared)
-        )
-        return math.sqrt(errors[1, 1]), (next(both), next(both))
+        partials = np.zeros((3, 3))  # of the sum and both moments in (d, n_x, n_y)
+        partials[0] = shown_t * per_d, *(2.0 * shown_q * n)
+        partials[1:, 0] = (shown_t * lever + shown * lever_t) * per_d * n
+        partials[1:, 1:] = moment * np.eye(2) + 2.0 * moment_q * np.outer(n, n)
+        inverse = np.asarray(np.linalg.inv(partials))
+        moment_error = (shown * math.hypot(law.lever_error, known.centre)) ** 2
+        moment_error += self._zero_moment**2
+        errors = np.diag([(shown * law.force_error) ** 2, moment_error, moment_error])
+        by_gain = known.gain * np.array([shown, *(moment * n)])
+        by_rotation = known.rotation * moment * np.array([0.0, -n[1], n[0]])
+        for each in (self._shift[:3], by_gain, by_rotation):
+            errors += np.outer(each, each)
+        return inverse, np.asarray(inverse @ (self._noise[:3, :3] + errors) @ inverse.T)

@@ -10,13 +10,22 @@ import math
 
 import numpy as np
 
-from softfinger.kinematics.compiled.kernel import inner_kernel
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inner_kernel
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.cell_centres import next_above, sums_above, sums_inside
-from softfinger.kinematics.estimation.detection import neighbourhood
-from softfinger.kinematics.estimation.state import START_POINTS, Cells, EstimatorState, Moments
-from softfinger.kinematics.sensing.footprint import FloatArray, Grid, set_around, set_face
+from softfinger.kinematics.estimation.detection import neighbourhood, next_above
+from softfinger.kinematics.estimation.state import (
+    DEPTH,
+    GAIN,
+    START_POINTS,
+    TILT_X,
+    TILT_Y,
+    Cells,
+    EstimatorState,
+    Moments,
+)
+from softfinger.kinematics.sensing.footprint import axes, set_around, set_face
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 # Margin around the footprint, in cell diagonals. All cells that touch the footprint have their
@@ -27,7 +36,6 @@ _BLUR_MARGIN = 2.0  # additional margin around the footprint, in standard deviat
 _TILT = 0.2
 _WEAK_PEAK = 15.0  # peak below which neighbourhoods are used, in noise standard deviations
 _SINE_MAX = 0.95
-_NO_LEVEL = -1e300  # threshold that is below every reading
 
 
 def tabulate_moments(
@@ -35,8 +43,7 @@ def tabulate_moments(
 ) -> None:
     """Tabulate the moments of the model for d up to ``deepest`` [m]."""
     cells = grid.on(tip)
-    x = (cells.x + cells.pitch_x * (np.arange(cells.cols) + 0.5))[None, :]
-    y = (cells.y + cells.pitch_y * (np.arange(cells.rows) + 0.5))[:, None]
+    x, y = np.meshgrid(*axes(cells))
     for k in range(1, START_POINTS):
         d = deepest * (k / (START_POINTS - 1)) ** 2
         straight, tilted = (grid.pressure(tip, material, d, tilt) for tilt in (0.0, _TILT))
@@ -73,111 +80,137 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
     """Estimate the contact from the frame alone: once from strong cells, twice from moments."""
     m = state.moments
     signal = state.signal
-    estimate = state.estimate
+    guess = state.estimate.guess
+    guess[:] = 0.0
     if state.options.is_solid:
         # A solid tip loads its whole base, and the extent of the pressure hardly depends on d.
-        sums_above(m, frame, cells, _NO_LEVEL)
-        m.gain = 1.0
-        if m.total > 0.0:
-            m.x /= m.total
-            m.y /= m.total
-        _set_contact(state, False)
+        _select_inside(cells, 0.0, 0.0, 0.0)
+        _set_moments(m, frame, cells)
+        _set_contact(state)
     else:
         weak = signal.peak <= _WEAK_PEAK * signal.noise
         if weak:
-            _sums_of_weak(state, frame, cells)
+            _select_weak(state, frame, cells)
         else:
-            sums_above(m, frame, cells, max(4.0 * signal.noise, 0.15 * signal.peak))
+            _select_above(frame, cells, max(4.0 * signal.noise, 0.15 * signal.peak))
+        _set_moments(m, frame, cells)
         if not m.total > 0.0:
             at = signal.row * state.grid.cols + signal.col
-            m.total, m.x, m.y, m.number = 1.0, cells.x[at], cells.y[at], 1.0
+            m.x, m.y, m.number = cells.x[at], cells.y[at], 1.0
         # In a weak contact, about three quarters of the cells exceed the threshold.
-        _set_from_area(m, state.grid, 1.3 * m.number if weak else m.number)
+        _set_from_area(state, 1.3 * m.number if weak else m.number)
         _refine(state, frame, cells)
         _refine(state, frame, cells)
-    estimate.d = m.d
-    estimate.n_x = m.n_x
-    estimate.n_y = m.n_y
-    estimate.gain = min(max(m.gain, 0.02), 50.0)
-    estimate.shear[:] = 0.0
+    guess[GAIN] = min(max(guess[GAIN], 0.02), 50.0)
 
 
-@inner_kernel
-def _sums_of_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Compute the same sums as :func:`sums_above` for pressures of a few times the noise.
-
-    Single noisy cells would distort the sums. The sums therefore include only cells that read at
-    least twice the noise and have a significant neighbourhood.
-    """
-    m = state.moments
-    level = 2.0 * state.signal.noise
-    patch = state.options.patch_level * state.signal.noise
-    last = frame.shape[0]
-    total = sum_x = sum_y = number = 0.0
-    at = next_above(frame, cells.height, 0, last, level)
-    while at < last:
-        if neighbourhood(frame, cells.height, state.grid, at) > patch:
-            total += frame[at]
-            sum_x += frame[at] * cells.x[at]
-            sum_y += frame[at] * cells.y[at]
-            number += 1.0
-        at = next_above(frame, cells.height, at + 1, last, level)
+@fast_inner_kernel
+def _set_moments(m: Moments, frame: FloatArray, cells: Cells) -> None:
+    """Compute the moments of the frame over the cells with a nonzero ``factor``."""
+    total = sum_x = sum_y = square = number = 0.0
+    for k in range(index(0), index(frame.shape[0])):
+        counts = cells.factor[k] != 0.0
+        x = cells.x[k]
+        y = cells.y[k]
+        value = frame[k] if counts else 0.0
+        total += value
+        sum_x += value * x
+        sum_y += value * y
+        square += value * (x * x + y * y)
+        number += 1.0 if counts else 0.0
+    each = 1.0 / total if total > 0.0 else 0.0
     m.total = total
-    m.x = sum_x
-    m.y = sum_y
+    m.x = each * sum_x
+    m.y = each * sum_y
+    m.trace = each * square - m.x * m.x - m.y * m.y
     m.number = number
 
 
+@fast_inner_kernel
+def _select_above(frame: FloatArray, cells: Cells, level: float) -> None:
+    """Select the cells that read more than ``level``."""
+    for k in range(index(0), index(frame.shape[0])):
+        cells.factor[k] = 1.0 if (cells.height[k] >= 0.0) & (frame[k] > level) else 0.0
+
+
+@fast_inner_kernel
+def _select_inside(cells: Cells, u: float, v: float, w: float) -> None:
+    """Select the cells whose centre is pressed by the face."""
+    for k in range(index(0), index(cells.height.shape[0])):
+        inside = cells.height[k] > u - v * cells.x[k] - w * cells.y[k]
+        cells.factor[k] = 1.0 if inside else 0.0
+
+
 @inner_kernel
-def _set_from_area(m: Moments, grid: Grid, number: float) -> None:
-    """Set (d, n_x, n_y) for a contact of ``number`` cells around the centroid of the sums."""
+def _select_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
+    """Select the cells of a contact whose pressures are a few times the noise.
+
+    Single noisy cells would distort the moments. Therefore a cell must read at least twice the
+    noise and have a significant neighbourhood.
+    """
+    level = 2.0 * state.signal.noise
+    patch = state.options.patch_level * state.signal.noise
+    last = frame.shape[0]
+    cells.factor[:] = 0.0
+    at = next_above(frame, cells.height, 0, last, level)
+    while at < last:
+        if neighbourhood(frame, cells.height, state.grid, at) > patch:
+            cells.factor[at] = 1.0
+        at = next_above(frame, cells.height, at + 1, last, level)
+
+
+@inner_kernel
+def _set_from_area(state: EstimatorState, number: float) -> None:
+    """Set the guess for a contact of ``number`` cells around the centroid of the moments."""
+    grid = state.grid
     a = grid.radius
     # The footprint area is π ρ² cos θ with ρ² = 2 a d − d².
     rho2 = min(number * grid.pitch_x * grid.pitch_y / math.pi, 0.75 * a * a)
-    m.d = max(a - math.sqrt(a * a - rho2), 1e-3 * a)
-    distance = m.total * (a - m.d / 3.0)
-    _set_normal(m, m.x / distance, m.y / distance)
+    d = max(a - math.sqrt(a * a - rho2), 1e-3 * a)
+    state.estimate.guess[DEPTH] = d
+    _set_normal(state, a - d / 3.0)
 
 
 @inner_kernel
-def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
-    """Set (n_x, n_y), shortened if it is too long for a unit normal."""
+def _set_normal(state: EstimatorState, arm: float) -> None:
+    """Set the normal by the centroid, shortened if it is too long for a unit normal."""
+    guess = state.estimate.guess
+    n_x, n_y = state.moments.x / arm, state.moments.y / arm
     shorter = min(1.0, _SINE_MAX / max(math.hypot(n_x, n_y), 1e-9))
-    m.n_x = shorter * n_x
-    m.n_y = shorter * n_y
+    guess[TILT_X] = shorter * n_x
+    guess[TILT_Y] = shorter * n_y
 
 
 @inner_kernel
 def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Refine the contact in ``state.moments`` using the moments over the widened footprint."""
-    m = state.moments
+    """Refine the guess using the moments over its widened footprint."""
+    guess = state.estimate.guess
     grid = state.grid
     face = state.around
     a = grid.radius
     margin = _MARGIN * math.hypot(grid.pitch_x, grid.pitch_y) + _BLUR_MARGIN * state.options.blur
-    set_face(face, a, m.d, m.n_x, m.n_y)
+    set_face(face, a, guess[DEPTH], guess[TILT_X], guess[TILT_Y])
     set_around(face, face, a, margin)
-    sums_inside(m, frame, cells, face.u, face.v, face.w)
-    m.gain = 0.0
-    if m.total > 0.0:
-        m.x /= m.total
-        m.y /= m.total
-        m.trace = m.trace / m.total - m.x * m.x - m.y * m.y
-        _set_contact(state, state.options.free_gain)
+    _select_inside(cells, face.u, face.v, face.w)
+    _set_moments(state.moments, frame, cells)
+    guess[GAIN] = 0.0
+    if state.moments.total > 0.0:
+        _set_contact(state)
 
 
 @inner_kernel
-def _set_contact(state: EstimatorState, by_extent: bool) -> None:
-    """Set the contact from the moments.
+def _set_contact(state: EstimatorState) -> None:
+    """Set the guess from the moments.
 
-    If ``by_extent`` is True, the extent determines d and the force determines the gain. Otherwise
-    the force determines d.
+    If a spring tip's gain is free, the extent determines d and the force determines the gain.
+    Otherwise the force determines d.
     """
     m = state.moments
+    guess = state.estimate.guess
+    by_extent = state.options.free_gain and not state.options.is_solid
     force = m.total * state.signal.scale
     t = _inverse(m.extent, m.trace) if by_extent else _inverse(m.force, force)
     t = max(t, 0.25)
-    m.d = state.options.deepest * (t / (START_POINTS - 1)) ** 2
-    m.gain = force / _interpolate(m.force, t) if by_extent else 1.0
-    centroid_arm = _interpolate(m.centroid_arm, t)
-    _set_normal(m, m.x / centroid_arm, m.y / centroid_arm)
+    guess[DEPTH] = state.options.deepest * (t / (START_POINTS - 1)) ** 2
+    guess[GAIN] = force / _interpolate(m.force, t) if by_extent else 1.0
+    _set_normal(state, _interpolate(m.centroid_arm, t))

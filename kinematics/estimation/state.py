@@ -5,21 +5,17 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple, TypeAlias
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.layout import Pair, Record
-from softfinger.kinematics.sensing.footprint import Face, FloatArray, Grid, IntArray
+from softfinger.kinematics.compiled.layout import FloatArray, Record
+from softfinger.kinematics.sensing.footprint import Face, Grid
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-OUTLIERS_MAX = 6  # maximum number of outliers that are excluded from a frame
 # Fit parameters. The last two apply only to solid tips.
 GAIN, DEPTH, TILT_X, TILT_Y, SHEAR_X, SHEAR_Y = range(6)
 PARAMETERS = 6
 START_POINTS = 17  # number of depths in the table for the initial estimate
 DEPTHS = 12  # number of depths in the table for the effects of correlated noise
-# Patterns of common errors: a shift of all cells, its slopes in x and y, the tip position in x and
-# y, the pitch, and the pressure itself.
-SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING, PRESSURE = range(7)
-SOURCES = 7
+SOURCES = 7  # number of patterns of common errors, see `error_budget`
 
 Matrix: TypeAlias = Annotated[FloatArray, 4, 4]
 Column: TypeAlias = Annotated[FloatArray, PARAMETERS]
@@ -32,23 +28,19 @@ class Options(Record):
 
     noise: float  # standard deviation of a cell [Pa]
     undetected: float  # d of the smallest detectable contact [m]
-    saturation: float  # [counts]
     floor: float  # smallest count that the board sends, minus one half
     tolerance: float
-    peak_level: float  # [noise standard deviations]
-    patch_level: float
-    r_squared_min: float
-    modulus: float  # modulus at zero strain [Pa]
+    patch_level: float  # [noise standard deviations]
+    modulus: float  # at zero strain [Pa]
     blur: float  # standard deviation [m]
     rotation: float  # rotation of the sensor [rad]
-    iterations: int
+    number: int  # number of cells that a contact can press
     free_gain: bool
     is_solid: bool
     deepest: float  # maximum d of the model [m]
     sine_max: float  # sine of the model's maximum tilt
     step_deepest: float  # limits during the iteration: d [m] and the sine of the tilt
     step_sine: float
-    shear_prior: float  # standard deviation of the shear, relative to the normal force
 
 
 class Signal(Record):
@@ -61,7 +53,7 @@ class Signal(Record):
     patch_level: float
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf without a floor
-    number: int  # number of cells that a contact can press
+    number: int  # number of cells that a contact can press, without outliers
     peak: float  # largest reading [counts]; if it is below the level, row and col are −1
     row: int
     col: int
@@ -73,7 +65,7 @@ class Signal(Record):
 
 
 class Estimate(Record):
-    """Estimate for one frame, first in sensor axes, then in finger axes; next initial guess."""
+    """Estimate for one frame in finger axes, and the next initial guess in sensor axes."""
 
     d: float
     gain: float
@@ -91,9 +83,7 @@ class Estimate(Record):
     has_last_contact: bool
     shear_x: float  # force on the face of a solid tip [N]
     shear_y: float
-    n_x: float
-    n_y: float
-    shear: Pair  # shear force of the model divided by the squared radius [Pa]
+    guess: Column  # fit parameters of the last fit, or of the initial estimate
     residual: float  # sum of (reading − model)² − reading² over the footprint [Pa²]
     undetected: float  # relative error of d that a smooth misfit may cause
     shared: float  # relative standard deviation of d due to known uncertainties
@@ -102,17 +92,13 @@ class Estimate(Record):
 
 
 class Moments(Record):
-    """Sums over the footprint and the contact estimated from them."""
+    """Moments of the selected cells, and a table of the model's moments."""
 
     total: float  # Σ p
     x: float  # centroid
     y: float
     trace: float  # trace of the pressure's covariance
     number: float  # number of cells
-    d: float
-    n_x: float
-    n_y: float
-    gain: float
     # Moments of the model at the depths deepest · (k/(START_POINTS − 1))².
     force: Depths  # Σ p for an upright tip [Pa]
     extent: Depths  # trace of the pressure's covariance for an upright tip [m²]
@@ -123,13 +109,10 @@ class Fit(Record):
     """Gauss-Newton step for one contact and gain."""
 
     face: Face
-    gain: float
-    d: float
-    n_x: float
-    n_y: float
-    shear: Pair
-    first_row: int  # range of cells that are under pressure in the model
-    last_row: int
+    contact: Column  # gain, d [m], n_x, n_y in sensor axes, shear force divided by a² [Pa]
+    previous: Column  # contact before the last step
+    first_cell: int  # range of cells that are under pressure in the model
+    last_cell: int
     clip_noise: float  # noise of cells that are clipped at the floor, or 0 without clipping [Pa]
     decrement: float  # predicted decrease of the sum of squares
     misfit: float  # Σ (reading − model)²
@@ -140,9 +123,10 @@ class Fit(Record):
     gradient: Column  # Jᵀr
     step: Column
     scale: Column
-    lower: Normal
     inverse: Normal
-    covariance: Matrix  # covariance of (d, n_x, n_y, gain)
+    variance: float  # factor from ``inverse`` to the covariance due to noise [Pa²]
+    widening: float  # factor from `Budget.shared` to the covariance due to other errors
+    to_results: Matrix  # partials of (d, tilt_x, tilt_y, gain) with respect to the fit parameters
 
 
 class Budget(Record):
@@ -160,11 +144,9 @@ class Budget(Record):
     is_correlated: bool
     # Factors on the four standard deviations, and degrees of freedom used.
     widening: Annotated[FloatArray, DEPTHS, 5]
-    responses: Annotated[FloatArray, PARAMETERS, SOURCES]  # Jᵀq
-    squares: Annotated[FloatArray, SOURCES]  # qᵀq
-    displacement: Column
-    shared: Normal  # covariance due to common errors
-    covariance: Matrix  # covariance of (d, n_x, n_y, gain) due to common errors
+    response: Column  # Jᵀq of one pattern q, times its size
+    displacement: Column  # change of the fit parameters by one pattern
+    shared: Normal  # covariance of the fit parameters due to common errors and smooth misfit
 
 
 class EstimatorState(Record):
@@ -178,53 +160,44 @@ class EstimatorState(Record):
     fit: Fit
     budget: Budget
     around: Face  # widened footprint
-    outliers: Annotated[IntArray, OUTLIERS_MAX]  # cell indices
 
 
 class Cells(NamedTuple):
-    """Arrays over the cells of `EstimatorState.grid`, float64 [cells].
+    """Arrays over the cells of `EstimatorState.grid`, float64 [cells] or [·, cells]."""
 
-    ``planes`` [4, rows, cols] combines the arrays ``stress`` to ``by_y``: the modelled pressure at
-    a gain of 1, and its partials.
-    """
-
-    planes: FloatArray
-    stress: FloatArray
-    by_d: FloatArray
-    by_x: FloatArray
-    by_y: FloatArray
-    height: FloatArray  # √(a² − x² − y²), see `cell_centres`; negative for unused cells [m]
+    sensitivity: FloatArray  # pressure at a gain of 1, its partials, shear images [PARAMETERS, ·]
+    planes: FloatArray  # the first four rows of ``sensitivity``, [4, rows, cols]
+    reach: FloatArray  # √(a² − x² − y²), negative for unused cells [m]
     x: FloatArray  # cell centre [m]
     y: FloatArray
+    height: FloatArray  # the same as ``reach``, but negative for the frame's outliers, too
     pattern: FloatArray  # pattern for detecting the contact of a solid tip
     model: FloatArray  # modelled pressure including gain and shear [Pa]
     residual: FloatArray  # reading − model, or 0 for cells excluded from the fit [Pa]
     factor: FloatArray  # sensitivity of the reading to pressure, or 0 for excluded cells
+    jacobian: FloatArray  # partials of the readings with respect to the parameters [PARAMETERS, ·]
+    errors: FloatArray  # patterns of the common errors [SOURCES, ·]
 
 
-STRESS, BY_D, BY_X, BY_Y, HEIGHT, X, Y, PATTERN, MODEL, RESIDUAL, FACTOR = range(11)  # row indices
-ROWS = 11
+# Row indices.
+REACH, X, Y, HEIGHT, PATTERN, MODEL, RESIDUAL, FACTOR, JACOBIAN = range(PARAMETERS, PARAMETERS + 9)
+ERRORS = JACOBIAN + PARAMETERS
+ROWS = ERRORS + SOURCES
 
 
 @inner_kernel
 def cells_in(rows: FloatArray, grid: Grid) -> Cells:
     """Return the cell arrays stored in ``rows`` [ROWS, cells]."""
-    planes = rows[:HEIGHT].reshape((HEIGHT, grid.rows, grid.cols))
+    planes = rows[:SHEAR_X].reshape((SHEAR_X, grid.rows, grid.cols))
     return Cells(
-        planes, rows[STRESS], rows[BY_D], rows[BY_X], rows[BY_Y], rows[HEIGHT], rows[X], rows[Y],
-        rows[PATTERN], rows[MODEL], rows[RESIDUAL], rows[FACTOR],
+        rows[:PARAMETERS], planes, rows[REACH], rows[X], rows[Y], rows[HEIGHT], rows[PATTERN],
+        rows[MODEL], rows[RESIDUAL], rows[FACTOR], rows[JACOBIAN:ERRORS], rows[ERRORS:],
     )  # fmt: skip
 
 
-class Images(NamedTuple):
-    """Images of a solid tip on `EstimatorState.grid`, with their weights."""
-
-    pixels: FloatArray  # pixels [images · cells]; the last two images are for shear
-    weights: Weights
-
-
 class Model(NamedTuple):
-    """Forward model: points for springs or images for solid rubber; the unused part is empty."""
+    """Forward model: points for springs, or images and their weights for solid rubber."""
 
     points: SpringPoints
-    images: Images
+    pixels: FloatArray  # images of a solid tip on `EstimatorState.grid`, see `solid_pressure`
+    weights: Weights

@@ -11,9 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from softfinger.kinematics.compiled.layout import FloatArray
 
 # Width in points. Moment-matching weights are used below it, and Gaussian samples above it.
 _MOMENT_MATCHED_MAX = 0.75
@@ -39,13 +38,18 @@ def axis_points(
     return places, np.ascontiguousarray(padded.reshape(-1, count).T)
 
 
-def mean_matrix(weights: FloatArray, number: int) -> FloatArray:
-    """Return the weights from :func:`axis_points` as a matrix [cells, points]."""
-    count, reach = weights.shape
-    matrix = np.zeros((number, (number + reach - 1) * count))
-    for j in range(number):
-        matrix[j, j * count : (j + reach) * count] = weights.T.ravel()
-    return matrix
+def cell_means(points: FloatArray, along: FloatArray, across: FloatArray) -> FloatArray:
+    """Return the means [rows, cols] of cells over ``points`` [lines, points per line].
+
+    The weights along y and ``across``, along x, and the order of the points are those of
+    :func:`axis_points`, with all points of a cell in sequence.
+    """
+    for weights in (across, along):
+        count, reach = weights.shape
+        parts = (points.reshape(-1, count) @ weights).reshape(len(points), -1, reach)
+        cells = parts.shape[1] - reach + 1
+        points = np.sum([parts[:, q : q + cells, q] for q in range(reach)], axis=0).T
+    return points
 
 
 def stencil(width: float) -> FloatArray:

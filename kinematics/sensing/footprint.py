@@ -17,13 +17,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.layout import Record
+from softfinger.kinematics.compiled.layout import FloatArray, Record
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Span = tuple[float, float]
 
 
@@ -37,6 +34,12 @@ class Grid(Record):
     pitch_y: float
     rows: int
     cols: int
+
+
+def axes(grid: Grid) -> tuple[FloatArray, FloatArray]:
+    """Return x [cols] and y [rows] of the cell centres [m]."""
+    x = grid.x + grid.pitch_x * (np.arange(grid.cols) + 0.5)
+    return np.asarray(x), np.asarray(grid.y + grid.pitch_y * (np.arange(grid.rows) + 0.5))
 
 
 class Face(Record):

@@ -13,9 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.footprint import FloatArray, Grid
+from softfinger.kinematics.sensing.footprint import Grid
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure, images
 from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, count_for
 
@@ -148,11 +149,8 @@ class SensorGrid:
             out = np.empty(self.shape)
         elif out.shape != self.shape or out.dtype != np.float64 or not out.flags.c_contiguous:
             raise ValueError(f"out must be a contiguous float64 array of shape {self.shape}")
-        contact = (d, *self.to_sensor(n_x, n_y))
-        if tip.physics == "solid":
-            SolidPressure(tip, material, self.images(tip))(contact, gain, out)
-        else:
-            _springs(replace(self, rotation=0.0), tip, material)(contact, gain, out)
+        model = _model(replace(self, rotation=0.0), tip, material)
+        model((d, *self.to_sensor(n_x, n_y)), gain, out)
         return out
 
     def images(self, tip: Fingertip) -> FloatArray:
@@ -167,7 +165,9 @@ def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
 
 
 @lru_cache(maxsize=16)
-def _springs(grid: SensorGrid, tip: Fingertip, material: Material) -> SpringsPressure:
+def _model(grid: SensorGrid, tip: Fingertip, material: Material) -> SolidPressure | SpringsPressure:
+    if tip.physics == "solid":
+        return SolidPressure(tip, material, grid.images(tip))
     cells = grid.on(tip)
     return SpringsPressure(cells, material, grid.blur, count_for(cells, _POINTS_PER_RADIUS))
 

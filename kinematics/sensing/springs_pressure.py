@@ -17,10 +17,9 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import index, inlined_kernel, inner_kernel, kernel
-from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.compiled.layout import FloatArray, Records
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.blur import axis_points
 from softfinger.kinematics.sensing.footprint import (
@@ -32,8 +31,6 @@ from softfinger.kinematics.sensing.footprint import (
     set_around,
     steps,
 )
-
-FloatArray = NDArray[np.float64]
 
 STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its partials in d, n_x and n_y
 PLANES = 4
@@ -52,12 +49,12 @@ class SpringPoints(NamedTuple):
     outside the grid that are within the range of the blur.
     """
 
-    line: FloatArray  # [5, row]: x from the tip centre [m], and scratch; see the row numbers
+    line: FloatArray  # [5, row]: distance from the tip centre in x [m], and scratch
     inverse: FloatArray  # means of 1/ℓ, x/ℓ and y/ℓ [3, all rows]
     y: FloatArray  # one value per row
     across: FloatArray  # weights along x [position, cell offset], see `blur.axis_points`
     along: FloatArray  # weights along y
-    law: FloatArray  # σ(ε) coefficients of the material, by increasing powers
+    law: FloatArray  # coefficients of the material's σ(ε), by increasing powers
     sums: FloatArray  # scratch, three rows of cells [3, cells]
 
 
@@ -109,7 +106,8 @@ def _set_strains(
     line = points.line
     for k in range(first, last):
         x = line[POINT_X, k]
-        # ε > 0 where f = ℓ² − z² > 0; f is almost linear up to the rim and beyond.
+        # The strain ε is positive where f = ℓ² − z² > 0. Up to the rim and beyond, f is almost
+        # linear.
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
         # Width of the uniform distribution of f. The exact width is 4 (big + small²/(3 big)). With

@@ -200,7 +200,6 @@ def test_anything_but_one_contact_is_invalid(estimator):
     [
         ({"noise": 0.0}, "noise"),
         ({"noise": math.nan}, "noise"),
-        ({"readings": Readings(saturation=0.0)}, "saturation"),
         ({"active": np.ones((4, 4), bool)}, "active"),
     ],
 )
@@ -209,6 +208,8 @@ def test_invalid_arguments_are_refused(options, message):
         ContactEstimator(TIP, LINEAR, GRID, **{"noise": 600.0, **options})
     with pytest.raises(ValueError, match="threshold"):
         Readings(threshold=-1.0)
+    with pytest.raises(ValueError, match="saturation"):
+        Readings(saturation=0.0)
 
 
 def _garbage(rng, grid):

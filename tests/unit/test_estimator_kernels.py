@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 from softfinger.kinematics.compiled.kernel import index, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.estimation import detection, gauss_newton
-from softfinger.kinematics.estimation.cell_centres import cell_centres
-from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
+from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings, cell_centres
 from softfinger.kinematics.estimation.gauss_newton import CLIP_BELOW, free_noise
 from softfinger.kinematics.estimation.state import (
     FACTOR,
-    MODEL,
+    GAIN,
     ROWS,
-    STRESS,
     EstimatorState,
     cells_in,
 )
@@ -50,7 +48,7 @@ def test_activity_matches_plain_numpy():
     state = EstimatorState()
     grid = state.grid
     grid.radius, grid.pitch_x, grid.pitch_y, grid.rows, grid.cols = 1.0, 0.01, 0.01, 20, 24
-    state.options.peak_level, state.signal.patch_level, state.signal.noise = 3.0, 4.0, 1.0
+    state.signal.patch_level, state.signal.noise = 4.0, 1.0
     height, _, _ = cell_centres(grid, active, 2.0)
     state.signal.number = int((height >= 0.0).sum())
     assert state.signal.number == active.sum()
@@ -98,10 +96,10 @@ def test_cells_near_the_floor_are_compared_with_their_expected_reading(floor):
     state = EstimatorState()
     state.grid.rows = state.grid.cols = 1
     state.signal.scale, state.signal.saturation, state.signal.floor = 1.0, math.inf, floor
-    state.fit.clip_noise = noise
+    state.fit.clip_noise, state.fit.contact[GAIN] = noise, 1.0
     rows = np.zeros((ROWS, 1))
     for model in np.linspace(max(floor - 1.9 * noise, 20.0), floor + 6.0 * noise, 9):
-        rows[STRESS] = rows[MODEL] = model
+        rows[GAIN] = model
         compare(state.array, np.array([3300.0]), rows)
         mean, response = mean_of(np.array(model), floor, noise)
         residual = 3300.0 - mean
@@ -111,7 +109,7 @@ def test_cells_near_the_floor_are_compared_with_their_expected_reading(floor):
         assert state.fit.counted_cells == 1.0
     below = floor - (CLIP_BELOW + 0.1) * noise
     if below > 0.0:
-        rows[STRESS] = rows[MODEL] = below
+        rows[GAIN] = below
         compare(state.array, np.array([3300.0]), rows)
         assert state.fit.counted_cells == 0.0
 

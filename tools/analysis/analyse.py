@@ -115,7 +115,7 @@ _NOISE_RATIO = 1.5  # multiple of tactile.noise above which the noise is reporte
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
     """Explain why no contact was found: maximum reading, threshold and likely cause."""
-    from softfinger.kinematics.estimation.estimator import PEAK_LEVEL
+    from softfinger.kinematics.estimation.detection import PEAK_LEVEL
 
     scale = tactile.pascal_per_count if recording.whole else 1.0
     pressure, level = recording.largest * scale, PEAK_LEVEL * tactile.noise

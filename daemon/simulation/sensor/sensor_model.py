@@ -27,7 +27,7 @@ from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.simulation.faults import MeasurementFaults
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.blur import axis_points, mean_matrix
+from softfinger.kinematics.sensing.blur import axis_points, cell_means
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, count_for
@@ -175,7 +175,7 @@ class SensorModel:
         """Sample points: their positions across the cylinder axis, and the hemisphere heights [m].
 
         Both arrays have the shape [lines, points per line]; the height is 0 beyond the rim. The
-        last two results are matrices that average over cells along y and x, including blur.
+        other two results are the weights of the points in a cell's mean, along y and x.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -183,8 +183,7 @@ class SensorModel:
         x, y = x.T.ravel(), y.T.ravel()[:, None]
         height = np.sqrt(np.maximum(cells.radius**2 - x**2 - y**2, 0.0))
         across_x, across_y = self.grid.to_sensor(1.0, 0.0)
-        means = mean_matrix(along_y, cells.rows), mean_matrix(along_x, cells.cols).T
-        return across_x * x + across_y * y, height, *means
+        return across_x * x + across_y * y, height, along_y, along_x
 
     def _curved(self, d: float, n_x: float, n_y: float, roundness: float) -> FloatArray:
         """Return the pressure [Pa] on each cell due to a cylinder of radius R = ``roundness`` [m].
@@ -210,7 +209,7 @@ class SensorModel:
         pressure[touched] = self._material.stress(
             1.0 - np.maximum(z[touched], 0.0) / height[touched]
         )
-        return np.asarray(along_y @ pressure @ along_x)
+        return cell_means(pressure, along_y, along_x)
 
     def press_evenly(self, pressure: float) -> None:
         """Replace the last press with a uniform pressure [Pa], as exerted by a bladder."""
