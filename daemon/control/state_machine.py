@@ -24,10 +24,10 @@ Several states share these transitions:
 - all: a fault → Off (FAULT); `stop`, `disarm` → Off (DISARMED), but a fault persists until `clear`
 - with torque: `release` → Travelling (RELEASING)
 - Settled, Changing, Turning: `rotate` → Turning
-- Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for
-  `safety.frame_age_fault` frame periods → Travelling (RELEASING)
-- Pressing, Settled, Changing, Turning: a contact is missing for the same time → Armed. Until then,
-  the joints hold their positions.
+- Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for _EMPTY_TIME →
+  Travelling (RELEASING)
+- Pressing, Settled, Changing, Turning: a contact is missing for `safety.frame_age_fault` frame
+  periods → Armed. Until then, the joints hold their positions.
 
 Each transition creates a new instance of a state class. Timers and flags are attributes of the
 state that uses them and are discarded with it. `control.modes` lists the commands for each mode,
@@ -56,9 +56,12 @@ _FORCE_TOLERANCE = 0.03
 # default finger, 0.05 N·m corresponds to a tenth of 6 N. The integral term removes this error
 # within seconds.
 _FRICTION_TOLERANCE = 0.1
-# s after which friction holds a joint that has not reached its goal, or a force within
-# _FRICTION_TOLERANCE: ten times the frictionless settling time of the force.
+# Time after which friction holds a joint that has not reached its goal, or a force within
+# _FRICTION_TOLERANCE [s]. The value is ten times the frictionless settling time of the force.
 _STUCK_TIME = 2.0
+# Time for which the tips must appear to touch each other before the grip counts as empty [s]. The
+# value is longer than one frame period at 25 Hz.
+_EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
 # Fraction of the force target. A streamed target may change continuously, so a grip also settles
@@ -177,9 +180,8 @@ class Control:
         self.grip = Grip(settings, self.fingers.indices, grasp)
         self.state: ControlState = Off()
         self.events: list[Event] = []
-        # A contact may be missing, or the tips may appear to touch each other, as long as frames
-        # may be missing [s].
-        self._doubt_time = settings.safety.frame_age_fault / settings.tactile.rate
+        # A contact may be missing as long as frames may be missing [s].
+        self._contact_loss_time = settings.safety.frame_age_fault / settings.tactile.rate
         # Force and angle have settled when they have stayed at their targets for the time over
         # which their setpoints are averaged, including the second average [s].
         self._settling_time = 2.0 * settings.control.smooth_time
@@ -404,7 +406,7 @@ class Control:
                 self._enter_armed()
 
     def _empty_for(self, before: float, dt: float) -> float:
-        """Return the duration [s] of apparent tip-to-tip contact; release if it persists.
+        """Return the duration [s] of apparent tip-to-tip contact; release after _EMPTY_TIME.
 
         Tips that press against each other would roll off to one side. When the tips touch each
         other, both sensors measure the same contact, so the estimated object width is 0 to within
@@ -413,7 +415,7 @@ class Control:
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:
             return 0.0
-        if before + dt > self._doubt_time:
+        if before + dt > _EMPTY_TIME:
             text = (
                 f"no object between the tips: their distance is {pose.width * 1e3:.1f} mm, "
                 f"expected at least object.width_min = {width_min * 1e3:g} mm; the hand opens"
@@ -447,7 +449,7 @@ class Control:
             history.lost_current = min(pressed, self._settings.safety.current_move)
         self.fingers.follow_setpoints(goal, history.lost_current)
         history.lost_for += dt
-        if history.lost_for > self._doubt_time:
+        if history.lost_for > self._contact_loss_time:
             self._warn("lost", "contact was lost; the joints hold their positions")
             self._enter(Armed(history.lost_current))
 

@@ -46,6 +46,7 @@ FloatArray = NDArray[np.float64]
 # Standard deviations of the settings.
 _TAPER_ERROR = 0.1  # `object.taper` [rad]
 _LATENCY_ERROR = 0.03  # `tactile.latency` [s]
+_GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
 
 
 class HandEstimator:
@@ -66,7 +67,6 @@ class HandEstimator:
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._estimates_object = settings.scene.object_model
-        self._servo_stiffness = settings.servos.stiffness
         self._tables = tables[0].data, tables[1].data
         self._state = state = HandFilter()
         state.half_separation = 0.5 * hand.pivot_separation
@@ -160,7 +160,7 @@ class HandEstimator:
     def _commanded_current(self, goal: Goal, finger: int, q: float) -> float:
         """Return the goal current [A] if the distance from the goal requires it, else 0."""
         current = goal.current[finger]
-        return current if self._servo_stiffness * (goal.q[finger] - q) > current else 0.0
+        return current if goal.q[finger] - q > _GOAL_DISTANCE else 0.0
 
     def update(
         self,
