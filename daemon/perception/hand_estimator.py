@@ -145,7 +145,7 @@ class HandEstimator:
         current1, current2 = reading.current
         commanded = 0.0, 0.0
         if goal is not None:
-            commanded = self._commanded_current(goal, 0, q1), self._commanded_current(goal, 1, q2)
+            commanded = _commanded_current(goal, 0, q1), _commanded_current(goal, 1, q2)
         states.predict(
             self._state.array,
             self._history,
@@ -156,11 +156,6 @@ class HandEstimator:
             commanded,
             goal is not None,
         )
-
-    def _commanded_current(self, goal: Goal, finger: int, q: float) -> float:
-        """Return the goal current [A] if the distance from the goal requires it, else 0."""
-        current = goal.current[finger]
-        return current if goal.q[finger] - q > _GOAL_DISTANCE else 0.0
 
     def update(
         self,
@@ -311,3 +306,8 @@ def _fill_from_frame(
     relative = law_error**2 + stiff * gain / (stiff + gain)
     variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
     contact.force_std = math.sqrt(variance)
+
+
+def _commanded_current(goal: Goal, finger: int, q: float) -> float:
+    """Return the goal current [A] if the joint is far from its goal, otherwise 0."""
+    return goal.current[finger] if goal.q[finger] - q > _GOAL_DISTANCE else 0.0

@@ -205,7 +205,7 @@ def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
     ("tactile", "told"),
     [
         ({"sensor": ("B2", "")}, "sensor: found A17, expected B2"),
-        ({"pitch": 0.001}, "pitch: found 1.812 × 1.812 mm, expected 1 × 1 mm"),
+        ({"pitch": 0.001}, "pitch: found 1.8125 × 1.8125 mm, expected 1 × 1 mm"),
         ({"full_count": 255}, "full_count: found 4095, expected 255"),
     ],
 )

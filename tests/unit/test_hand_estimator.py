@@ -33,6 +33,7 @@ def some_hand(rng: np.random.Generator) -> HandFilter:
     hand.mean[:] = 1e-3 * rng.normal(size=STATES)
     hand.prior_variance[:] = 1.0
     hand.latency = 1.0
+    hand.frame_rate = 100.0
     return hand
 
 

@@ -153,7 +153,7 @@ def foreign(path: Path, *channels: tuple[str, str, bytes]) -> Path:
 
 def test_a_file_without_our_channels_is_refused_with_a_list_of_its_channels(tmp_path):
     path = foreign(tmp_path / "a.mcap", ("/imu", "cdr", b"x"), ("hand/state", "protobuf", b"y"))
-    with pytest.raises(RecordingError, match=r"the channels /imu, hand/state, expected"):
+    with pytest.raises(RecordingError, match=r"\(channels: /imu, hand/state\), expected"):
         Recording(path)
 
 
