@@ -146,7 +146,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "servos.alert": EventKind(
         "error",
-        "A servo reports a hardware error, for example overload, overheating or voltage.",
+        "A servo reports a hardware error, for example overload, overheating or a voltage error.",
         "Remove the cause; `softfinger doctor --fix` reboots the servo.",
     ),
     "servos.heat": EventKind(
@@ -285,7 +285,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "tare": EventKind(
         "info, warning",
-        "A tare has ended. The message states the median and the largest change of the zero "
+        "A tare has ended. The message states the median and the largest change in the zero "
         "offsets. If the level is warning, the sensor was not tared because most cells are "
         "saturated without contact.",
         "If the level is warning, check the board's gain and `tactile.full_count`. If the "
