@@ -184,7 +184,8 @@ def fit_files(
         )
     if theta and len(theta) != len(paths):
         raise CalibrationError(
-            f"--theta: found {len(theta)} values for {len(paths)} files, expected one value per file"
+            f"--theta: found {len(theta)} values for {len(paths)} files, expected one value for "
+            "each file"
         )
     files = [read_csv(path) for path in paths]
     if any("strain" in file for file in files):
