@@ -118,7 +118,7 @@ _MEANINGS = {
         "The command was received before the last `stop`, or too soon after it. Programs must "
         "not repeat it automatically."
     ),
-    Reason.SUPERSEDED: "A newer `hold` of the same connection replaced this `hold`, or another "
+    Reason.SUPERSEDED: "A newer `hold` from the same connection replaced this `hold`, or another "
     "command was carried out before this command was repeated.",
     Reason.BUSY: (
         "Too many commands are waiting, or this client exceeds the command rate. Send fewer "

@@ -339,7 +339,8 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
     shape, count = settings.simulation.object_shape, len(settings.scene.fingers)
     if shape != "rectangle" or count != 2:
         raise SettingsError(
-            f"found the object_shape {shape} and {count} fingers, expected rectangle and 2 fingers"
+            f"found a hand with {count} fingers and object_shape = {shape!r}, expected 2 fingers "
+            "and object_shape = 'rectangle'"
         )
     fingers = sensors = ""
     for k, (name, side) in enumerate((("left", 1), ("right", -1))):

@@ -36,7 +36,7 @@ GROUPS = {  # package in tools/ and description of each subcommand
         "view": ("viewing", "show and command the running hand on a web page, or show a recording"),
     },
     "data": {
-        "record": ("recordings", "record the running daemon's stream into an MCAP file"),
+        "record": ("recordings", "record the running daemon's stream in an MCAP file"),
         "replay": ("recordings", "publish a recording again, or recompute it with this version"),
         "analyse": ("analysis", "compute contact, force and energy over time from frames"),
         "plot": (

@@ -155,7 +155,7 @@ class Sweep(Generic[Case, Result]):
                 else:
                     case = self._cases[self._left()[0]]
                     raise SweepError(
-                        f"{self._name}: all worker processes ended during {case}"
+                        f"{self._name}: all worker processes exited during {case}"
                     ) from None
 
     def _by(self, executor: Executor) -> Iterator[int]:

@@ -159,7 +159,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
     A warning is logged if the servos have not confirmed that torque is off.
     """
     if reply.get("ok") is not True:
-        text = str(reply.get("error", "refused; the reply does not state a reason"))
+        text = str(reply.get("error", "rejected; the reply does not state a reason"))
         raise Refused(text, str(reply.get("reason", "")))
     if reply.get("torque_off") == "unconfirmed":
         _log.warning(UNCONFIRMED_TEXT)

@@ -64,7 +64,7 @@ REPLY = {
     "angle": "target angle of the object [rad], limited to the range of this grip",
     "queued": "name of the command if it must wait for the mode in `until`",
     "until": "mode in which the queued command starts",
-    "fault": "reason of the latched fault, or empty",
+    "fault": "reason for the latched fault, or empty",
     "fault_name": "name of the fault in [Limits](limits.md), or empty",
     "torque": "torque is on, or torque off is not confirmed",
     "seq": "number of the current tick",
@@ -191,7 +191,7 @@ COMMANDS: dict[str, CommandKind] = {
     ),
     "clear": CommandKind(
         frozenset({Mode.FAULT}),
-        "Clears a fault after its cause was removed, and reconnects the servos and sensors. The "
+        "Clears a fault whose cause has been removed, and reconnects the servos and sensors. The "
         "hand is then disarmed.",
         refusals={
             Reason.STATE: "The cause persists, or the servos or a sensor do not respond.",

@@ -516,7 +516,7 @@ class Control:
             history.increase_reported = False
         elif not history.increase_reported and grip.target > (1 + _FORCE_NOISE) * grip.commanded:
             history.increase_reported = True
-            why = "the object is turning" if grip.has_slipped else "sudden load"
+            why = "the object rotates" if grip.has_slipped else "sudden load"
             if grip.slip.assumed_load > 0.0:
                 why = (
                     f"the load may reach {grip.slip.assumed_load:.1f} N along the object's face "

@@ -67,7 +67,7 @@ def check_idle_states(path: Path) -> Finding:
     """Check that the daemon can disable deep processor idle states, which wake up slowly."""
     name = str(path)
     if not path.exists():
-        return Finding("warn", name, "missing in this kernel: deep idle states delay wake-ups")
+        return Finding("warn", name, "not provided by this kernel: deep idle states delay wake-ups")
     if os.access(path, os.W_OK):
         return Finding("pass", name, "can be opened")
     problem = "no permission to open it: deep idle states delay wake-ups"

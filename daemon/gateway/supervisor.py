@@ -106,7 +106,7 @@ class Gateway:
         text, status = process.communicate()[0].decode().strip(), process.returncode
         cause = f"signal {-status}" if status < 0 else f"status {status}"
         if not self._closing.is_set():
-            self.link.notices.append(text or f"the gateway process ended ({cause})")
+            self.link.notices.append(text or f"the gateway process exited ({cause})")
 
     def _kill(self) -> None:
         self._channel.close()

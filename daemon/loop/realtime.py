@@ -108,7 +108,7 @@ class RealTime:
         self._undo += undo
 
     def _refused(self, text: str, remedy: str = "") -> None:
-        self.refused.append(f"{text}; to grant this measure: {remedy}" if remedy else text)
+        self.refused.append(f"{text}; to allow this: {remedy}" if remedy else text)
 
     def _keep_interpreter(self, freeze: bool) -> None:
         """Keep the garbage collector and other threads from delaying the loop.
@@ -143,7 +143,7 @@ class RealTime:
             for each in undo:
                 each()
             self._refused(
-                f"SCHED_FIFO {priority} refused ({error.strerror}): other processes can delay a "
+                f"SCHED_FIFO {priority} denied ({error.strerror}): other processes can delay a "
                 "tick",
                 GRANT_PRIORITY,
             )
@@ -175,7 +175,7 @@ class RealTime:
         except OSError as error:
             there = ", ".join(map(str, sorted(before)))
             self._refused(
-                f"use of processor {names} refused ({error.strerror}; available: {there}): the "
+                f"use of processor {names} denied ({error.strerror}; available: {there}): the "
                 "loop may move between processors"
             )
         else:
@@ -195,7 +195,7 @@ class RealTime:
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.mlockall(flags) != 0:
             why = os.strerror(ctypes.get_errno())
-            text = f"memory lock refused ({why}): the loop's memory can be swapped out"
+            text = f"memory lock denied ({why}): the loop's memory can be swapped out"
             self._refused(text, GRANT_MEMORY_LOCK)
         else:
             self._granted("memory locked", libc.munlockall)
@@ -205,14 +205,14 @@ class RealTime:
         try:
             descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
-            text = f"{_LATENCY_DEVICE} refused ({error.strerror}): deep idle states delay wake-ups"
+            text = f"{_LATENCY_DEVICE} denied ({error.strerror}): deep idle states delay wake-ups"
             self._refused(text, "" if isinstance(error, FileNotFoundError) else GRANT_LATENCY)
             return
         try:
             os.write(descriptor, bytes(4))
         except OSError as error:
             os.close(descriptor)
-            self._refused(f"{_LATENCY_DEVICE} refused ({error.strerror})")
+            self._refused(f"{_LATENCY_DEVICE} denied ({error.strerror})")
         else:
             self._granted("deep idle states disabled", partial(os.close, descriptor))
 
@@ -221,7 +221,7 @@ class RealTime:
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
             why = os.strerror(ctypes.get_errno())
-            self._refused(f"timer slack refused ({why}): wake-ups may be 50 µs late")
+            self._refused(f"timer slack denied ({why}): wake-ups may be 50 µs late")
         else:  # A value of 0 restores the thread's initial slack.
             undo = partial(libc.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
             self._granted(f"timer slack {nanoseconds} ns", undo)

@@ -94,8 +94,8 @@ class TipSettings(Section):
         "frictionless", "", "Contact between a solid tip and the object: sticking or frictionless."
     )
     relaxation: tuple[Fraction, Fraction, Fraction] = setting(
-        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: initial excess stiffness of the tip "
-        "as fractions of its final stiffness."
+        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms, as fractions of the final stiffness "
+        "of the tip."
     )  # fmt: skip
     relaxation_times: tuple[Positive, Positive, Positive] = setting(
         (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "
@@ -136,7 +136,7 @@ class ServoSettings(Section):
     """The servos of the joints."""
 
     backend: Annotated[str, names_backend("servos")] = setting(
-        "simulated", "", "Driver of the servos.", examples=[*BUILT_IN["servos"]]
+        "simulated", "", "Servo driver.", examples=[*BUILT_IN["servos"]]
     )
     port: str = setting(
         "/dev/ttyUSB0", "", 'Serial port; "{dir}" is replaced by the folder given with --dir.'
@@ -156,10 +156,10 @@ class ServoSettings(Section):
         "current-based position", "", "Operating mode of the servos; `position` cannot grasp."
     )
     stiffness: Positive = setting(
-        8.0, "A/rad", "Position gain of the daemon's position loop in the mode `current`."
+        8.0, "A/rad", "Position gain of the daemon's position loop in `current` mode."
     )
     damping: NonNegative = setting(
-        0.4, "A·s/rad", "Velocity gain of the daemon's position loop in the mode `current`."
+        0.4, "A·s/rad", "Velocity gain of the daemon's position loop in `current` mode."
     )
     reply_timeout: float = setting(
         0.004, "s", "Maximum time that the loop waits for a servo reply.", gt=0, le=1
@@ -284,7 +284,7 @@ class EstimatorSettings(Section):
     method: Literal["ml"] = setting("ml", "", "Estimation method: maximum likelihood.")
     free_gain: Literal["auto", True, False] = setting(
         "auto", "",
-            "Estimate the sensor gain from each frame. `auto` does so for springs only, "
+            "Estimate the sensor gain from each frame. `auto` estimates the gain for springs only, "
             "because the frames of a solid tip do not determine both d and the gain."
     )  # fmt: skip
 
@@ -292,8 +292,8 @@ class EstimatorSettings(Section):
 class LoopSettings(Section):
     """The control loop and its clock.
 
-    The clock ``real`` is the machine's time. ``hand`` is the time of a simulated hand; this clock
-    pauses while the machine is busy. ``virtual`` runs as fast as possible. ``hand`` and ``virtual``
+    The ``real`` clock is the machine's clock. The ``hand`` clock of a simulated hand pauses while
+    the machine is busy. The ``virtual`` clock runs as fast as possible. ``hand`` and ``virtual``
     need simulated backends. ``auto`` selects ``hand`` for simulated backends and for the ports of
     `softfinger emulate`, otherwise ``real``.
     """
@@ -305,11 +305,11 @@ class LoopSettings(Section):
 
 
 class RealtimeSettings(Section):
-    """Measures that reduce the delay of ticks.
+    """Real-time features that reduce the delay of ticks.
 
-    The daemon reports the measures that the system denies.
+    The daemon reports the features that the system denies.
 
-    All measures are harmless except the priority: under SCHED_FIFO, the loop can block other
+    All features are harmless except the priority: under SCHED_FIFO, the loop can block other
     programs on its processor.
     """
 
@@ -354,7 +354,7 @@ class StreamSettings(Section):
     latest: str = setting(
         "", "",
             "Address on which each state is also sent as a single frame, for `ZMQ_CONFLATE`. "
-            "If empty, this is disabled."
+            "If empty, states are sent only at `address`."
     )  # fmt: skip
     state_rate: Rate = setting(100.0, "Hz", "Rate of `hand/state`.")
     tactile_rate: Rate = setting(
@@ -414,9 +414,9 @@ class ControlSettings(Section):
     approach_current: Positive = setting(
         0.15, "A", "Maximum current when closing; it bounds the tip force if a sensor fails."
     )
-    move_speed: Positive = setting(1.0, "rad/s", "Joint speed of `move` and `release`.")
+    move_speed: Positive = setting(1.0, "rad/s", "Joint speed during `move` and `release`.")
     contact_force: Positive = setting(0.5, "N", "Force above which a finger is in contact.")
-    force_default: Positive = setting(5.0, "N", "Force of a `grasp` without the parameter `force`.")
+    force_default: Positive = setting(5.0, "N", "Force of a `grasp` without the `force` parameter.")
     law: LawName = setting(
         "energy", "", "Grip control law; `upright` does not use the measured object angle."
     )
@@ -424,7 +424,7 @@ class ControlSettings(Section):
         0.1, "s", "Duration of the force ramp from the measured to the commanded value."
     )
     smooth_time: Seconds = setting(
-        0.1, "s", "Averaging time of the setpoints; averaging limits their jerk."
+        0.1, "s", "Averaging time of the setpoints; averaging limits the jerk of the setpoints."
     )
     force_gain: NonNegative = setting(1.0, "", "Proportional gain of the force controller.")
     force_bandwidth: NonNegative = setting(1.0, "Hz", "Bandwidth of the force integral.")
@@ -514,7 +514,7 @@ class SafetySettings(Section):
         10.0, "frame periods", "Frame age above which a fault is latched."
     )
     frame_age_action: Literal["torque off", "open"] = setting(
-        "torque off", "", "Reaction to the fault caused by old frames; `open` opens the hand first."
+        "torque off", "", "Reaction to a `tactile.silent` fault; `open` opens the hand first."
     )
     goal_reach: Positive = setting(
         0.5,
@@ -524,7 +524,7 @@ class SafetySettings(Section):
     goal_speed: Positive = setting(
         3.0, "rad/s", "Maximum speed of the goal angle outside `goal_reach`."
     )
-    current_rate: Positive = setting(60.0, "A/s", "Maximum rate of increase of a goal current.")
+    current_rate: Positive = setting(60.0, "A/s", "Maximum rate at which a goal current increases.")
     current_fault: Positive = setting(
         1.8, "A", "Measured current above which a fault is latched after 0.1 s."
     )
@@ -557,7 +557,7 @@ class SafetySettings(Section):
             "fault is latched."
     )  # fmt: skip
     residual_width: Positive = setting(
-        0.004, "m", "Change of the held object's width since the grip began, above which a fault "
+        0.004, "m", "Change in the held object's width since the grip began, above which a fault "
         "is latched."
     )  # fmt: skip
     residual_force: Positive = setting(

@@ -127,8 +127,8 @@ class SimulationSettings(Section):
     )
     tip_relaxation: tuple[Fraction, Fraction, Fraction] = setting(
         (0.0, 0.0, 0.0), "",
-            "Amplitudes of three Prony terms: initial excess stiffness of the tip as fractions "
-            "of its final stiffness; 0 makes the tip elastic."
+            "Amplitudes of three Prony terms, as fractions of the final stiffness of the tip; "
+            "0 makes the tip elastic."
     )  # fmt: skip
     tip_relaxation_times: tuple[Positive, Positive, Positive] = setting(
         (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "

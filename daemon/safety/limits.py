@@ -248,15 +248,15 @@ def _servos_late(view: View, _: State, fraction: float) -> str:
 
 
 @Limit("servos.frozen",
-    "servo whose clock register has not changed for 0.1 s, so that its readings are old", "fault",
+    "servo whose clock register has not changed for 0.1 s, so its readings are outdated", "fault",
     needs="servos")  # fmt: skip
 def _servos_frozen(view: View, state: State, _: float) -> str:
     frozen = state.reading.frozen
     if not frozen:
         return ""
     return (
-        f"servos: old readings from the {_names(view, frozen)} servo: the clock register has "
-        "stopped; check the cable, and switch the power supply off and on"
+        f"servos: outdated readings from the {_names(view, frozen)} servo: the clock register has "
+        "stopped; check the cable, and switch the power supply off and on again"
     )
 
 
@@ -755,7 +755,7 @@ def _hand_angle(view: View, state: State, fraction: float) -> str:
     )
 
 
-@Limit("hand.width", "change of the held object's width since it was gripped", "fault",
+@Limit("hand.width", "change in the held object's width since it was gripped", "fault",
     ("safety.residual_width",), "sensors", in_turn=True, lasts=0.2)  # fmt: skip
 def _hand_width(view: View, state: State, fraction: float) -> str:
     changed = state.object.width - view.grip_width

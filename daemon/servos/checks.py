@@ -24,7 +24,9 @@ CHECKED = reg.BACKUP_READY  # number of registers to read, at addresses 0 to 146
 DRIVE_REVERSE = 0b0001
 FIX = "`softfinger doctor --fix`"
 REBOOT_FIX = "remove the cause, then reboot the servo with `softfinger doctor --fix`"
-LOST_TURN_FIX = "reboot the servo: switch its supply off and on, or run `softfinger doctor --fix`"
+LOST_TURN_FIX = (
+    "reboot the servo: switch its supply off and on again, or run `softfinger doctor --fix`"
+)
 OLD_PROTOCOL = (
     "replies in Protocol 1.0, expected Protocol 2.0",
     "select Protocol 2.0 with the manufacturer's DYNAMIXEL Wizard (register 13; MX servos "
@@ -228,7 +230,7 @@ def notice_servo(
         (
             not model.fast_read(firmware),
             f"firmware {firmware} does not support fast sync reads (version "
-            f"{model.fast_read_firmware} or later does); the slower sync read is used",
+            f"{model.fast_read_firmware} or later does); the daemon uses slower sync reads",
         ),
         (present >= limit - _TEMPERATURE_MARGIN, f"{present} °C, close to its limit of {limit} °C"),
     )

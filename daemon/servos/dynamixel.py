@@ -184,7 +184,7 @@ class DynamixelServos:
                 each.table.long(reg.MAX_POSITION_LIMIT),
             )
             if each.misplaced is not None:
-                fix = f"{each.misplaced.fix}; until then, `arm` is refused"
+                fix = f"{each.misplaced.fix}; until then, `arm` is rejected"
                 notices.append(replace(each.misplaced, fix=fix))
         self.notices = tuple(notices)
 

@@ -81,7 +81,7 @@ def choose_reads(
         if reads.answered():
             return reads, notices
         text = "the servos do not reply to fast sync reads, although their firmware supports them"
-        notices.append(Finding("warn", "servos", text, "the slower sync read is used"))
+        notices.append(Finding("warn", "servos", text, "the daemon uses slower sync reads"))
     reads = TickReads(port, handler, ids, GroupRead)
     if not reads.answered():
         listed = ", ".join(map(str, ids))

@@ -102,7 +102,7 @@ class CommandServer:
             mine = [other for other in waiting if other[0].route[0] == ask.route[0]]
             if mine and _replaces(request, mine[-1][1]):
                 waiting.remove(mine[-1])
-                text = "hold: replaced by a newer hold of the same connection"
+                text = "hold: replaced by a newer hold from the same connection"
                 self.link.reply(mine[-1][0], refusal(text, Reason.SUPERSEDED))
             waiting.append((ask, request))
 

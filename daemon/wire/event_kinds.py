@@ -26,35 +26,36 @@ KINDS: dict[str, EventKind] = {
     "start": EventKind("info", "The daemon is starting, or is ready and accepts commands."),
     "end": EventKind(
         "info, error",
-        "The daemon has ended. If the level is error, the servos did not confirm torque off.",
+        "The daemon has exited. If the level is error, the servos did not confirm torque off.",
         "If the level is error, switch off the servo supply.",
     ),
-    "mode": EventKind("info", "The mode has changed; the text contains the old and the new mode."),
+    "mode": EventKind("info", "The mode has changed; the message states the old and the new mode."),
     "compile": EventKind(
         "info, warning",
         "Kernels are being compiled. A warning states why some kernels were not compiled ahead "
         "of time.",
-        "Run `softfinger compile` once. If there is a warning, fix the cause given in the text.",
+        "Run `softfinger compile` once. If there is a warning, fix the cause stated in it.",
     ),
     "settings": EventKind(
         "warning",
-        "A setting is allowed but probably wrong, for example a sensor smaller than the footprint.",
-        "Correct the settings named in the text. To see the warning again, run `softfinger config "
-        "check`.",
+        "A setting is valid but probably wrong, for example if the sensor is smaller than the "
+        "footprint.",
+        "Correct the settings named in the warning. To see the warning again, run "
+        "`softfinger config check`.",
     ),
     "calibration": EventKind(
-        "info", "A calibration file was loaded. The text summarises the calibration."
+        "info", "A calibration file was loaded. The message summarises the calibration."
     ),
     "material": EventKind(
         "info",
-        "The material law was fitted to the measured points. The text states the deviation of "
-        "the law from the points.",
+        "The material law was fitted to the measured points. The message states how far the law "
+        "deviates from the points.",
         "If the deviation is large, remove outliers or measure more points.",
     ),
     "realtime": EventKind(
         "info, warning",
-        "Real-time measures were applied. A warning names a measure that the system denied.",
-        "Run the command in the text, which grants the measure, or disable the measure in "
+        "Real-time features were enabled. A warning names a feature that the system denied.",
+        "Run the command in the warning, which permits the feature, or disable the feature in "
         "`[realtime]`.",
     ),
     "late": EventKind(
@@ -67,7 +68,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "clients": EventKind(
         "warning",
-        "The gateway process, which serves the clients, ended, was suspended, or rejected a "
+        "The gateway process, which serves the clients, exited, was suspended, or rejected a "
         "client.",
         "The process restarts automatically. If the event recurs, look for a client that sends "
         "too many messages.",
@@ -116,7 +117,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "task": EventKind(
         "warning",
-        "The profile's task ended or restarted; the text states the reason.",
+        "The profile's task ended or restarted; the message states the reason.",
         "Clear any fault, then send `demo`, which arms the hand and restarts the task.",
     ),
     # Servos
@@ -140,12 +141,12 @@ KINDS: dict[str, EventKind] = {
     ),
     "servos.frozen": EventKind(
         "error",
-        "A servo repeats old readings.",
+        "A servo repeats outdated readings.",
         "Switch the servo supply off and on again; check the cable.",
     ),
     "servos.alert": EventKind(
         "error",
-        "A servo reports a hardware error, for example overload, overheating or voltage.",
+        "A servo reports a hardware error, for example overload, overheating or a voltage error.",
         "Remove the cause; `softfinger doctor --fix` reboots the servo.",
     ),
     "servos.heat": EventKind(
@@ -223,7 +224,7 @@ KINDS: dict[str, EventKind] = {
         "warning",
         "According to the joint angles, the tips overlap during the approach, but at least one "
         "tip has no contact.",
-        f"Correct `servos.direction`, or `servos.zero`. {_CALIBRATE_JOINTS}",
+        f"Correct `servos.direction` or `servos.zero`. {_CALIBRATE_JOINTS}",
     ),
     "joint.blocked": EventKind(
         "warning",
@@ -261,14 +262,14 @@ KINDS: dict[str, EventKind] = {
     "tactile.silent": EventKind(
         "error",
         "No valid frame arrived within `safety.frame_age_fault`.",
-        "The text states the reason. If the cell noise exceeds `tactile.noise`, this message "
-        "also gives the measured noise. Check the cable, and check the board with `softfinger "
+        "The message states the reason and, if the cell noise exceeds `tactile.noise`, the "
+        "measured noise. Check the cable, and check the board with `softfinger "
         "doctor`.",
     ),
     "tactile.frozen": EventKind(
         "error",
         "A board repeats the same frame during contact.",
-        "Switch the board off and on. If the board's noise is below one count, set "
+        "Switch the board off and on again. If the board's noise is below one count, set "
         "`safety.frozen_after = 0`.",
     ),
     "tactile.saturated": EventKind(
@@ -284,7 +285,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "tare": EventKind(
         "info, warning",
-        "A tare has ended. The text states the median change and the largest change of the zero "
+        "A tare has ended. The message states the median and the largest change in the zero "
         "offsets. If the level is warning, the sensor was not tared because most cells are "
         "saturated without contact.",
         "If the level is warning, check the board's gain and `tactile.full_count`. If the "
@@ -293,12 +294,12 @@ KINDS: dict[str, EventKind] = {
     # consistency checks between components of the hand
     "hand.angle": EventKind(
         "warning, error",
-        "The two fingers measure different angles of the object.",
+        "The two fingers measure different object angles.",
         "Set `object.taper` if the object is tapered; otherwise run `softfinger calibrate centre`.",
     ),
     "hand.width": EventKind(
         "error",
-        "The measured width of the held object has changed, which means that a sensor or a "
+        "The measured width of the held object has changed, which indicates that a sensor or a "
         "joint's zero has shifted.",
         f"Check the mounting of the sensors. {_CALIBRATE_JOINTS}",
     ),

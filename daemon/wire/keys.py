@@ -115,8 +115,8 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     for name in wanted:
         if not _NAME.fullmatch(name) or name == "server":
             raise KeyFileError(
-                f"{name!r} is not a client name: expected at most 64 letters, digits, dots and "
-                "dashes"
+                f"{name!r} is not a valid client name: expected at most 64 letters, digits, dots "
+                "and dashes"
             )
         there = [server / "clients" / f"{name}.key", folder / name]
         if any(path.exists() for path in there) or wanted.count(name) > 1:

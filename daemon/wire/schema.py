@@ -119,7 +119,7 @@ class _Announcement:
         lambda _: False,
     )
     timestamp: float = _news(*_UNIX, lambda m: m.wall)
-    mono_ns: int = _news("ns", "the daemon's monotonic clock", lambda m: _ns(m.t))
+    mono_ns: int = _news("ns", "time on the daemon's monotonic clock", lambda m: _ns(m.t))
 
 
 class StateSource(NamedTuple):
@@ -535,7 +535,7 @@ _command = FieldSource[CommandSource]()
 
 
 @topic(
-    COMMAND, "Every command from any client that received a reply, except `status`.", CommandSource
+    COMMAND, "Every command that received a reply, from any client, except `status`.", CommandSource
 )
 @record
 class AnsweredCommand(_Announcement):
@@ -587,7 +587,7 @@ class InputReading:
     alert: int = _reading("", "bit i: the servo of finger i reports a hardware error")
     error: str = _read("", "bus error, or empty", lambda s: s.read_error)
     lost: int = _reading("", "bit i: the servo of finger i has not received the last goals")
-    frozen: int = _reading("", "bit i: the servo of finger i repeats old readings")
+    frozen: int = _reading("", "bit i: the servo of finger i repeats outdated readings")
 
 
 @record

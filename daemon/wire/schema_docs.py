@@ -23,12 +23,12 @@ _INTRODUCTION = f"""\
 # The stream
 
 To read the hand's state in any language, subscribe to the daemon's ZeroMQ socket
-(`stream.address`) and unpack each message with msgpack. In Python, the class `softfinger.Hand`
+(`stream.address`) and unpack each message with msgpack. In Python, the `softfinger.Hand` class
 subscribes and unpacks. This page lists all messages and their fields. It is generated from
 `daemon/wire/schema.py` by `python -m softfinger.daemon.wire.schema_docs`.
 
 Each message has two frames: the topic, and a msgpack map whose keys are strings. Values are in SI
-units. `left.q` means the entry `q` in the map that is stored under the key `left`. A message always
+units. `left.q` means the entry `q` of the map that is stored under the key `left`. A message always
 contains all fields. This page describes schema {SCHEMA}. New versions may add fields, but never
 remove a field or change its type. A float is always sent as a float. An integer is sent in the
 smallest msgpack format. JavaScript therefore reads integers below 2³² as numbers, and may read

@@ -464,7 +464,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
     """
     at, load = np.asarray(t, np.float64), np.asarray(force, np.float64)
     if at.size < 8 or not load.max() > 0.0:
-        raise CalibrationError("relaxation: expected at least eight frames of a press that is held")
+        raise CalibrationError("relaxation: expected at least eight frames of a held press")
     noise = float(np.std(np.diff(load[at.size // 2 :]))) / math.sqrt(2.0)
     held = int(np.argmax(load >= load.max() - _SIGNIFICANT_SIGMA * noise))  # start of the hold
     told = [k for k, time in enumerate(times) if time > 2.0 * (at[-1] - at[0]) / (at.size - 1)]

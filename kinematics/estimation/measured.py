@@ -98,7 +98,8 @@ class MeasuredEstimator:
         law = tip.law
         if law is None or law.radius != tip.radius:
             raise ValueError(
-                f"the tip's law must be measured at the tip's radius, {tip.radius:g} m"
+                f"the tip's law must have been measured on a tip with the same radius, "
+                f"{tip.radius:g} m"
             )
         alive = np.ones(grid.shape, np.bool_) if active is None else active
         self.grid = grid

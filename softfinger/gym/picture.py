@@ -100,7 +100,7 @@ class Window:
         except Exception as error:  # ImportError or TclError, which is defined in tkinter
             raise RuntimeError(
                 f"render_mode: found 'human', but no window can be opened: {error}; use a display "
-                "and a Python with tkinter, or render_mode 'rgb_array'"
+                "and a Python installation with tkinter, or render_mode 'rgb_array'"
             ) from None
         self._root.title(title)
         self._photo = tkinter.PhotoImage(width=WIDTH, height=HEIGHT)

@@ -107,7 +107,7 @@ def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bu
         bus.servo(i).fast_reads = False  # This setting contradicts the firmware version.
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
-    assert notice.fix == "the slower sync read is used"
+    assert notice.fix == "the daemon uses slower sync reads"
     assert not isinstance(backend._reads.errors, FastGroupRead)
     reading = Reading()
     backend.read(reading)

@@ -112,13 +112,13 @@ def test_refused_measures_are_reported_with_their_effect_and_remedy():
     refused = [text for level, kind, text in events[1:] if (level, kind) == ("warning", "realtime")]
     assert len(refused) == len(events) - 1
     for words in (
-        ("SCHED_FIFO 7 refused", "other processes can delay a tick", "rtprio"),
-        ("processor 1023 refused", "may move between processors"),
-        ("memory lock refused", "can be swapped out", "memlock unlimited"),
+        ("SCHED_FIFO 7 denied", "other processes can delay a tick", "rtprio"),
+        ("processor 1023 denied", "may move between processors"),
+        ("memory lock denied", "can be swapped out", "memlock unlimited"),
     ):
         assert any(all(word in text for word in words) for text in refused), (words, refused)
     if os.access("/dev/cpu_dma_latency", os.F_OK):
-        assert any("/dev/cpu_dma_latency refused" in text and "udev" in text for text in refused)
+        assert any("/dev/cpu_dma_latency denied" in text and "udev" in text for text in refused)
 
 
 def test_disabled_measures_are_not_requested():

@@ -207,7 +207,7 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
     assert "the servo has counted 2 turns too many" in found.text
     assert (
         found.fix
-        == "reboot the servo: switch its supply off and on, or run `softfinger doctor --fix`"
+        == "reboot the servo: switch its supply off and on again, or run `softfinger doctor --fix`"
     )
     (fixed,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert "rebooted because the position was wrong by at least one turn" in fixed.text

@@ -47,7 +47,7 @@ def test_results_do_not_depend_on_the_number_of_processes_or_a_crash(tmp_path):
 
 @pytest.mark.extended
 def test_a_case_that_kills_each_worker_ends_the_sweep():
-    with pytest.raises(SweepError, match="all worker processes ended during 5"):
+    with pytest.raises(SweepError, match="all worker processes exited during 5"):
         list(Sweep("drawn", dies, CASES).run(2))
 
 

@@ -47,7 +47,7 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
     "frozen": (
         {"reading.frozen": 0b01},
         "servos.frozen",
-        "servos: old readings from the left servo",
+        "servos: outdated readings from the left servo",
     ),
     "deaf": ({"reading.lost": 0b11}, "goal.lost", "goals do not reach the left and right servo"),
     "hot": ({"reading.temperature.0": 71.0}, "servos.temperature", "the left servo is at 71 °C"),

@@ -84,7 +84,7 @@ def test_an_object_that_twists_in_the_grip_is_gripped_with_more_force():
             turned = abs(hand.plant.object_pose[2] - start)
             assert (turned < math.radians(5.0)) == held
             assert (hand.plant.force.mean() > 1.2 * FORCE) == held
-            assert any("N: the object is turning" in text for _, _, text in hand.events) == held
+            assert any("N: the object rotates" in text for _, _, text in hand.events) == held
 
 
 class GripUnderLoad:

@@ -61,7 +61,7 @@ steps of a tip, in this order; each step adds its result to FILE:
                presses at known depths and tilts (--d, --theta), or CSV files of a testing machine
                (--compression), which give E, or E versus d, from the force alone
   relaxation   initial stiffness of the rubber relative to its final stiffness, for the profile; a
-               press held for some seconds at a known d (--d, --frames 500)
+               press held for a few seconds at a known d (--d, --frames 500)
   scales       correction factors for the tip's modulus, the sensor's gain and the joint's torque,
                estimated during grips of a running daemon or in a recording; the daemon starts with
                these factors

@@ -183,7 +183,10 @@ def fit_files(
             "require frames"
         )
     if theta and len(theta) != len(paths):
-        raise CalibrationError(f"--theta: found {len(theta)} values for {len(paths)} files")
+        raise CalibrationError(
+            f"--theta: found {len(theta)} values for {len(paths)} files, expected one value for "
+            "each file"
+        )
     files = [read_csv(path) for path in paths]
     if any("strain" in file for file in files):
         if len(files) > 1 or settings.tip.physics != "springs":

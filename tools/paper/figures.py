@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("figures"),
         metavar="DIR",
-        help="output folder, made if missing (default: figures)",
+        help="output folder, created if it does not exist (default: figures)",
     )
 
 

@@ -50,7 +50,7 @@ class PublishedValue(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "This takes some seconds, because grips and frames are simulated."
+    parser.epilog = "This takes a few seconds, because grips and frames are simulated."
 
 
 def run(arguments: argparse.Namespace) -> int:

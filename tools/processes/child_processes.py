@@ -162,7 +162,7 @@ class RecorderProcess:
         if self._process.returncode < 0:
             name = signal.Signals(-self._process.returncode).name
             why = [f"ended by {name}; `softfinger record --recover {self._path}` repairs its file"]
-        self._on_end(f"the recorder has ended, so recording has stopped: {why[0]}")
+        self._on_end(f"the recorder has exited, so recording has stopped: {why[0]}")
 
     def close(self) -> str:
         """End the recording and return the recorder's summary."""

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="append the log to FILE instead of writing it to stderr",
     )
-    parser.add_argument("--verbose", action="store_true", help="also log the real-time measures")
+    parser.add_argument("--verbose", action="store_true", help="also log the real-time features")
     parser.add_argument(
         "--no-task", action="store_true", help="stay disarmed even if the profile defines a task"
     )
@@ -86,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         return _serve(settings, arguments, signals, log)
     except Interrupted:
-        log.line("info", "end", "ended during startup; torque was never on")
+        log.line("info", "end", "exited during startup; torque was never on")
         return 0
     finally:
         log.close()

@@ -21,8 +21,8 @@ _EPILOG = """\
 _CHECK = """\
 Print all errors and warnings of a profile, without touching hardware. Errors prevent the start of
 `softfinger run`: invalid keys or values, contradictions, and calibration files or contact tables
-that do not match. Warnings are settings that are allowed but probably wrong, for example a
-sensor smaller than the footprint, or forces that the servos can't reach.
+that do not match. Warnings concern settings that are valid but probably wrong, for example
+a sensor that is smaller than the footprint, or forces that the servos can't reach.
 
 exit status: 0 no errors (there may be warnings), 1 errors"""
 

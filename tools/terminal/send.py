@@ -26,7 +26,7 @@ _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle=RAD (a streamed
 setpoint), move left=RAD right=RAD, release, set compliance=RAD/NM, demo (restart the profile's
 task), stop, clear, status. Numbers are in SI units or carry a unit: force=10N, angle=8deg or 8°.
-Exit status: 0 done, 1 refused, 2 no reply or invalid arguments, 3 stop or disarm was received, but
+Exit status: 0 done, 1 rejected, 2 no reply or invalid arguments, 3 stop or disarm was received, but
 the servos have not confirmed torque off yet."""
 
 

@@ -230,7 +230,7 @@ def send_words(folder: Path, text: str) -> str:
     except OSError:
         raise NoEmulator(f"{folder}: no emulator is running here") from None
     if not reply:
-        raise NoEmulator(f"{folder}: the emulator has ended")
+        raise NoEmulator(f"{folder}: the emulator has exited")
     return reply.decode()
 
 
