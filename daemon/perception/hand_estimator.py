@@ -61,7 +61,7 @@ class HandEstimator:
     ) -> None:
         """Create the estimator.
 
-        Each tip has a contact table, priors, and a material that provides the error of its
+        Each tip has a contact table, priors and a material. The material provides the error of its
         stress-strain law.
         """
         hand, gear = settings.hand, settings.servos.gear_ratio
