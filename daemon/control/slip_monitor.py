@@ -327,8 +327,8 @@ def _has_jumped(
 ) -> bool:
     """Return True if ``changes`` of both residuals [N·m] show a pull (kind 0) or a twist (kind 1).
 
-    A pull changes both residuals equally, a twist changes them in opposite directions. Four tests
-    exclude other causes:
+    A pull changes both residuals equally, whereas a twist changes them in opposite directions. Four
+    tests exclude other causes:
 
     1. Both residuals change. A wrong current or frame affects only one joint.
     2. The change exceeds the noise. Soon after holding began, friction may also be released.

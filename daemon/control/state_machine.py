@@ -253,7 +253,7 @@ class Control:
         self._enter(Travelling(Mode.RELEASING))
 
     def grasp(self, force: float, is_streamed: bool = False) -> None:
-        """Close until all fingers touch, then increase the mean tip force to ``force`` [N].
+        """Close until all fingers touch. Then increase the mean tip force to ``force`` [N].
 
         If the hand is already gripping, only the force changes and the mode stays the same. Set
         ``is_streamed`` if the force may change again before it is reached.

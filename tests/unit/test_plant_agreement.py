@@ -64,7 +64,7 @@ class Contact:
         return np.array(columns).T
 
     def slide(self, x):
-        """Return the Jacobian row for the touched body's velocity relative to the tip, along t."""
+        """Return the Jacobian row for the touched body's velocity along t, relative to the tip."""
         m = self.normal(x)
         t = np.array([-m[1], m[0]])
         point = tips(x)[self.finger] + self.way(x)

@@ -128,7 +128,7 @@ class PtyServoBus:
         return int(_TERMIOS2.unpack(raw)[-1])
 
     def next_event(self) -> float:
-        """Return the time [s] of the next :meth:`service` call if no bytes arrive first."""
+        """Return the time [s] at which :meth:`service` must be called if no bytes arrive first."""
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 

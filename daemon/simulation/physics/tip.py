@@ -7,10 +7,10 @@ All elastic forces are the gradient of a single energy, so the contact can't cre
 U₀ and F are the energy and the force on a plane face, from the contact table. With a constant
 modulus E, F = πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1, the second term then becomes πE(d²
 d_t tan θ + d d_t²), the tangential energy of the parallel-distributed model. For other materials, F
-introduces their effective modulus. w(θ) is 1 on the soft hemisphere and fades to 0 towards the side
-of the finger. U_rim is a stiff spring between the rim of the backing plate and the object. A plane
-reaches the rim at d = a(1 − |sin θ|), which is the end of the soft range. Beyond a slightly smaller
-d, a(1 − √(sin² θ + 0.03²)), U₀ is continued linearly in d, and F is constant.
+contains the effective modulus of the material. w(θ) is 1 on the soft hemisphere and fades to 0
+towards the side of the finger. U_rim is a stiff spring between the rim of the backing plate and the
+object. A plane reaches the rim at d = a(1 − |sin θ|), which is the end of the soft range. Beyond a
+slightly smaller d, a(1 − √(sin² θ + 0.03²)), U₀ is continued linearly in d, and F is constant.
 
 The formulas above are the contact law for ``simulation.tip_law = "springs"``. With ``"bristles"``,
 the term sin θ d_t is omitted. The tangential force T = 2 s F cos θ d_t/d (2πE s d d_t for a

@@ -238,7 +238,7 @@ class Arrivals:
         return self.number > newest
 
     def _plan(self) -> None:
-        """Determine the next frame that is not lost and its arrival time."""
+        """Find the next frame that is not lost, and set its arrival time."""
         self._next += 1
         while self._dropped > 0.0 and self._random.random() < self._dropped:
             self._next += 1
