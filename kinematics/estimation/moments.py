@@ -183,7 +183,7 @@ def _set_normal(state: EstimatorState, arm: float) -> None:
 
 @inner_kernel
 def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Refine the guess using the moments over its widened footprint."""
+    """Refine the guess using the moments over the guess's widened footprint."""
     guess = state.estimate.guess
     grid = state.grid
     face = state.around
