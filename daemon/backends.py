@@ -41,7 +41,7 @@ class Backend(NamedTuple):
     section: type[BaseModel] | None = None  # plugin's settings model
 
     def options(self, tables: Mapping[str, Any]) -> tuple[BaseModel, ...]:
-        """Return the plugin's validated settings in a tuple, which is empty without settings."""
+        """Return a tuple with the plugin's validated settings, or an empty tuple."""
         if self.section is None:
             return ()
         return (self.section.model_validate(tables.get(self.name, {})),)

@@ -35,7 +35,7 @@ class Clock(Protocol):
 
 
 class LoopClock(Clock, Protocol):
-    """The loop's clock, which also provides the machine's real time."""
+    """Clock of the loop, which also provides the machine's real time."""
 
     behind: float  # total delay of `now` relative to the machine's time [s]
 
@@ -57,7 +57,7 @@ def make_clock(settings: Settings) -> LoopClock:
 
 
 def emulated(settings: Settings) -> bool:
-    """Return True if all ports belong to a running ``softfinger emulate``."""
+    """Return True if all ports belong to a running ``softfinger emulate`` process."""
     ports = []
     if backend("servos", settings.servos.backend).metal:
         ports.append(settings.servos.port)
@@ -120,7 +120,7 @@ class RealClock:
         self._spin = spin
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until ``t``, even if a signal handler runs during the sleep."""
+        """Sleep until ``t``; continue the sleep if a signal handler interrupts it."""
         now = time.monotonic
         delay = t - self._spin - now()
         if delay > 0.0:
@@ -131,7 +131,7 @@ class RealClock:
 
 
 class HandClock:
-    """Clock that pauses while the machine is late, for a simulated or emulated hand.
+    """Clock for a simulated or emulated hand, which pauses while the machine is late.
 
     The clock's time changes only during a sleep. After a sleep, the time equals the sleep's
     deadline, even if the machine woke up late. The clock makes up for any delay that is shorter
@@ -160,7 +160,7 @@ class HandClock:
         return self._machine.host()
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until the hand's time is ``t``; if already late, add the delay to ``behind``."""
+        """Sleep until the hand's time is ``t``; if late, add the delay to ``behind``."""
         self._now = max(t, self._now)
         if self._due is not None:
             self._due.t = self._now

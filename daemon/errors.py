@@ -36,7 +36,7 @@ _SIMILAR = 0.75  # minimum similarity of a suggested word; allows about one wron
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a hint with the most similar known word, or an empty string if none is similar."""
+    """Return a hint that suggests the most similar known word, or "" if no word is similar."""
     found = difflib.get_close_matches(word[:80], list(known), n=1, cutoff=_SIMILAR)
     return f"; nearest: {found[0]}" if found else ""
 
@@ -140,7 +140,7 @@ class Refused(SoftfingerError):
     """Rejected command. The reply to the client contains the message."""
 
     def __init__(self, text: str, reason: Reason | str = Reason.STATE) -> None:
-        """``reason`` is a `Reason`, or another string if the daemon has a different version."""
+        """``reason`` is a `Reason`, or another string if the client and daemon versions differ."""
         super().__init__(text)
         self.reason = reason
 

@@ -61,9 +61,10 @@ def unpacked_size_max(file: BinaryIO) -> int:
 def runtime_folder() -> Path:
     """Return the user's runtime folder, which by default contains an emulated hand's port links.
 
-    The folder is in XDG_RUNTIME_DIR or /run/user. If neither location is usable, the folder is in
-    the temporary folder and named after the user. If another user owns a folder with that name, the
-    runtime folder is in the home folder. Raises RuntimeError if there is no home folder either.
+    The folder is in XDG_RUNTIME_DIR or /run/user. If neither location is usable, the runtime folder
+    is in the temporary folder and is named after the user. If another user owns a folder with that
+    name, the runtime folder is in the home folder. Raises RuntimeError if there is no home folder
+    either.
     """
     named = os.environ.get("XDG_RUNTIME_DIR", "")
     for folder in (Path(named), Path(f"/run/user/{os.geteuid()}")):
@@ -96,7 +97,7 @@ def shared_folder() -> Path:
 
 
 def home_folder() -> Path:
-    """Return the fallback folder in the user's home folder. Raises RuntimeError without one."""
+    """Return the fallback folder in the user's home folder. Raises RuntimeError without a home."""
     return user_cache() / "run"
 
 

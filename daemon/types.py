@@ -1,4 +1,4 @@
-"""Define the plain records exchanged between pipeline stages.
+"""Define the plain records that the pipeline stages exchange.
 
 Per-finger lists have length 2, left finger first. For a finger that is not in the scene, the values
 stay 0 and ``valid`` is False. Values are plain floats because each tick accesses them one at a
@@ -62,7 +62,7 @@ class Frame:
 
 @dataclass(slots=True)
 class Contact:
-    """Contact of one fingertip: newest frame estimate, predicted with subsequent joint angles."""
+    """Contact of one fingertip: the newest frame estimate, extrapolated with later joint angles."""
 
     seq: int = 0  # sequence number of the frame
     t: float = 0.0  # sample time of that frame [s]
@@ -97,7 +97,7 @@ class Contact:
 
     @property
     def valid(self) -> bool:
-        """True if a frame has arrived, the frame is not too old, and its estimate is valid."""
+        """True if a recent frame exists and its estimate is valid."""
         return not self.invalid
 
 
@@ -127,7 +127,7 @@ class Goal:
 
 @dataclass(slots=True)
 class ServoHeatEstimate:
-    """Servo temperatures from the thermal model in `safety.heat`; 0 while unknown."""
+    """Servo temperatures computed by `safety.heat`'s thermal model; 0 while unknown."""
 
     winding: float = 0.0  # [°C]
     winding_std: float = 0.0  # standard deviation [°C]
@@ -206,7 +206,7 @@ class SensorInfo(NamedTuple):
 
 
 class HandInfo(NamedTuple):
-    """JSON texts that stay constant while a daemon runs; empty if not available."""
+    """JSON texts that are constant while a daemon runs; empty if not available."""
 
     version: str
     settings: str

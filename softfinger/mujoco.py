@@ -2,8 +2,8 @@
 
 :class:`SoftTips` turns spheres in any MuJoCo model into soft hemispheres. A passive-force callback
 (`mjcb_passive`) applies the force from the contact table, with friction. A user sensor returns the
-pressure under each tip. :class:`MujocoHand` is a profile's hand; the daemon uses it if
-``servos.backend = "mujoco"``.
+pressure under each tip. :class:`MujocoHand` simulates the hand of a profile. The daemon uses this
+class if ``servos.backend = "mujoco"``.
 
 The contact law is the kernel that the simulated hand uses (`simulation.physics.tip`). In 3D, the
 shear is a vector in the face. The component along the tilt is d_t. The component across the tilt is
@@ -83,7 +83,7 @@ class Touch(Record):
 
 @inner_kernel
 def _set_frame(touch: Touch, geometry: FloatArray) -> None:
-    """Compute m, t, m × t and θ from the tip's centre, axis and foremost point."""
+    """Compute m, t, m × t and θ from the centre, axis and foremost point of a tip."""
     m, t, tip = touch.normal, touch.along, touch.contact
     m[:] = geometry[7:] - geometry[1:4]
     m /= math.sqrt((m * m).sum())

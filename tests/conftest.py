@@ -1,4 +1,4 @@
-"""Provide shared fixtures: private addresses, complete daemons and polling of conditions.
+"""Provide shared fixtures for private addresses, complete daemons and polling.
 
 Each test process has its own loopback addresses and folders, so that tests can run in parallel. All
 processes that a test starts, directly or indirectly, are killed when the test ends.
@@ -95,7 +95,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_unconfigure() -> None:
-    """Kill processes left behind by a crashed test process and adopted by this process."""
+    """Kill processes that a crashed test process left behind and that this process has adopted."""
     descendants.end(descendants.running() - _OUR_OWN)
 
 

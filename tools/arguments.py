@@ -146,7 +146,7 @@ def addresses(text: str) -> tuple[str, str]:
 
 
 def waiting(address: str, folder: Path | None) -> str:
-    """Return the message shown while waiting for the stream, with a hint if there are no keys.
+    """Return the message shown while a client waits for the stream, with a hint if it has no keys.
 
     To a client without keys, a daemon that requires keys appears unreachable.
     """

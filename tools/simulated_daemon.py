@@ -39,7 +39,7 @@ class TrueStates:
 
 
 class SimulatedDaemon:
-    """Daemon on virtual time whose simulated hand can be observed; may raise SettingsError."""
+    """Daemon on virtual time whose simulated hand can be observed. Raises SettingsError."""
 
     def __init__(
         self,

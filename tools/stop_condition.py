@@ -18,7 +18,7 @@ def available_signals(*names: str) -> tuple[signal.Signals, ...]:
 
 
 class StopCondition:
-    """Context manager in which a signal, time limit or closed pipe requests a subcommand's end.
+    """Context manager that ends a subcommand on a signal, a time limit or a closed pipe.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class StopCondition:
         return self.is_requested or time.monotonic() >= self._deadline
 
     def wait(self, seconds: float) -> bool:
-        """Wait up to ``seconds`` for the end; return True if the subcommand should end."""
+        """Wait up to ``seconds`` for an end request; return True if the subcommand should end."""
         self.wait_readable(seconds)
         return self.is_met
 

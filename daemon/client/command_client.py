@@ -1,4 +1,4 @@
-"""Send commands to a daemon, as single requests or through one method per command."""
+"""Send commands to a daemon: one function for any command, and one method per command."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class Attempts:
     """Retry policy for one command, within the caller's timeout.
 
     After a stall, the daemon refuses outdated commands with the reason ``late``. A refused command
-    has no effect. All attempts have the same key, so the daemon carries out the command at most
-    once. The daemon refuses a repeated attempt if it has received a stop or another command in the
+    has no effect. All attempts have the same key, so the daemon executes the command at most once.
+    The daemon refuses a repeated attempt if it has received a stop or another command in the
     meantime.
     """
 
@@ -86,8 +86,8 @@ def send(
 
     If the daemon refuses the command as late, the client sends the command again until ``timeout``
     expires. If the reply takes longer than 1 s, a warning is logged. If no logging handler exists,
-    the warning is printed to standard error. If the daemon runs on this machine under the same
-    user, a ``stop`` is sent over a local socket and bypasses other clients' queues.
+    the warning is printed to standard error. A ``stop`` to a daemon of the same user on this
+    machine is sent over a local socket, which bypasses the queues of other clients.
     """
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
@@ -154,7 +154,7 @@ def _number(what: str, value: Any) -> float:
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """Return the reply without ``ok``. Raises Refused, with the reason, if the reply is a refusal.
+    """Return the reply without ``ok``. If the reply is a refusal, raises Refused with the reason.
 
     A warning is logged if the servos have not confirmed that torque is off.
     """
@@ -179,10 +179,10 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 class HandClient(Generic[_Done]):
     """Base class of `Hand` and `AsyncHand`, which stores the addresses and defines the commands.
 
-    A command raises Refused, with the reason, if the daemon refuses it, and NoAnswer if the daemon
-    does not reply. If the daemon refuses a command as late, the client sends the command again
-    until ``timeout`` expires. ``arm``, ``disarm``, ``clear`` and ``release`` may be repeated:
-    arming an armed hand is not an error.
+    If the daemon refuses a command, the command's method raises Refused with the reason. If the
+    daemon does not reply, the method raises NoAnswer. If the daemon refuses a command as late, the
+    client sends the command again until ``timeout`` expires. ``arm``, ``disarm``, ``clear`` and
+    ``release`` may be repeated: arming an armed hand is not an error.
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context
@@ -262,7 +262,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("rotate", angle=angle)
 
     def hold(self, force: float | None = None, angle: float | None = None) -> _Done:
-        """Send one setpoint; call this method continuously, for example at 50 to 100 Hz.
+        """Send one setpoint; call this method repeatedly, for example at 50 to 100 Hz.
 
         Pass the ``force`` [N] per tip, the object ``angle`` [rad], or both. If the hand is not
         gripping yet, it grasps first. The angle is limited to the grip's range, and the angular

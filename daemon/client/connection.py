@@ -23,7 +23,7 @@ _MESSAGE_SIZE_MAX = 4_000_000
 
 
 def default_addresses() -> tuple[str, str]:
-    """Return the stream and command addresses from SOFTFINGER_ADDRESS; the default is this machine.
+    """Return the stream and command addresses in SOFTFINGER_ADDRESS; the default is this machine.
 
     Raises SettingsError like :func:`both_addresses`.
     """
@@ -54,7 +54,7 @@ def both_addresses(named: str, where: str) -> tuple[str, str]:
 
 
 def is_host(named: str) -> bool:
-    """Return True if an address is ``tcp://HOST`` without a port."""
+    """Return True if an address has the form ``tcp://HOST``, without a port."""
     alone = named.startswith("tcp://") and "," not in named
     return alone and ":" not in named[6:].split("]")[-1]
 
@@ -81,7 +81,7 @@ def require_host(address: str) -> None:
 class OneThread:
     """Owner of a hand's sockets: the first thread that uses them, until that thread ends.
 
-    A ZeroMQ socket that two threads use loses messages or aborts the process.
+    If two threads use one ZeroMQ socket, messages are lost or the process aborts.
     """
 
     def __init__(self) -> None:

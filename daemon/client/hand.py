@@ -65,8 +65,8 @@ class Hand(HandClient[None]):
     ----------
     stream, commands
         Addresses of the daemon. ``stream`` may also contain both addresses, as ``tcp://HOST`` or
-        ``STREAM,COMMANDS``. The default is the environment variable SOFTFINGER_ADDRESS, or else
-        this machine.
+        ``STREAM,COMMANDS``. The default is the value of the environment variable SOFTFINGER_ADDRESS
+        or, if the variable is not set, this machine.
     client
         Client name for the command lease.
     timeout

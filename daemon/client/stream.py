@@ -83,10 +83,10 @@ def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
 class Gaps:
     """Counter for lost messages of one topic.
 
-    Messages are identified by their ``number`` or, if they have none, by ``seq`` divided by
-    ``seq_step``. A decreasing number does not count as a loss: it means that the daemon was
-    restarted or that a second daemon is running. A repeated message (``again``) fills a gap if the
-    first copy was lost.
+    A message is identified by its ``number``. A message without ``number`` is identified by ``seq``
+    divided by ``seq_step``. A decreasing number does not count as a loss: it means that the daemon
+    has restarted or that a second daemon is running. A repeated message (``again``) fills a gap if
+    its first copy was lost.
     """
 
     def __init__(self) -> None:
@@ -215,7 +215,7 @@ class Subscriber(Generic[_Record]):
 
 
 class Wait:
-    """Wait of up to ``timeout`` s for a state that satisfies ``condition``."""
+    """Wait for a state that satisfies ``condition``, for at most ``timeout`` s."""
 
     def __init__(
         self,

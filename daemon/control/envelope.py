@@ -30,7 +30,7 @@ _SECTIONS = ("hand", "tip", "material")
 
 
 def identity(settings: Settings) -> dict[str, Any]:
-    """Return the settings that identify a map's hand."""
+    """Return the settings that identify the hand of a map."""
     identifying = {name: getattr(settings, name).model_dump(mode="json") for name in _SECTIONS}
     return identifying | {"control": {"law": settings.control.law}}
 
@@ -56,7 +56,7 @@ def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
 
 
 class Envelope:
-    """Map for one hand, evaluated for the object in the settings."""
+    """Map of graspable objects for one hand, evaluated for the object in the settings."""
 
     def __init__(self, settings: Settings) -> None:
         """Read the map named in the settings.

@@ -92,8 +92,8 @@ class Fingers:
     def close_fingers(self, touching: set[int]) -> set[int]:
         """Close the fingers that are not in contact; return the fingers in contact.
 
-        ``touching`` is this function's result on the previous tick. A finger that is in contact but
-        not in ``touching`` stops at its current angle.
+        ``touching`` is the set that this function returned on the previous tick. A finger that is
+        in contact but not in ``touching`` stops at its current angle.
         """
         law, now_touching = self._settings.control, set[int]()
         for index in self.indices:
@@ -113,7 +113,7 @@ class Fingers:
 
     @property
     def distance_max(self) -> float:
-        """Maximum distance of a joint from its setpoint's target [rad]."""
+        """Maximum distance between a joint and its setpoint target [rad]."""
         return max(abs(self.reading.q[i] - self._setpoints[i].target) for i in self.indices)
 
     # Goals

@@ -11,7 +11,7 @@ parts:
    these goals. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
 
 With ``control.law = "energy"``, the moment arms are the gradient of the contact-table energy along
-the rolling increments. These moment arms include the moments and shear forces of the tips.
+the rolling increments. These moment arms account for the moments and shear forces of the tips.
 
 With ``"upright"``, the control law ignores the object angle until a command steers it. The upright
 law gives both joints the same torque plus damping, as in the literature on blind grasping. A
@@ -102,7 +102,7 @@ class Grip:
 
     @property
     def stopping_ratio(self) -> float:
-        """Ratio of the earliest stopping angle to the current angle; 0 unless |angle| increases."""
+        """Ratio of the earliest stop angle to the current angle; 0 unless |angle| increases."""
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
             return 0.0
@@ -122,7 +122,7 @@ class Grip:
     def retarget(self, force: float) -> None:
         """Change the commanded force [N].
 
-        If the force decreases, the increase due to slip decreases in proportion.
+        If the commanded force decreases, the force increase due to slip decreases in proportion.
         """
         force = min(force, self.commanded_max)
         if force < self.commanded:

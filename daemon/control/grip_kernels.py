@@ -282,7 +282,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
 
 @inner_kernel
 def _closing_rate(grasp: GraspState, rate: float, offset_rate: float) -> float:
-    """Return the closing rate [rad/s] that changes the force at ``rate`` [N/s] in a rotation."""
+    """Return the closing rate [rad/s] that changes the force at ``rate`` [N/s] while rotating."""
     arm = grasp.moment_arm
     rotation = grasp.jacobian_rotation
     d_rate = 2.0 * rate / _mean_stiffness(grasp)
@@ -351,7 +351,8 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     """Advance the dither; return its antisymmetric torque [N·m].
 
     The virtual spring from `hand.upright` acts between the fingers, and an oscillating torque
-    overcomes the joint friction. It fades out so that friction leaves no bias.
+    overcomes the joint friction. The oscillating torque fades out slowly, so that friction does not
+    leave a bias.
     """
     law, q = g.law, grasp.q
     antisymmetric = 0.5 * (q[0] - q[1])

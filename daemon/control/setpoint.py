@@ -1,4 +1,4 @@
-"""Generate smooth setpoints: a jerk-limited path to a target that may jump on any tick.
+"""Generate smooth setpoints that follow a jerk-limited path to a target that may jump.
 
 The values may have any unit.
 """
@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 
 
 class RunningMean(Record):
-    """Mean of the last ``length`` values, which are stored in a separate window."""
+    """Running mean of the last ``length`` values; the values are stored in a separate window."""
 
     length: int
     index: int  # position of the oldest value
@@ -50,7 +50,7 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
 
 @inner_kernel
 def has_arrived(s: SetpointState) -> bool:
-    """Return True if the setpoint has stopped at its target."""
+    """Return True if the setpoint has reached its target and stopped."""
     there: bool = s.idle_count >= s.first.length + s.second.length and s.ramp == s.target
     return there
 

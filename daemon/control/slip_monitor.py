@@ -115,7 +115,7 @@ class SlipState(Record):
 
 
 def configure(s: SlipState, settings: Settings) -> None:
-    """Fill the constants from the settings."""
+    """Set the constants from the settings."""
     law, control = s.law, settings.control
     law.dt = 1.0 / settings.loop.rate
     law.width = settings.object.width
@@ -233,7 +233,7 @@ def update(
 def _update_friction(s: SlipState, grasp: GraspState) -> float:
     """Set the joint friction and the usable tip friction; return the tip friction before its bound.
 
-    Rolling uses part of the tip friction, and this part increases with the grip force.
+    Rolling uses a part of the tip friction that increases with the grip force.
     """
     law = s.law
     free_torque = max(mean(grasp.free_torque), law.joint_friction)
@@ -327,8 +327,8 @@ def _has_jumped(
 ) -> bool:
     """Return True if ``changes`` of both residuals [N·m] show a pull (kind 0) or a twist (kind 1).
 
-    A pull changes both residuals equally, a twist changes them in opposite directions. Four tests
-    exclude other causes:
+    A pull changes both residuals equally, whereas a twist changes them in opposite directions. Four
+    tests exclude other causes:
 
     1. Both residuals change. A wrong current or frame affects only one joint.
     2. The change exceeds the noise. Soon after holding began, friction may also be released.
@@ -419,7 +419,7 @@ def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_chan
 
 @inner_kernel
 def _has_turned(s: SlipState, grasp: GraspState) -> bool:
-    """Return True if the object has rotated by more than the tips' shear deformation.
+    """Return True if the object has rotated by more than the tips can shear.
 
     Both tips must show the rotation, because a single faulty sensor can simulate a rotation.
     """

@@ -1,4 +1,4 @@
-"""State machine of the hand: handles commands and sets one servo goal on each tick.
+"""State machine that handles the hand's commands and sets one servo goal on each tick.
 
 State        Mode       Action                           Event → next state
 -----------  ---------  -------------------------------  ------------------------------------------
@@ -113,7 +113,7 @@ class GraspCommand:
 
 @dataclass
 class Approaching(ControlState):
-    """The fingers close."""
+    """The fingers close until all of them are in contact."""
 
     mode = Mode.GRASPING
     command: GraspCommand
@@ -124,7 +124,7 @@ class Approaching(ControlState):
 
 @dataclass
 class GripHistory:
-    """Data shared by the states of one grip, from the contact of all fingers to the end."""
+    """Data shared by the states of one grip, from the contact of all fingers until its end."""
 
     lost_for: float = 0.0  # [s]
     lost_current: float = 0.0  # current limit while a contact is missing [A]
@@ -253,7 +253,7 @@ class Control:
         self._enter(Travelling(Mode.RELEASING))
 
     def grasp(self, force: float, is_streamed: bool = False) -> None:
-        """Close until all fingers touch, then increase the mean tip force to ``force`` [N].
+        """Close until all fingers touch. Then increase the mean tip force to ``force`` [N].
 
         If the hand is already gripping, only the force changes and the mode stays the same. Set
         ``is_streamed`` if the force may change again before it is reached.
@@ -481,7 +481,7 @@ class Control:
                 self.rotate(angle)
 
     def _is_force_reached(self, is_streamed: bool) -> bool:
-        """Return True if the mean tip force has reached its target, or a setpoint close to it.
+        """Return True if the mean tip force has reached its target or a setpoint near the target.
 
         The mean is used because friction between object and support may unbalance the tip forces.
         """

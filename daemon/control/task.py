@@ -22,7 +22,7 @@ _RESTART_PAUSE = 2.0  # pause before a restart, so that the user can read the me
 
 
 class TaskEnded(SoftfingerError):
-    """Raised when the task can't continue. The message says why."""
+    """The task can't continue. The message gives the reason."""
 
 
 class Task:

@@ -1,4 +1,4 @@
-"""Check the hand's devices: the scene's servos and the frames of each tactile board.
+"""Check the hand's devices: the servos in the scene and the frames of each tactile board.
 
 The checks do not change settings. `softfinger doctor --fix` calls the functions named `repair`,
 which configure adapters and servos. Torque is switched off to write a servo's EEPROM, so the hand
@@ -82,7 +82,7 @@ def check_servos(settings: Settings) -> list[Finding]:
 
 
 def _wait_for(line: ServoLine, settings: Settings) -> None:
-    """Wait up to ``servos.open_timeout`` for servos that have not replied yet, as `run` does."""
+    """Like `run`, wait up to ``servos.open_timeout`` for servos that have not replied yet."""
     end = time.monotonic() + settings.servos.open_timeout
     missing = [settings.servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
     while missing:
@@ -94,7 +94,7 @@ def _wait_for(line: ServoLine, settings: Settings) -> None:
 def _try_exchange(
     line: ServoLine, settings: Settings, model: ServoModel, found: list[Examined]
 ) -> list[Finding]:
-    """Measure the duration of a tick's reads and writes if all servos are usable.
+    """If all servos are usable, measure the duration of the reads and writes in a tick.
 
     The writes have the same length and address as those of a tick, but contain the current register
     values, so nothing changes. If a servo has torque on, or might switch it on when a goal is
@@ -156,7 +156,7 @@ def _described(servo: Examined, model: ServoModel) -> str:
 
 
 def _search(settings: Settings, model: ServoModel) -> list[Finding]:
-    """Search the port at all baud rates of the model; explain how to use the servos found."""
+    """Search for servos at all baud rates of the model; explain how to use the servos found."""
     servos = settings.servos
     found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
     if found.old:
@@ -196,7 +196,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
 
 
 def check_law(settings: Settings, finger: int) -> Finding:
-    """Compare a tip's contact law with the law that `calibrate law` identified."""
+    """Compare the contact law of a tip with the contact law that `calibrate law` identified."""
     name, tip = f"tip {FINGERS[finger]}", settings.tip
     try:
         calibration = calibration_for(settings, finger)

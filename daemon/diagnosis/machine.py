@@ -1,4 +1,4 @@
-"""Check that this machine can run ticks on time: scheduling, memory, idle states and clock.
+"""Check scheduling, memory, idle states and clock, which determine if ticks run on time.
 
 The problems found here only degrade the timing, so they are reported as warnings. The checks read
 the limits of this process. A daemon that is started from the same shell has the same limits.
@@ -49,7 +49,7 @@ def check_scheduling() -> Finding:
 
 
 def check_memory_lock(limit: int) -> Finding:
-    """Check RLIMIT_MEMLOCK [bytes], which is RLIM_INFINITY if unlimited."""
+    """Check RLIMIT_MEMLOCK [bytes]; RLIM_INFINITY means unlimited."""
     if os.geteuid() == 0:
         return Finding("pass", "memory lock", "not limited for root")
     if limit == resource.RLIM_INFINITY:
@@ -84,7 +84,7 @@ def check_wall_clock(now: float) -> Finding:
 
 
 def wake_ups() -> list[float]:
-    """Measure wake-up delays [s], using the same kind of sleep as between ticks."""
+    """Measure wake-up delays [s] after the kind of sleep that is used between ticks."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UP_COUNT):

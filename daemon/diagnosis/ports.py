@@ -39,7 +39,7 @@ def note_ports() -> Finding:
 
 
 def check_runtime_folder() -> Finding:
-    """Check that only this user may write to the folder of emulated ports and the local stop."""
+    """Check that only this user may write to the folder for emulated ports and local stops."""
     what, _, fix = runtime_fault().partition(": chmod ")
     if what:
         return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
@@ -163,7 +163,7 @@ _TIMEOUT = 0.5  # timeout for a daemon's reply [s]
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
-    """Check that all addresses can be bound; if not, report whether a daemon uses them."""
+    """Check that all addresses can be bound; if not, report if a daemon uses the addresses."""
     found = [
         _check(settings, "stream.address", settings.stream.address),
         _check(settings, "commands.address", settings.commands.address),

@@ -27,7 +27,7 @@ _PASS_COUNT = 2  # number of passes; a lower limit may be rejected until its upp
 
 
 class StoredServo(Section):
-    """One servo in the file."""
+    """Entry for one servo in the file."""
 
     id: int
     model: str

@@ -57,7 +57,7 @@ READY = "ready"  # printed by the process once its sockets are bound
 
 
 class Config(NamedTuple):
-    """Addresses, limits and stream topics. Empty addresses are not bound."""
+    """Addresses, limits and stream topics of a gateway. Empty addresses are not bound."""
 
     stream: str
     commands: str

@@ -1,4 +1,4 @@
-"""Forward requests to the loop, within the limits in `bounds`, and replies to clients.
+"""Forward requests to the loop, within the limits in `bounds`, and forward replies to clients.
 
 The gateway does not unpack requests. Requests that look like a stop bypass the queues, one at a
 time for each client. Apart from stops, only a few requests are forwarded to the loop at a time.
@@ -9,8 +9,8 @@ Each request is stamped with its arrival time and the number of stops that prece
 thread reads ahead, so the gateway can't determine whether a request arrived before or after a stop.
 After a stop or a gap between two polls, the gateway therefore stamps requests as if they had
 arrived earlier, until the socket has been empty and few requests have arrived. Replies are also
-held back, for a limited time, because clients may respond to a reply with new requests, which would
-be refused.
+held back for a limited time, because a client may respond to a reply with a new request, which the
+gateway would refuse.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _QUEUE_FULL_REFUSAL = refusal("too many commands are waiting", Reason.BUSY)
 
 
 class Client:
-    """One connection, with its queued requests and a token bucket of one second's requests."""
+    """One connection, with its queued requests and a token bucket for one second of requests."""
 
     def __init__(self) -> None:
         self.waiting: deque[Ask] = deque()

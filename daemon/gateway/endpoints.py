@@ -29,7 +29,7 @@ _LATEST_TOPIC = 0  # index of the topic that is also published in single frames
 
 
 class RestartNeeded(SoftfingerError):
-    """All clients must be disconnected so that they reconnect. The message gives the reason."""
+    """All clients must disconnect and connect again. The message gives the reason."""
 
 
 class ClientSockets:
@@ -85,7 +85,7 @@ class ClientSockets:
                 self.handshakes.send_multipart([version, number, status, b"", user.encode(), b""])
 
     def name(self, part: zmq.Frame) -> str:
-        """Return the sender's name according to its key, or an empty string without keys."""
+        """Return the client name for the sender's key, or an empty string if no keys are used."""
         return "" if self._keys is None else str(part.get("User-Id"))
 
     def _update_keys(self, now: float) -> None:

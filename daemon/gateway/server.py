@@ -1,4 +1,4 @@
-"""Run the gateway process, in which one thread serves the loop and the clients.
+"""Run the gateway process. One thread serves the loop and the clients.
 
 The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's
 file descriptor and a `Config` as JSON. It prints `READY` once its sockets are bound, and exits when

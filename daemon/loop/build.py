@@ -179,7 +179,7 @@ class Daemon:
 
     @property
     def tables(self) -> tuple[ContactTable, ContactTable]:
-        """Contact tables of both tips: the same object twice if the tips share a material."""
+        """Contact tables of both tips; tips of the same material share one table object."""
         return self.models[0].table, self.models[1].table
 
     def close(self) -> None:

@@ -56,7 +56,7 @@ class Commands(Protocol):
 
 
 class Loop:
-    """The pipeline, driven by a clock and run entirely in the thread that calls `run`."""
+    """Pipeline that a clock drives; the pipeline runs entirely in the thread that calls `run`."""
 
     def __init__(
         self,

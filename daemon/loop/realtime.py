@@ -182,10 +182,10 @@ class RealTime:
             self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))
 
     def _lock_memory(self) -> None:
-        """Lock pages in memory when they are touched. Warm-up has already touched the loop's pages.
+        """Lock each page in memory on first access. Warm-up has already accessed the loop's pages.
 
-        Two thirds of the compiler libraries' pages are never touched, and loading all of them would
-        take almost a second. If there is a limit on locked memory, only existing mappings are
+        Two thirds of the pages of the compiler libraries are never accessed, and loading all pages
+        would take almost a second. If there is a limit on locked memory, only existing mappings are
         locked, because later mappings would otherwise fail.
         """
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]

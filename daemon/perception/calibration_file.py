@@ -32,7 +32,7 @@ _FAULTY = 0.2  # minimum range of an unloaded cell, as a fraction of the median 
 
 
 class CalibrationFileError(TactileError):
-    """Raised for a file that can't be used or belongs to another sensor. The message says why."""
+    """File that can't be used or belongs to another sensor. The message gives the reason."""
 
 
 class _StepModel(BaseModel):
@@ -211,7 +211,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """Describe how a file's sensor differs from ``there``; return "" if both are equal."""
+    """Describe how the sensor in a file differs from ``there``; return "" if both are equal."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "unnamed", there.label or "unnamed"),
@@ -303,7 +303,7 @@ class Converter:
 
     @property
     def quantum(self) -> float:
-        """Typical pressure per count [Pa]: the mean slope of the curve."""
+        """Typical pressure per count [Pa], which is the mean slope of the curve."""
         return self.saturation / self._full
 
 
@@ -317,7 +317,7 @@ def least_end(ends: FloatArray) -> float:
 
 
 def _contradiction(calibration: Calibration) -> str:
-    """Return a message if values contradict each other, otherwise ""."""
+    """Return a message if values in the file contradict each other, otherwise ""."""
     sensor = calibration.sensor
     tables = {}
     if calibration.tare:

@@ -99,11 +99,11 @@ def _log_slope(h: HandFilter, finger: int) -> float:
 
 @inner_kernel
 def _set_torque_slopes(h: HandFilter) -> float:
-    """Set the slopes for the mean joint torque due to the tip forces; return that torque [N·m].
+    """Set the slopes of the mean joint torque due to the tip forces; return this mean torque [N·m].
 
-    Each joint contributes (1 + TORQUE) M, where M is the moment of the tip force about the joint.
-    M is known from the residual, which is the difference between the two. It is proportional to the
-    tip force ρ e^MODULUS F(D, θ), so ∂M/∂MODULUS = M and ∂M/∂D = M ∂ ln F/∂d.
+    Each joint contributes (1 + TORQUE) M, where M is the moment of the tip force about the joint. M
+    is the scaled joint torque minus the torque residual. M is proportional to the tip force ρ
+    e^MODULUS F(D, θ), so ∂M/∂MODULUS = M and ∂M/∂D = M ∂ ln F/∂d.
     """
     expected = 0.0
     for k in range(2):
@@ -280,7 +280,7 @@ def _write_shear(h: HandFilter) -> None:
 
 @inner_kernel
 def _write_consistency(h: HandFilter) -> None:
-    """Write the biases and set `sensor_fault` if a channel is faulty."""
+    """Write the channel biases, and set `sensor_fault` if a channel is faulty."""
     grasp = h.grasp
     grasp.sensor_fault = False
     for k in range(2):

@@ -10,10 +10,10 @@ the frames of both tips, starting from ``object.taper``. A shifted sensor looks 
 limit ``hand.angle`` compares the frames with ``object.taper``.
 
 A disc has no faces. φ is then the direction of the line between the contacts, and ``rotate`` acts
-on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per joint angle. This ratio is 0.4
-for a radius R of 20 mm and the default hand, whereas the prediction for faces is 1.5. The frames
-correct the difference, so a rotation takes longer and the disc rolls further than commanded. A
-curved contact appears less tilted than it is, so φ is about 5 % too small. If the fingers are
+on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per unit of joint angle. This ratio
+is 0.4 for a radius R of 20 mm and the default hand, whereas the prediction for faces is 1.5. The
+frames correct the difference, so a rotation takes longer and the disc rolls further than commanded.
+A curved contact appears less tilted than it is, so φ is about 5 % too small. If the fingers are
 straight or lean outwards, the line does not follow the joints: a disc with R ≥ 30 mm can be held,
 but its rotation stops at the tip limits.
 """
@@ -61,7 +61,7 @@ class HandEstimator:
     ) -> None:
         """Create the estimator.
 
-        Each tip has a contact table, priors, and a material that provides the error of its
+        Each tip has a contact table, priors and a material. The material provides the error of its
         stress-strain law.
         """
         hand, gear = settings.hand, settings.servos.gear_ratio

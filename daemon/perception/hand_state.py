@@ -411,7 +411,7 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
-    """Update the state with the encoder angle, which is precise when the count changes.
+    """Update the state with the encoder angle, which is precise at the moment the count changes.
 
     Between two changes, the angle is known to within one count. ``step`` [rad] is the joint motion
     since the last reading, computed from the velocity.

@@ -65,7 +65,7 @@ def make_table(
 
 @lru_cache(maxsize=8)
 def _built(tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
-    """Build a contact table in 0.16 s. All hands in one process share the table."""
+    """Build a contact table, which takes 0.16 s. All hands in one process share the table."""
     return ContactTable.build(tip, material, tolerance)
 
 

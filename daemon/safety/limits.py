@@ -96,7 +96,7 @@ class JointMotion:
 
 
 class View:
-    """Scene whose limits are checked, with the history that some checks require."""
+    """Scene whose limits are checked, and the history that some checks require."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class View:
         return state.object.valid and _touches(left) and _touches(right)
 
     def holds(self, state: State) -> bool:
-        """Return True if `touched` is true and the grip has settled."""
+        """Return True if `touched` returns True and the grip has settled."""
         return state.mode in HOLDING_MODES and self.touched(state)
 
 
@@ -352,7 +352,7 @@ _CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 @Limit("joint.dead", "joint that is at least 0.05 rad from its goal, but neither moves nor draws "
     "current for 0.05 s", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
-    """Report a joint that is stationary away from its goal without drawing current.
+    """Report a joint that is away from its goal, stationary and not drawing current.
 
     A joint held back by a load draws current. In position mode, the expected current is unknown, so
     the check is skipped.

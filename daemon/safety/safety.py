@@ -35,7 +35,7 @@ class Breach(NamedTuple):
 
 
 class _Watch:
-    """Monitor for one limit and the duration of its violation."""
+    """Monitor that checks one limit and measures how long a violation lasts."""
 
     def __init__(self, limit: Limit, check: Check, view: View) -> None:
         self.limit = limit

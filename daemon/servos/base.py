@@ -91,7 +91,7 @@ class Servos(Protocol):
 
 
 class JointPlant(Protocol):
-    """Simulated joints with motors, used by the simulated and emulated servos.
+    """Simulated joints with motors, which the simulated and emulated servos use.
 
     Index 0 is the left finger's joint. Positive values close the finger.
     """

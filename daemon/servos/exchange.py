@@ -39,7 +39,7 @@ _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2
 
 
 class TickReads:
-    """A tick's group reads, all of the same type, in all span lengths."""
+    """Group reads of a tick: one read for each span length, all of the same type."""
 
     def __init__(
         self,
@@ -171,7 +171,7 @@ def judge_exchanges(
 
 
 def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) -> list[Finding]:
-    """Return a notice if even the fastest of a few test reads takes most of a tick."""
+    """Return a notice if even the fastest of a few test reads takes up most of a tick."""
     least = time_exchanges(port, reads, count=_CONNECT_READ_COUNT).least
     rate = settings.loop.rate
     if least * rate <= _REPLY_FRACTION_MAX:

@@ -37,7 +37,7 @@ def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
 
 
 class PortLost(ServoError):
-    """Raised if the open port disappears because the adapter was unplugged or lost power."""
+    """The open port has disappeared because the adapter was unplugged or lost power."""
 
 
 class SerialPort(PortHandler):  # type: ignore[misc]

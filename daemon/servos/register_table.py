@@ -246,7 +246,7 @@ def required_registers(
 
 
 def armed_registers(model: ServoModel) -> list[Requirement]:
-    """Return the rows for RAM registers written by `arm`."""
+    """Return the rows for the RAM registers that `arm` writes."""
     why = "set by another program; `arm` corrects it"
     d, i, p = model.position_gains
     values = (

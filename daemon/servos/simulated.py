@@ -26,7 +26,7 @@ class MotorHeat(Protocol):
     sensed: float  # thermometer reading [°C]
 
     def step(self, current: float, seconds: float) -> None:
-        """Advance by ``seconds`` at a constant ``current`` [A]."""
+        """Advance by ``seconds`` with a constant ``current`` [A]."""
 
 
 class HandPlant(JointPlant, Protocol):

@@ -1,4 +1,4 @@
-"""Define faults of the emulated hand: their syntax, servo line faults and measurement faults.
+"""Define faults of the emulated hand: fault syntax, servo line faults and measurement faults.
 
 A fault is written as ``[PART:]KIND[=VALUE][@START[..END]]``. The fault begins suddenly at START, or
 increases linearly from START to END. Faults do not change the physics of the hand.
@@ -72,14 +72,14 @@ class FaultSource:
         return bool(damage or rates.delay)
 
     def loses(self, reads: bool) -> bool:
-        """Return True if the next instruction is lost; ``reads`` is True for a read instruction."""
+        """Return True if the next instruction is lost; set ``reads`` for a read instruction."""
         rates = self.rates
         if rates.lose and self._random.random() < rates.lose:
             return True
         return bool(not reads and rates.lose_writes and self._random.random() < rates.lose_writes)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
-        """Return a reply's corrupted copies as (extra delay [s], bytes); none if it is dropped."""
+        """Apply faults to a reply; return the (extra delay [s], bytes) pairs to send, if any."""
         rates, chance = self.rates, self._random.random
         if chance() < rates.drop:
             return []
@@ -99,7 +99,7 @@ REPLAY_TIME_MAX = 3.0  # s
 
 
 class MeasurementFault(NamedTuple):
-    """Type of measurement fault: its neutral value and its limits."""
+    """Measurement fault type with its neutral value and limits."""
 
     honest: float
     low: float
@@ -121,7 +121,7 @@ SWITCHED_FAULTS = ("mirror", "replay")  # faults that are either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
-    """Raised for an invalid fault text. The message lists the allowed fault texts."""
+    """Invalid fault text. The message lists the allowed fault texts."""
 
 
 class FaultEvent(NamedTuple):
@@ -154,7 +154,7 @@ class _Form(NamedTuple):
     sided: bool = False  # True if the word may name a finger
 
     def fits(self, side: str | None, kind: str, valued: bool) -> bool:
-        """Return True if a word may have this syntax."""
+        """Return True if a fault word may belong to this group."""
         optional = self.value.startswith("[")
         return (
             kind in self.kinds
@@ -289,7 +289,7 @@ class MeasurementFaults:
         self._ramps: dict[str, _Ramp] = {}
 
     def begin(self, kind: str, value: float, t: float, over: float = 0.0) -> None:
-        """Change one of MEASUREMENT_FAULTS linearly to ``value`` within ``over`` [s] from ``t``.
+        """Change one of MEASUREMENT_FAULTS linearly to ``value``, from ``t`` to ``t + over`` [s].
 
         The change starts from the value at ``t`` and replaces an unfinished change. Raises KeyError
         if ``kind`` is unknown.
@@ -306,7 +306,7 @@ class MeasurementFaults:
         return MEASUREMENT_FAULTS[kind].honest if ramp is None else ramp(t)
 
     def apply(self, signal: FloatArray, full_count: int, t: float) -> None:
-        """Apply the faults at ``t`` [s] in place to a sensor's counts ``signal`` [rows, cols].
+        """Apply the faults at time ``t`` [s] to the sensor counts ``signal`` [rows, cols] in place.
 
         A shift by a fraction of a cell is interpolated.
         """
@@ -322,7 +322,7 @@ class MeasurementFaults:
 
 
 def _shift(count: int, cells: float) -> FloatArray:
-    """Return the matrix [count, count] that shifts by ``cells`` with linear interpolation."""
+    """Return the [count, count] matrix that shifts a signal by ``cells``, interpolated linearly."""
     places = np.arange(count)
     weights: FloatArray = np.maximum(1.0 - np.abs(places[:, None] - places - cells), 0.0)
     return weights

@@ -13,7 +13,7 @@ __all__ = ["TactileSensor"]
 
 
 class TactileSensor(Protocol):
-    """Pressure grid under one fingertip, which is read outside the tick."""
+    """Pressure grid under one fingertip. The grid is read outside the tick."""
 
     def open(self) -> None:
         """Open the sensor and wait for a valid frame. Raises TactileError if no frame arrives."""

@@ -59,7 +59,7 @@ _SQUARES = str.maketrans({"²": "2", "ý": "2", "^": "", ".": "", "*": ""})
 
 
 class TekscanError(SoftfingerError, ValueError):
-    """Raised for text that is not a valid export. The message names the line."""
+    """Text that is not a valid export. The message names the line."""
 
 
 @dataclass(frozen=True)

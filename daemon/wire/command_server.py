@@ -6,9 +6,9 @@ stops than the current number is refused, unless it is ``status``. A ``hold`` re
 ``hold`` that directly precedes it on the same connection.
 
 A client may add a unique ``key`` to a request and repeat the request if it was refused as late. The
-daemon carries out a command with a key at most once. If another command has been carried out since
-the refusal, the repeated request is refused, because the newest command prevails. Commands that can
-only make the hand safer (`NO_LEASE_COMMANDS`) are carried out every time.
+daemon executes a command with a key at most once. If another command has been executed since the
+refusal, the repeated request is refused, because the newest command prevails. Commands that can
+only make the hand safer (`NO_LEASE_COMMANDS`) are executed every time.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class CommandServer:
         return reply
 
     def _unpack(self, handler: Handler) -> None:
-        """Unpack the arrived requests. Carry out a stop immediately, and only once per call."""
+        """Unpack all received requests. Execute a stop immediately, but only once per call."""
         stopped, waiting = b"", self.link.unpacked
         size = 0  # bytes
         while self.link.asked and size < _UNPACKED_SIZE_MAX:
@@ -107,7 +107,7 @@ class CommandServer:
             waiting.append((ask, request))
 
     def _answer(self, ask: Ask, request: dict[str, Any], handler: Handler) -> bytes:
-        """Carry out a request, at most once if it has a key, and return the reply."""
+        """Execute a request (at most once if the request has a key) and return the reply."""
         name, place = request["command"], (ask.name, ask.payload)
         keyed = request.pop("key", None) is not None and name not in NO_LEASE_COMMANDS
         counts = stops, changes = self.link.stops, self._changes
@@ -140,7 +140,7 @@ def _replaces(request: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def accepted(reply: dict[str, Any]) -> bytes:
-    """Return the packed reply to a command that was carried out."""
+    """Return the packed reply to a command that was executed."""
     packed: bytes = msgpack.packb({"ok": True, **reply})
     return packed
 

@@ -40,7 +40,7 @@ TOPICS: dict[bytes, Topic] = {}
 
 
 class FieldSource(Generic[_From]):
-    """Source object of declared fields, obtained by calling ``get`` on the outer source."""
+    """Source object of declared fields, which is ``get`` applied to the outer source."""
 
     def __init__(
         self, outer: "FieldSource[Any] | None" = None, get: Getter = lambda it: it
@@ -49,7 +49,7 @@ class FieldSource(Generic[_From]):
         self.get = get
 
     def of(self, get: Callable[[_From], _Within]) -> "FieldSource[_Within]":
-        """Declare a source that is obtained by calling ``get`` on this source."""
+        """Declare a source that is ``get`` applied to this source."""
         return FieldSource(self, get)
 
     def __call__(
@@ -57,7 +57,7 @@ class FieldSource(Generic[_From]):
     ) -> _Value:
         """Declare a field.
 
-        Without ``get``, the field's value is the source's attribute of the same name.
+        Without ``get``, the field value is the source attribute with the field's name.
         """
         about = {"unit": unit, "meaning": meaning, "source": self, "get": get}
         return cast(_Value, dataclasses.field(metadata=about))
@@ -91,7 +91,7 @@ def members(cls: type[Any]) -> Iterator[Member]:
 
 @dataclass_transform(frozen_default=True)
 def record(cls: type[_Record]) -> type[_Record]:
-    """Turn a class of declared fields into a record, whose docstring lists them."""
+    """Turn a class of declared fields into a record whose docstring lists the fields."""
     made = dataclasses.dataclass(frozen=True, slots=True)(cls)
     listed = ["", "Attributes", "----------"]
     for each in members(made):

@@ -50,7 +50,7 @@ class ServerKeys:
     clients: dict[bytes, str]  # maps each public key to a client name
 
     def left(self, folder: Path) -> ServerKeys:
-        """Return the keys, except the keys of clients whose files were removed.
+        """Return the keys, except those of clients whose key files have been removed.
 
         Raises KeyFileError.
 
@@ -72,14 +72,14 @@ class ServerKeys:
 
 @dataclass(frozen=True, slots=True)
 class ClientKeys:
-    """A client's key pair and the server's public key, in Z85."""
+    """A client's key pair and the server's public key, all in Z85."""
 
     server: bytes
     public: bytes
     secret: bytes
 
     def guard(self, socket: zmq.Socket[Any] | zmq.Context[Any]) -> None:
-        """Use these keys in a socket that is not yet connected, or in a context's new sockets."""
+        """Use these keys for a socket before it connects, or for all new sockets of a context."""
         socket.setsockopt(zmq.CURVE_SERVERKEY, self.server)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)

@@ -1,7 +1,7 @@
 """Provide a local socket for ``stop`` that other clients can't block.
 
-The socket is a Unix datagram socket, so connections can't run out. Only the daemon's user can send
-to the socket. `client.command_client` uses the socket if it exists.
+The socket is a Unix datagram socket, so the daemon can't run out of connections. Only the daemon's
+user can send to the socket. `client.command_client` uses the socket if it exists.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
 
 def free_socket_path(path: Path, kind: socket.SocketKind) -> str:
-    """Remove the socket file of a killed process; return the reason if the path is not free."""
+    """Remove the socket file that a killed process left; return a reason if the path is in use."""
     if not path.exists():
         return ""
     if not path.is_socket():

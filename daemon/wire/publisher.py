@@ -106,7 +106,7 @@ class Publisher:
         self._link.look()
 
     def send(self, topic: bytes, *arguments: object) -> None:
-        """Publish a message; ``arguments`` are those of the topic's source in `wire.schema`."""
+        """Publish a message; ``arguments`` are passed to the topic's source in `wire.schema`."""
         self._link.publish(_INDEX[topic], self._pack[topic](*arguments))
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:

@@ -126,7 +126,7 @@ def frame_html(frame: TactileFrame) -> str:
 
 
 def _outlines(pressure: NDArray[np.float64]) -> Iterator[tuple[int, str]]:
-    """Yield each shade in a frame with an SVG path of its cells, merged within each row."""
+    """Yield each shade in a frame with an SVG path of its cells; adjacent cells are merged."""
     full = max(pressure.max(), _FULL)
     levels = np.rint(np.nan_to_num(pressure / full) * _SHADES).astype(int)[::-1]
     for level in range(1, _SHADES + 1):

@@ -1,7 +1,7 @@
 """Define the stream schema, the only declaration of all topics and fields.
 
 Each topic is a record. Each field has a unit, a meaning and a source. The value of a field is
-either a function of the source or the source's attribute of the same name. The packers
+either a function of the source or the source attribute with the field's name. The packers
 (`wire.publisher`), the records that clients read (`client.stream`), the ``STREAM.md`` page and the
 JSON Schemas of recordings (`wire.schema_docs`) are derived from these declarations.
 
@@ -398,7 +398,7 @@ class TactileFrame:
 
     @property
     def pressure(self) -> NDArray[np.float64]:
-        """Pressure of each cell [Pa], counts times scale, float64 [rows, cols]."""
+        """Pressure of each cell [Pa] (counts times scale), float64 [rows, cols]."""
         return self.counts.astype(np.float64) * self.scale
 
 

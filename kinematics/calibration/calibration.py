@@ -1,4 +1,4 @@
-"""Calibration of a pressure sensor under a soft tip.
+"""Calibrate a pressure sensor under a soft tip.
 
 The steps are, in order:
 
@@ -58,7 +58,7 @@ _ITERATIONS = 25  # number of iterations that alternate between the term strengt
 
 
 class CalibrationError(SoftfingerError, ValueError):
-    """Error raised if the data do not determine the result."""
+    """The data do not determine the result."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
 @dataclass(frozen=True)
 class SensorCurve:
-    """Result of `fit_curve`: p = c_1 x^b + c_2 x² + c_3 x³ [Pa].
+    """Result of `fit_curve`: the pressure p = c_1 x^b + c_2 x² + c_3 x³ [Pa].
 
     ``coefficients`` are (b, c_1, c_2, c_3). ``errors`` [n] are the relative errors at the known
     forces, and ``residual`` is their rms.
@@ -199,8 +199,8 @@ def fit_curve(
 ) -> SensorCurve:
     """Fit the pressure curve of the cells to known forces.
 
-    The pressure times the cell area, summed over all cells, is fitted to the forces. The fit
-    minimises the squared relative errors.
+    The fitted force is the pressure times the cell area, summed over all cells. The fit minimises
+    the squared relative errors.
 
     Parameters
     ----------
@@ -454,8 +454,8 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
         Time [s] and force [N]. The press may have any speed and depth. The press must begin without
         contact, because the fit does not include earlier relaxation.
     times
-        Time constants τ_i [s]. If a time constant is shorter than two frames, its strength cannot
-        be determined and is set to 0.
+        Time constants τ_i [s]. If a time constant is shorter than two frame periods, its strength
+        cannot be determined and is set to 0.
 
     Raises
     ------

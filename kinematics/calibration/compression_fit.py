@@ -123,7 +123,7 @@ def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
 
 
 def rising(d: FloatArray) -> tuple[slice, int]:
-    """Return the rows of the last branch that rises to full depth, and the number of such branches.
+    """Return the rows of the last branch that reaches full depth, and the number of such branches.
 
     Raises CalibrationError in the same cases as `loading`.
     """
@@ -150,7 +150,7 @@ def rising(d: FloatArray) -> tuple[slice, int]:
 
 
 def _turning_points(d: FloatArray, slack: float) -> list[int]:
-    """Return the indices of the first and last row and of reversals of ``d`` above ``slack``."""
+    """Return the indices of the first row, the last row, and reversals of ``d`` above ``slack``."""
     turns, extreme, way = [0], 0, 0
     for k in range(1, d.size):
         moved = d[k] - d[extreme]
@@ -373,7 +373,7 @@ def _shapes(
 
 
 def _variance_inflation(left: FloatArray) -> float:
-    """Return the variance factor due to the lag-1 correlation of the residuals ``left``."""
+    """Return the variance increase factor due to lag-1 correlation of the residuals ``left``."""
     lag = float(left[1:] @ left[:-1]) / float(left @ left)
     lag = min(max(lag, 0.0), 0.99)
     return (1.0 + lag) / (1.0 - lag)

@@ -19,7 +19,7 @@ _ITERATIONS = 12
 
 
 class HeatFit(NamedTuple):
-    """Factors on the model's ``rise`` and ``time``, their standard deviations and the residual."""
+    """Factors for the model's ``rise`` and ``time``, their standard deviations and the residual."""
 
     rise: float
     rise_std: float

@@ -1,4 +1,4 @@
-"""Latency of tactile frames: the delay of d at the tips relative to the joint closing."""
+"""Measure the latency of tactile frames, i.e. the delay of d at the tips after the joint motion."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def fit_latency(
     latency: float,
     response: float = 0.0,
 ) -> LatencyFit:
-    """Fit the frame delay to the ramps k of a grip. In a ramp, the force rises or falls.
+    """Fit the frame delay to the ramps k of a grip. The force rises or falls during a ramp.
 
         d(t) = scale · closing(t − delay) + offset_k
 

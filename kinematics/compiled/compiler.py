@@ -106,7 +106,7 @@ class KernelCompiler(CompilerBase):
 
 
 class _Arguments(tuple[Any, ...]):
-    """Argument types without their long string form, which Numba would build in every pass."""
+    """Argument types without the long string form that Numba would build in every pass."""
 
     __slots__ = ()
 

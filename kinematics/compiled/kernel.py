@@ -34,7 +34,7 @@ _SUMS = {"reassoc", "contract", "nsz", "arcp"}
 
 
 class JitDisabled(SoftfingerError):
-    """Error raised if Numba's JIT compilation is disabled."""
+    """Numba's JIT compilation is disabled."""
 
 
 def _chosen_compiler() -> tuple[ModuleType, str]:

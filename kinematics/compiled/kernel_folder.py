@@ -108,7 +108,7 @@ def _without_checksum(data: bytes) -> bytes:
 
 
 def damaged(folder: OwnFolder) -> list[str]:
-    """Return the names of corrupted or unreadable kernel files. The check takes a few ms."""
+    """Return the names of corrupted or unreadable kernel files. Takes a few milliseconds."""
     found = []
     for name in folder.names():
         if name.endswith(_KERNEL):

@@ -1,9 +1,9 @@
-"""Exact contact formulas for a soft hemispherical fingertip of constant modulus on a plane.
+"""Exact contact formulas for a soft hemispherical fingertip with constant modulus on a plane.
 
 The module defines the fingertip's geometry and computes force, energy and partial derivatives. The
 tip is a hemisphere of radius a on a rigid base. Each point of the base carries an independent
-spring that is normal to the base. The object's face is displaced by d along its normal, which is
-tilted by θ from the base normal. With h = a − d:
+spring that is normal to the base. The object's face is displaced by d along the face's normal,
+which is tilted by θ from the base normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 

@@ -4,7 +4,7 @@ A spring tip's table stores the ratio of each quantity to its closed form for th
 strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, the ratios
 are exactly 1 and the table has no coefficients.
 
-Two coordinates make the ratios analytic up to the edges of the domain: the height h = (a − d)/a,
+In two coordinates, the ratios are analytic up to the edges of the domain: the height h = (a − d)/a,
 and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The coordinate y is even in θ. The value of y is 1 at θ
 = 0 and 0 at the limit on θ. The peak strain is 1 − u. The domain is divided into slabs of h, 16 per
 octave, and each slab into as many pieces of y as the tolerance requires. The domain ends at h =

@@ -15,7 +15,7 @@ moment ∂U/∂θ. With the base force F, the base pressure is
 Without friction, F = N cos θ. A sticking face holds each point of the tip at the position where the
 point first touched it. The plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ
 is the derivative of the energy of straight presses with respect to the tilt. A shear force T = −N
-sin θ cos θ q_0 pulls the tip up the slope, and F = N cos θ (1 − sin² θ q_0).
+sin θ cos θ q_0 pulls the tip up the slope. Therefore, F = N cos θ (1 − sin² θ q_0).
 
 A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). The shear force is
 assumed to act at height a, so its moment about the base centre is T a.
@@ -42,7 +42,8 @@ _FILE = Path(__file__).with_name("solid_tip.npz")
 class SolidData:
     """Data of a solid tip at one ν, for E = a = 1.
 
-    Polynomials are stored in powers of x = 2 t/``root`` − 1, then of y = 2 sin² θ/``square`` − 1.
+    Polynomials are stored by powers of x = 2 t/``root`` − 1 and, within these, by powers of y = 2
+    sin² θ/``square`` − 1.
     """
 
     root: float  # maximum t

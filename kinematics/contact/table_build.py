@@ -157,7 +157,7 @@ def _terms(values: FloatArray) -> FloatArray:
 
 @cache
 def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return Chebyshev nodes on [−1, 1] and the matrix from node values to coefficients."""
+    """Return Chebyshev nodes on [−1, 1], and the matrix that maps node values to coefficients."""
     nodes: FloatArray = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     inverse = np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
     return nodes, np.asarray(inverse, dtype=np.float64)

@@ -108,7 +108,7 @@ def _shifted_polynomial(count: int, end: float) -> FloatArray:
 
 
 def rises(curve: ArrayLike, root: float, square: float) -> bool:
-    """Return True if the curve is positive and increasing in t on (0, root] × [0, square]."""
+    """Return True if the curve is positive and increases with t on (0, root] × [0, square]."""
     t, q = np.meshgrid(np.linspace(0.0, root, 41), np.linspace(0.0, square, 9), indexing="ij")
     values = _value(t, q, np.asarray(curve))
     return bool((np.diff(values, axis=0) > 0.0).all() and (values[0] >= 0.0).all())

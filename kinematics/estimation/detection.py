@@ -33,7 +33,7 @@ _SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviatio
 
 @fast_inner_kernel
 def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
-    """Return Σ p, Σ p² and the maximum of 0 and all p; non-finite cells make Σ p non-finite."""
+    """Return Σ p, Σ p² and the maximum of 0 and all p. A non-finite cell makes Σ p non-finite."""
     total = 0.0
     energy = 0.0
     peak = np.int64(0)
@@ -120,8 +120,8 @@ def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bo
     """Return True if the cells of a frame without contact scatter by more than their noise.
 
     Only cells above a centre are used, because readings may be clipped at 0. The centre is the mean
-    reading, or 0 if more than a quarter of the cells read 0. With half of 788 cells, the noise is
-    determined with a standard deviation of 4 %.
+    reading, or 0 if more than a quarter of the cells read 0. If half of 788 cells are above the
+    centre, the standard deviation of the noise estimate is 4 %.
     """
     signal = state.signal
     if not (signal.is_finite and signal.peak > signal.mean + _SUSPECT_PEAK * signal.noise):
@@ -219,7 +219,7 @@ def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) ->
 
 @inner_kernel
 def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArray) -> int:
-    """Run :func:`activity` with outliers masked and return the number of outliers."""
+    """Mask the outliers, run :func:`activity`, and return the number of outliers."""
     signal = state.signal
     cols = state.grid.cols
     rejected = 0

@@ -126,7 +126,7 @@ def set_budget(
     material: Material,
     pattern: FloatArray | None,
 ) -> None:
-    """Set the error budget, and raise the threshold of the activity test above the common errors.
+    """Set the error budget, and raise the activity test threshold above the common errors.
 
     The material's ``fit_error`` [Pa], the maximum difference between the law and the fitted points,
     acts like a zero shift of the pressed cells. ``pattern`` [rows, cols] is the pattern used to
@@ -187,7 +187,7 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
 def _set_widening(
     state: EstimatorState, rho: FloatArray, grid: SensorGrid, tip: Fingertip, material: Material
 ) -> None:
-    """Tabulate the widening by correlated noise at zero tilt, and the fit's degrees of freedom."""
+    """Tabulate the fit's degrees of freedom and the widening by correlated noise at zero tilt."""
     options = state.options
     first = 0 if options.free_gain else 1
     step = 1e-3
@@ -309,7 +309,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     """Set ``budget.shared``, the covariance of the fit parameters due to common errors.
 
     ``fit.inverse`` must be the covariance for white noise of variance 1 Pa². Returns the sum of
-    squared residuals [Pa²] that results if each common error equals twice its standard deviation.
+    squared residuals [Pa²] for common errors of twice their standard deviations.
     """
     fit = state.fit
     budget = state.budget

@@ -33,7 +33,7 @@ __all__ = ["ContactEstimate", "ContactEstimator", "Readings"]
 
 @dataclass(slots=True)
 class ContactEstimate:
-    """Estimated contact in one frame; SI units, angles in rad.
+    """Estimated contact in one frame, in SI units.
 
     Attributes
     ----------
@@ -89,8 +89,8 @@ class ContactEstimate:
     known uncertainties.
 
     Without a contact, d and the tilts are 0, the estimate is valid, and ``d_std`` is the smallest
-    detectable d. Two errors cannot be detected from a single frame: a wrong modulus if the gain is
-    fixed, and a displacement of the tip on the sensor.
+    detectable d. A single frame does not reveal two errors: a wrong modulus if the gain is fixed,
+    and a displacement of the tip on the sensor.
     """
 
     contact: bool = False
@@ -382,7 +382,7 @@ class ContactEstimator:
         self._arrays = self._rows, pixels, weights.array, *points
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:
-        """Set and return a solid tip's contact pattern [rows, cols], from its dominant image."""
+        """Set a solid tip's contact pattern [rows, cols] from its dominant image, and return it."""
         pattern = self.grid.images(tip)[0].reshape(self.grid.shape) * alive
         pattern = np.where(alive, pattern - pattern.sum() / alive.sum(), 0.0)
         pattern /= math.sqrt((pattern**2).sum())

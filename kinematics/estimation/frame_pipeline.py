@@ -1,4 +1,4 @@
-"""Processing of one pressure frame, with the estimator's only compiled entry point.
+"""Process one pressure frame; this module contains the estimator's only compiled entry point.
 
 The steps are the activity test, the outlier rejection, and a maximum likelihood fit. The fit starts
 from the last estimate, or from an initial estimate based on the frame alone.
@@ -167,7 +167,7 @@ def _set_results(state: EstimatorState) -> None:
 def _fault_in_readings(
     state: EstimatorState, frame: FloatArray, height: FloatArray, reason: Invalid
 ) -> Invalid:
-    """Return the fault in the readings that explains a failed estimate, otherwise ``reason``."""
+    """Return the fault in the readings that explains a failed estimate, or else ``reason``."""
     signal = state.signal
     level = max(ABOVE_NOISE * signal.noise, ABOVE_PEAK * signal.peak)
     above = pressed = full = 0

@@ -58,7 +58,7 @@ CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 
 @inner_kernel
 def parameters(options: Options) -> tuple[int, int]:
-    """Return the half-open range of the fitted parameters."""
+    """Return the half-open index range of the fitted parameters."""
     return GAIN if options.free_gain else DEPTH, PARAMETERS if options.is_solid else SHEAR_X
 
 
@@ -132,7 +132,7 @@ def _clip_noise(
 def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
     """Compute the model, residual and response of each cell, and their sums.
 
-    A cell never reads below the floor, and never below 0 even where the rubber is in tension. A
+    A cell never reads below the floor, and never below 0, even if the rubber is in tension there. A
     saturated cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the
     noise is clipped at the floor; otherwise, cells with a model below the floor are excluded.
     """
@@ -325,7 +325,7 @@ def _check_fit(state: EstimatorState, cells: Cells) -> float:
 
 @inner_kernel
 def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) -> bool:
-    """Set the estimate after the fit; return False for too few cells.
+    """Set the estimate after the fit; return False if there are too few cells.
 
     ``fit.inverse`` times ``fit.variance`` is the covariance due to noise, and ``budget.shared``
     times ``fit.widening`` the covariance due to other errors.

@@ -223,7 +223,7 @@ class MeasuredEstimator:
         return Invalid.NONE if agrees else Invalid.MODEL_MISMATCH
 
     def _errors(self, t: float, n: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the partials of (d, n_x, n_y) in the sums, and the covariance of (d, n_x, n_y).
+        """Return the partials of (d, n_x, n_y) with respect to the sums, and the covariance.
 
         The covariance includes the noise of the sums and the errors that are common to all frames.
         """

@@ -77,7 +77,7 @@ def _inverse(values: FloatArray, value: float) -> float:
 
 @inner_kernel
 def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Estimate the contact from the frame alone: once from strong cells, twice from moments."""
+    """Estimate the contact from the frame alone: from strong cells, then twice from moments."""
     m = state.moments
     signal = state.signal
     guess = state.estimate.guess
@@ -173,7 +173,7 @@ def _set_from_area(state: EstimatorState, number: float) -> None:
 
 @inner_kernel
 def _set_normal(state: EstimatorState, arm: float) -> None:
-    """Set the normal by the centroid, shortened if it is too long for a unit normal."""
+    """Set the normal from the centroid; limit the normal's in-plane part to `_SINE_MAX`."""
     guess = state.estimate.guess
     n_x, n_y = state.moments.x / arm, state.moments.y / arm
     shorter = min(1.0, _SINE_MAX / max(math.hypot(n_x, n_y), 1e-9))
@@ -183,7 +183,7 @@ def _set_normal(state: EstimatorState, arm: float) -> None:
 
 @inner_kernel
 def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Refine the guess using the moments over its widened footprint."""
+    """Refine the guess using the moments over the guess's widened footprint."""
     guess = state.estimate.guess
     grid = state.grid
     face = state.around

@@ -179,7 +179,7 @@ def _unexplained(
     arm: float,
     moment_arm: float,
 ) -> tuple[float, float, float]:
-    """Return one finger's residual torque [N·m] and its decrease per T and T².
+    """Return the residual torque [N·m] of one finger, and its coefficients of −T and −T².
 
     The residual is the joint torque, signed by ``side``, minus the contributions of N, ∂U/∂θ and T.
     """

@@ -83,7 +83,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
 
 @inner_kernel
 def _convection_factor(over: float) -> float:
-    """Return the convection factor g for a case at ``over`` K above ambient, but at least 1 K."""
+    """Return the convection factor g for a case ``over`` K above ambient; use at least 1 K."""
     return math.sqrt(math.sqrt(max(over, 1.0) / _CONVECTION_DIFFERENCE))
 
 

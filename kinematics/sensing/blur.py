@@ -41,8 +41,8 @@ def axis_points(
 def cell_means(points: FloatArray, along: FloatArray, across: FloatArray) -> FloatArray:
     """Return the means [rows, cols] of cells over ``points`` [lines, points per line].
 
-    The weights along y and ``across``, along x, and the order of the points are those of
-    :func:`axis_points`, with all points of a cell in sequence.
+    The weights along y, the weights ``across`` along x, and the order of the points are those of
+    :func:`axis_points`. All points of a cell are in sequence.
     """
     for weights in (across, along):
         count, reach = weights.shape

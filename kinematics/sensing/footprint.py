@@ -61,7 +61,7 @@ def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def set_around(out: Face, face: Face, a: float, margin: float) -> None:
-    """Set ``out`` parallel to ``face``, with a footprint radius larger by ``margin`` [m].
+    """Set ``out`` to a face parallel to ``face``, with a footprint larger by ``margin`` [m].
 
     The enlarged footprint is limited to the tip's rim.
     """

@@ -298,7 +298,7 @@ class SolidPressure:
         out: FloatArray,
         shear: tuple[float, float] | None = None,
     ) -> None:
-        """Call :func:`render_solid`; by default, ``shear`` is that of straight indentation."""
+        """Call :func:`render_solid`; the default ``shear`` is that of straight indentation."""
         whole = shear is not None
         render_solid(
             self._weights, self._pixels, contact, shear or (0.0, 0.0), whole, gain, out.reshape(-1)

@@ -5,9 +5,9 @@ normal n = (sin θ, 0, cos θ), applied to both mirror images y and −y. The ce
 C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Contact therefore requires
 q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
 
-On a sticking face, two additional forces along the plane hold each cell where the cell first
-touched. With a sticking face, the result depends on the path. The plane moves straight along n, so
-the held points do not move along the plane and the tangential forces do no work. Therefore N =
+On a sticking face, two additional forces along the plane hold each cell at the position where the
+cell first touched the plane. The result then depends on the path. The plane moves straight along n,
+so the held points do not move along the plane and the tangential forces do no work. Therefore N =
 ∂U/∂d holds, as it does without friction.
 """
 

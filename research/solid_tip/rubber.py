@@ -381,7 +381,7 @@ class Body:
             )
 
     def _go(self, state: State, d: float) -> State:
-        """Advance to depth ``d`` in as many steps as needed and return the state."""
+        """Advance to depth ``d`` in as many steps as necessary, and return the state."""
         try:
             return self._step(state, d)
         except RuntimeError:
@@ -430,7 +430,7 @@ class Body:
         raise RuntimeError(f"no contact found at d = {d} a, θ = {self.theta} rad")
 
     def base_pressure(self, motion: FloatArray, forces: FloatArray) -> FloatArray:
-        """Return cosine harmonics of the base pressure at `MIDDLES` in the deformed position."""
+        """Return cosine harmonics of the base pressure at `MIDDLES`, in the deformed position."""
         place = self.nodes.copy()
         if self.at_rest is not None:  # The elements are linear.
             motion = 0 * motion
@@ -498,7 +498,7 @@ class Body:
 def strained(
     block: str, poisson: float, theta: float | None, mesh: Meridian, file: Path
 ) -> dict[str, FloatArray]:
-    """Return linear and nonlinear presses as arrays (2, n, …), linear first; cached in ``file``."""
+    """Return linear and nonlinear presses as arrays (2, n, …), linear first. Caches to ``file``."""
     if not file.exists():
         base, sticking = block.removesuffix("-sticking"), block.endswith("-sticking")
         found = []

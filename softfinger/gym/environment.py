@@ -335,6 +335,6 @@ class Images(gymnasium.ObservationWrapper[Observation, NDArray[np.float32], Obse
         self.observation_space: Any = spaces.Dict({**known.spaces, "pressure": image})
 
     def observation(self, observation: Observation) -> Observation:
-        """Replace the entry ``pressure`` of the observation by 8-bit images."""
+        """Replace the ``pressure`` entry of the observation with 8-bit images."""
         grey = np.minimum(observation["pressure"] * (255.0 / self._full), 255.0)
         return observation | {"pressure": grey.astype(np.uint8)}

@@ -85,7 +85,7 @@ def _box(at: NDArray[np.float64], reach: float) -> tuple[slice, slice]:
 
 
 class Window:
-    """Tkinter window that shows images at most as fast as in simulated time."""
+    """Tkinter window that shows images at real-time speed or slower."""
 
     def __init__(self, title: str) -> None:
         """Open the window.

@@ -244,7 +244,7 @@ class VirtualTimeHand(Hand):
         return made
 
     def _select_topics(self) -> None:
-        """Tap the topics of the open subscriptions, or all topics while recording."""
+        """Collect the topics of the open subscriptions, or all topics while recording."""
         self._subscriptions = [each for each in self._subscriptions if each.is_open]
         self._link.tapped = 0 if self._writer is None else _EVERYTHING
         for each in self._subscriptions:

@@ -1,6 +1,6 @@
 """Fuzz commands, profiles and calibration files: invalid input must be rejected cleanly.
 
-Commands are sent to a running hand, every hundredth of them through a real socket.
+Commands are sent to a running hand. Every hundredth command is sent through a real socket.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Publisher and command server on real sockets, with a hand computed from formulas.
+"""Publish states and serve commands on real sockets, for a hand computed from formulas.
 
 Client tests use these sockets and control all messages.
 """

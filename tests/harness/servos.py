@@ -57,7 +57,7 @@ def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
 
 
 class BusClient:
-    """Bus client with its own time; it parses replies with the independent parser."""
+    """Bus client with its own time and an independent parser for the replies."""
 
     def __init__(self, bus: ServoBus) -> None:
         self.bus = bus

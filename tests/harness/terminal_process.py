@@ -82,7 +82,7 @@ class TerminalProcess:
         os.write(self.master, keys)
 
     def press(self, key: bytes, text: str) -> None:
-        """Press a key repeatedly until ``text`` appears; a busy machine may lose a key press."""
+        """Press a key until ``text`` appears, because a busy machine may lose a key press."""
         while text not in self.text():
             self.type(key)
             later = time.monotonic() + 1.0

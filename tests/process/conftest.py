@@ -39,7 +39,7 @@ def connect(running: Run) -> Iterator[Connect]:
 
 @pytest.fixture
 def fake() -> Iterator[FakeDaemon]:
-    """Return a fake daemon: real sockets, with a hand computed from formulas."""
+    """Return a fake daemon, which has real sockets and computes its hand from formulas."""
     with FakeDaemon() as fake:
         yield fake
 

@@ -1,4 +1,4 @@
-"""Test the bus's traffic record, read directly and through the control socket."""
+"""Test the bus traffic record when it is read directly and through the control socket."""
 
 import json
 import struct

@@ -1,4 +1,4 @@
-"""Test the command line in processes: run, send, signals, a second daemon, invalid settings."""
+"""Test the command line in processes: `run`, `send`, signals, a second daemon, invalid settings."""
 
 import json
 import os

@@ -2,7 +2,8 @@
 
 Each page runs from top to bottom in its own folder, with one simulated hand. `harness.documented`
 provides the `softfinger` command and describes which commands are only parsed. A block with a title
-is saved under that name for later blocks. A mark above a block makes an exception:
+is saved in a file with that name, which later blocks can use. A mark above a block makes an
+exception:
 
     <!-- not run: why -->                  the block cannot be run, with the reason
     <!-- not run without gymnasium -->     the block needs a package that is not installed here

@@ -1,4 +1,4 @@
-"""Test measures for punctual ticks: applied and reverted where permitted, otherwise reported."""
+"""Test that real-time measures are applied and reverted if permitted, and otherwise reported."""
 
 import ctypes
 import json

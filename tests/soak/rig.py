@@ -77,7 +77,7 @@ class Rig:
             self.start_daemon(*words)
 
     def start_daemon(self, *more: str) -> None:
-        """Start the daemon and wait for its first reply; may raise RigError."""
+        """Start the daemon and wait for its first reply. Raises RigError."""
         end = time.monotonic() + _PATIENCE
         words = ["run", "--config", str(self.config), "--dir", str(self.ports), *_PATIENT, *more]
         log = str(self.folder / "daemon.log")
@@ -131,7 +131,7 @@ class Rig:
         return self.daemon is not None and self.daemon.poll() is None
 
     def send(self, words: str) -> str:
-        """Send words to the emulated hand's control socket; may raise RigError."""
+        """Send words to the emulated hand's control socket. Raises RigError."""
         try:
             return carry_out(self.ports, words)
         except SoftfingerError as error:
@@ -143,7 +143,7 @@ class Rig:
         return report
 
     def ask(self, request: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
-        """Send one command and return its reply; may raise NoAnswer."""
+        """Send one command and return its reply. Raises NoAnswer."""
         return send(self.commands, request, timeout)
 
     def status(self, timeout: float = 0.5) -> dict[str, Any] | None:

@@ -1,9 +1,9 @@
 """Run a virtual-time soak: random sequences of commands, loads and faults, one per seed.
 
 ``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most sequences grip the object;
-the grips are then loaded, turned, disturbed by faulty measurements and stopped. The daemon is
-complete except for its sockets. Requirements are checked against the plant and the data sent to the
-servos, never against the daemon's own reports. The soak counts how often each requirement is
+the grips are then loaded, turned, disturbed by faulty measurements and stopped. The daemon runs
+completely, except for its sockets. Requirements are checked against the plant and the data sent to
+the servos, never against the daemon's own reports. The soak counts how often each requirement is
 checked, and fails if a requirement is never checked. The tests run a few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time, with its stream recorded and

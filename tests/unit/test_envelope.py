@@ -1,4 +1,4 @@
-"""Test the envelope of the hand's grips: virtual-time runs, the stored map, use by `grasp`."""
+"""Test the grip envelope: virtual-time runs, the stored map, and its use by `grasp`."""
 
 from typing import Any
 

@@ -272,7 +272,7 @@ def rotation(angle: float) -> np.ndarray:
 
 
 def contacts_by_rotation(hand: ReferenceHand, q, pose, width) -> np.ndarray:
-    """Reference with fingers as rotated vectors and the object's frame as a rotation matrix."""
+    """The reference uses rotated vectors for the fingers and a rotation matrix for the object."""
     local = np.array([hand.finger_offset, hand.finger_length])
     left = np.array([-hand.half_separation, 0]) + rotation(-q[0]) @ local
     right = np.array([hand.half_separation, 0]) + rotation(q[1]) @ (local * [-1, 1])

@@ -148,7 +148,7 @@ def test_a_joint_fault_ends_a_grip(make, how, name, within):
     "mode", ["current-based position", pytest.param("current", marks=pytest.mark.extended)]
 )
 def test_grips_turns_stops_and_pushes_cause_no_false_alarm(make, mode):
-    """Long grips, with joints at a stop, on an object, or pushed away from their goals."""
+    """The grips are long, with joints at a stop, on an object, or pushed away from their goals."""
     daemon = make(servos={"mode": mode})
     hand: Any = daemon.hand
     command(daemon, "arm")

@@ -1,4 +1,4 @@
-"""Test measurement faults: their text form, and their effect on an unchanged hand's sensors."""
+"""Test measurement faults: syntax, and effect on the sensors while the hand itself is unchanged."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Test that another user's files in place of this user's are neither followed nor overwritten."""
+"""Test that another user's files at this user's paths are neither followed nor overwritten."""
 
 import os
 from collections.abc import Callable

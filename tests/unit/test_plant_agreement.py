@@ -64,7 +64,7 @@ class Contact:
         return np.array(columns).T
 
     def slide(self, x):
-        """Return the Jacobian row for the touched body's velocity relative to the tip, along t."""
+        """Return the Jacobian row for the touched body's velocity along t, relative to the tip."""
         m = self.normal(x)
         t = np.array([-m[1], m[0]])
         point = tips(x)[self.finger] + self.way(x)
@@ -239,7 +239,7 @@ def start(scene: Scene, loss: float, count: int):
 
 
 def compared(hand, scene: Scene) -> np.ndarray:
-    """Return the state in the reference's order."""
+    """Return the plant state in the coordinate order of the reference."""
     state = hand.plant.state
     shears = state.extra_shear[-2:] if scene.contacts[0].mutual else state.shear
     palm = state.extra_shear[: 0 if scene.corners is None else 2]

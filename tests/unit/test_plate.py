@@ -1,4 +1,4 @@
-"""Test the plate that presses an emulated tip: text form, motion, and invalid input."""
+"""Test the plate that presses on an emulated tip: syntax, motion, and invalid input."""
 
 import math
 

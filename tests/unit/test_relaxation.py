@@ -1,4 +1,4 @@
-"""Test relaxing tips: the plant against the integrals of its Prony terms, and its energy."""
+"""Test tip relaxation: the plant against the integrals of its Prony terms, and energy decay."""
 
 import re
 from pathlib import Path

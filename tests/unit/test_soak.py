@@ -1,4 +1,4 @@
-"""Run short soak sequences; test that requirements hold and violations are detected."""
+"""Run short soak sequences; test that all requirements are met and that violations are detected."""
 
 import math
 from collections.abc import Iterator

@@ -40,7 +40,7 @@ def test_joints_are_held_at_their_positions_once_torque_is_on(make):
 
 
 def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
-    """The writes are lost, but readings still arrive and keep resetting the servos' watchdogs."""
+    """All writes are lost, but the reads still succeed and keep resetting the servo watchdogs."""
     daemon = make()
     events = heard(daemon)
     command(daemon, "arm")

@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Analyse files and write the results; a single file may raise SoftfingerError or OSError."""
+    """Analyse files and write the results. Raises SoftfingerError or OSError for a single file."""
     settings, files = profile(arguments), arguments.files
     if len(files) == 1:
         print(_analysed(arguments, settings, files[0]), end="")
@@ -328,7 +328,7 @@ class _Pass:
 
 
 def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
-    """Compute the contacts of each sensor; may raise the errors of ``source.frames``."""
+    """Compute the contacts of each sensor. Raises the errors of ``source.frames``."""
     models = source.models()
     passes = {finger: _Pass(source, models, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):

@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plot a recording; may raise RecordingError, Missing, MissingExtra or OSError."""
+    """Plot a recording. Raises RecordingError, Missing, MissingExtra or OSError."""
     require("plot")  # Fail early, before reading a long recording.
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
@@ -155,7 +155,7 @@ def load_run(
     end: float,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedRun:
-    """Read the figure data from ``start`` to ``end`` [s]; may raise RecordingError."""
+    """Read the figure data from ``start`` to ``end`` [s]. Raises RecordingError."""
     messages = recording.messages([schema.STATE], start, end, progress)
     record = schema.TOPICS[schema.STATE].record
     states = to_columns([read(record, message) for _, message in messages])

@@ -68,7 +68,8 @@ class TwoPhased(Altered):
 
     Phase one integrates the object angle error with ``bandwidth`` [Hz] into an antisymmetric joint
     goal. Phase two is a PD law that moves the joints to this goal; equal bias torques for the grip
-    are added. The measured force is not used: the bias is computed from the requested force.
+    are added. The measured force is not used. The bias torques are computed from the requested
+    force.
     """
 
     def __init__(

@@ -4,11 +4,11 @@ All measured functions take turns in one run. All lookups use the same points: |
 up to 8 mm. Half of the displacements are evenly spaced, and half are logarithmically spaced down to
 1 µm. The reported error is the maximum relative deviation from quadrature with many nodes.
 
-Each frame has 44 × 44 cells on 58 mm and shows a contact with d = 4 mm and a tilt of 15°. The noise
-is 0.2 % of the modulus. As in the control loop, the estimator is called from Python, for spring
-tips and solid tips in turn. RMS errors over these frames are listed next to the Cramér-Rao bound.
-The "sensor" rows show the errors for a profile's sensor that has been pressed in the same way for
-one second.
+Each frame has 44 × 44 cells on 58 mm, and it shows a contact with d = 4 mm and a tilt of 15°. The
+noise is 0.2 % of the modulus. As in the control loop, the estimator is called from Python, for
+spring tips and solid tips in turn. RMS errors over these frames are listed next to the Cramér-Rao
+bound. The "sensor" rows show the errors for a profile's sensor that has been pressed in the same
+way for one second.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 @dataclass(frozen=True)
 class FaultCase:
-    """Case of the benchmark: a kind of grip and a fault.
+    """Benchmark case: a kind of grip and a fault.
 
     ``words`` are faults in the syntax of `softfinger emulate --fault`, with ``{side}`` as a
     placeholder for the finger. The faults start during the hold or, if ``before`` is True, before

@@ -155,7 +155,7 @@ def _while_pressed(
 
 
 def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | str]) -> None:
-    """Print an instruction, then wait for Enter or run ``--move``; may raise CalibrationError."""
+    """Print an instruction, then wait for Enter or run ``--move``. Raises CalibrationError."""
     _say(told if arguments.move else f"{told}; then press Enter")
     if arguments.move:
         _move(arguments.move, load)
@@ -164,7 +164,7 @@ def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | s
 
 
 def _move(command: str, load: Mapping[str, float | str]) -> None:
-    """Run the stage program for one load and wait for it; may raise CalibrationError."""
+    """Run the stage program for one load and wait for it. Raises CalibrationError."""
     try:
         words = [
             word.format(**{"force": 0.0, "d": 0.0, "theta": 0.0, **load})
@@ -179,7 +179,7 @@ def _move(command: str, load: Mapping[str, float | str]) -> None:
 
 @contextlib.contextmanager
 def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[TactileSensor]:
-    """Open the finger's sensor for the duration of this context; may raise TactileError."""
+    """Open the finger's sensor for the duration of this context. Raises TactileError."""
     hand = None
     if settings.tactile.backend == "simulated":
         from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand

@@ -70,7 +70,7 @@ def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str
 def _fit(
     columns: dict[str, NDArray[Any]], name: str, settings: Settings, unit: float
 ) -> FrictionFit:
-    """Fit the friction to a joint's motion without contact; may raise CalibrationError."""
+    """Fit the friction to a joint's motion without contact. Raises CalibrationError."""
     t, touched = columns["t"], columns[f"{name}.contact"]
     used = columns["torque"].copy()
     for begin, end in _stretches(touched):
@@ -156,7 +156,7 @@ def _way(settings: Settings, name: str) -> tuple[float, float]:
 def _stroke(
     hand: LiveHand, settings: Settings, name: str, ends: tuple[float, float], speed: float
 ) -> None:
-    """Move a joint from one end to the other at ``speed`` [rad/s]; may raise CalibrationError."""
+    """Move a joint from one end to the other at ``speed`` [rad/s]. Raises CalibrationError."""
     first, last = ends
     touch, rest = settings.control.contact_force, _REST + settings.control.smooth_time
     seconds = abs(last - first) / speed

@@ -121,7 +121,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
 
 
 def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
-    """Return the servo that rotated between closed and open; may raise CalibrationError."""
+    """Return the servo that rotated between the closed and open poses. Raises CalibrationError."""
     moved = {k: abs(at["closed"][k] - at["open"][k]) * radian for k in at["open"]}
     servo, *others = sorted(moved, key=lambda k: -moved[k])
     if moved[servo] < _LEAST:

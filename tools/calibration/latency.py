@@ -150,7 +150,7 @@ def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArra
 
 
 def _closing(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray]:
-    """Return times and the depth [m] by which the joints close, relative to an arbitrary origin.
+    """Return times, and the closing depth [m] of the joints relative to an arbitrary origin.
 
     d1 + d2 = W + 2a − (O2 − O1)·n does not change if the object moves between the tips.
     """

@@ -66,12 +66,12 @@ class LiveHand:
             self._hand.disarm()
 
     def command(self, name: str, **numbers: float) -> None:
-        """Send a command; may raise Refused or NoAnswer."""
+        """Send a command. Raises Refused or NoAnswer."""
         self._hand.command(name, **numbers)
         self._commanded = True
 
     def states(self) -> Iterator[HandState]:
-        """Store all messages and repeatedly yield the newest state; may raise NoStream."""
+        """Store all messages and repeatedly yield the newest state. Raises NoStream."""
         while True:
             if not self._socket.poll(int(1e3 * REPLY_TIMEOUT)):
                 raise no_stream(self._address[0], STATE, REPLY_TIMEOUT)

@@ -72,7 +72,7 @@ Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 
 def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
-    """Load the calibration file or make a new calibration; may raise CalibrationFileError."""
+    """Load the calibration file or make a new calibration. Raises CalibrationFileError."""
     sensor = sensor_of(settings, FINGERS.index(arguments.finger))
     if not arguments.file.exists():
         return Calibration(sensor=sensor, date=now())
@@ -151,7 +151,7 @@ class Step:
 
 
 def done(step: Step) -> Done:
-    """Compute the step; may raise CalibrationError."""
+    """Compute the step. Raises CalibrationError."""
     truths = step.loads.truths
     if not step.loads.frames:
         raise CalibrationError("the run does not contain any frames with d above 0")

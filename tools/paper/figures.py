@@ -53,7 +53,7 @@ def pages() -> dict[str, FigurePage]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the data and, if matplotlib is installed, the figures; may raise OSError."""
+    """Write the data and, if matplotlib is installed, the figures. Raises OSError."""
     known = (*NAMES, *BY_NAME)
     unknown = [name for name in arguments.names if name not in known]
     if unknown:
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def write(chosen: dict[str, FigurePage], folder: Path) -> None:
-    """Write the chosen figures to ``folder`` and print each file path; may raise OSError."""
+    """Write the chosen figures to ``folder`` and print each file path. Raises OSError."""
     from softfinger.tools import style
     from softfinger.tools.extras import MissingExtra
     from softfinger.tools.paper.sheets import errata_sheet

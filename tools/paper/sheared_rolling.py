@@ -10,7 +10,7 @@ For the springs of the parallel distributed model, with equal lateral and axial 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      F = πE [d²/cos θ + 2 d ζ sin θ]
 
 F is the sum of the spring forces on the base. A sensor under the tip measures this sum. The terms
-with ζ sin θ and ζ tan θ have the sign of θ, so the minima of F and U are before the upright
+with ζ sin θ and ζ tan θ have the sign of θ, so F and U reach their minima before the upright
 position. ∂U/∂d is the force on the face at fixed tilt and shear. The minimum of ∂U/∂d lies between
 the minima of F and U.
 

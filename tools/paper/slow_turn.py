@@ -9,8 +9,8 @@ The shear rate is the rolling speed minus two other terms: the speed along the f
 component along a tilted face due to increasing d. s, d and θ are defined in
 `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium if Σ δU = 0
 for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ +
-T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies the equilibrium condition, which
-`turned` solves step by step, without time, mass or damping.
+T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies this equilibrium condition. `turned`
+solves the condition step by step; time, mass and damping do not occur.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
 
 
 def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
-    """Find the root near ``start`` by Newton's method; raise RuntimeError without convergence."""
+    """Find the root near ``start`` by Newton's method. Raises RuntimeError without convergence."""
     x = start.copy()
     for _ in range(30):
         value = residual(x)

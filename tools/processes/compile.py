@@ -1,7 +1,8 @@
-"""Compile a scene's kernels on all cores, for ``softfinger compile`` and first starts.
+"""Compile a scene's kernels on all cores, for ``softfinger compile`` and the first start.
 
 The daemon itself only loads the kernels and therefore uses less memory. Each process compiles one
-pipeline part (`loop.warm_up`) after another. Parts that need the contact table wait for it.
+pipeline part (`loop.warm_up`) after another. Parts that need the contact table wait until the table
+exists.
 """
 
 from __future__ import annotations

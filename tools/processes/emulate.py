@@ -216,7 +216,7 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def _ready(ports: dict[str, Path]) -> str:
-    """Return the output of a ready emulator as one text, because readers may wait for its end."""
+    """Return a ready emulator's output as one text, because readers may wait for the last line."""
     return "".join(["ready\n", *(f"{name}: {path}\n" for name, path in ports.items())])
 
 

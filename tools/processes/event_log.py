@@ -71,7 +71,7 @@ class EventLog:
         logging.getLogger().addHandler(handler)
 
     def close(self, patience: float = 1.0) -> None:
-        """Write the queued lines, taking at most ``patience`` s."""
+        """Write the queued lines; stop after at most ``patience`` s."""
         self._closing = True
         self._news.set()
         self._thread.join(patience)

@@ -225,7 +225,7 @@ class Recording:
     def _messages(
         self, times: tuple[int, int] = (0, 2**64), progress: Callable[[int], None] | None = None
     ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield channel number, log time [ns] and data of each message; register new channels.
+        """Yield the channel number, log time [ns] and data of each message; register new channels.
 
         Chunks outside ``times`` are skipped.
         """
@@ -317,7 +317,7 @@ class Recording:
             self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
-        """Check the file's end; return the profile in the header, or PROFILE without a header."""
+        """Check the end of the file; return the header's profile, or PROFILE without a header."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Header
 

@@ -1,6 +1,6 @@
 """Run ``softfinger completion SHELL``: print a shell completion script for softfinger.
 
-The script contains all arguments, so completion does not start a process.
+The script contains all arguments, so the shell completes words without starting a process.
 """
 
 from __future__ import annotations

@@ -176,7 +176,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lower_priority() -> None:
-    """Reset the real-time priority that was inherited from the daemon."""
+    """Reset the real-time priority that this process inherited from the daemon."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):

@@ -269,7 +269,7 @@ class MonitorPage:
         return line.append(" µs", DIM)
 
     def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
-        """Draw the commanding client, the last reply, texts too long for their line, and events."""
+        """Draw the commanding client, the last reply, overlong texts, and events."""
         who = truncated(Text(self.feed.commander(now)), 16)
         title = Text(f"events ─ {who} commands the hand" if who else "events")
         full: list[Text] = []

@@ -71,12 +71,12 @@ class _Published(NamedTuple):
 class Site:
     """Serve the page and its pictures, carry out its commands, and stream to Foxglove clients.
 
-    Requests must name this server as their host. A browser's requests must also come from this
+    Requests must name this server as their host. Requests from a browser must also come from this
     server's pages. The host rule blocks DNS rebinding, in which the host has another name. The page
-    rule blocks requests from other sites' pages, which have another origin. Pages with the
-    ``token`` may send commands through ``send``. All pages may control a recording's playback
-    through ``wish``. If other machines can reach the server, the token is required even for
-    watching. A browser then obtains the token with a one-time code.
+    rule blocks requests from other sites, whose pages have another origin. Pages with the ``token``
+    may send commands through ``send``. All pages may control a recording's playback through
+    ``wish``. If other machines can reach the server, the token is required even for watching. A
+    browser then obtains the token with a one-time code.
     """
 
     def __init__(

@@ -169,7 +169,7 @@ class Pictures:
         self._begin_rows()
 
     def _begin_rows(self) -> None:
-        """Discard all rows; the pages then drop them as well."""
+        """Discard all rows; the pages then also discard their copies."""
         self._first = self._number
         self._past: deque[tuple[HandState, Row]] = deque(maxlen=round(SECONDS / STEP))
 

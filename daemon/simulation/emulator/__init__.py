@@ -1,5 +1,5 @@
-"""Implement `softfinger emulate`, the simulated hand with servos and tactile boards on ptys.
+"""Implement `softfinger emulate`, which provides a simulated hand on pseudo-terminals.
 
-This package handles ports, transmission times, framing and injected faults. The servos are in
-`servo_model`.
+This package handles ports, transmission times, framing and injected faults. The `servo_model`
+package emulates the servos.
 """

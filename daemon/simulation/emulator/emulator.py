@@ -1,4 +1,4 @@
-"""Emulate a hand in real time: simulated physics with servos and tactile boards on ptys.
+"""Emulate a hand in real time: simulate its physics, and serve its servos and boards on ptys.
 
 On a busy machine, the emulator and the daemon wait for each other, unless the daemon's
 ``loop.clock`` is ``real``; see `EmulatorClock`.
@@ -70,17 +70,17 @@ DEFAULT_BOARD = {
 
 
 class EmulatorError(SoftfingerError):
-    """Raised if the emulated hand can't be set up. The message gives the reason and a fix."""
+    """Failure to set up the emulated hand. The message gives the reason and a fix."""
 
 
 class EmulatorClock:
-    """Clock of the emulated hand: real time since the start, minus interruptions of the emulator.
+    """Clock of the emulated hand: real time since the start, excluding emulator interruptions.
 
     If interruptions were included, a process that was stopped for a minute would have to simulate
-    that minute and could not reply in the meantime. A daemon whose own clock pauses while the
-    machine is busy sets deadlines. While a daemon that sets deadlines uses the ``servos`` and their
-    torque is on, the emulator clock advances from one deadline to the next by the same amount as
-    the daemon clock, within `_AHEAD_TIME`.
+    that minute and could not reply in the meantime. A daemon sets deadlines if its own clock pauses
+    while the machine is busy. While such a daemon uses the ``servos`` with torque on, the emulator
+    clock stays within `_AHEAD_TIME` of the daemon clock: both advance by the same amount from one
+    deadline to the next.
     """
 
     pauses_when_late = False
@@ -134,10 +134,9 @@ class EmulatedServos:
 
 
 class Emulator:
-    """Emulated hand on ptys with links in ``folder``; :meth:`run` serves it.
+    """Emulated hand on ptys, which are linked in ``folder``; :meth:`run` serves the ptys.
 
-    A finger that is not in the scene has no board. Servos or tactile sensors with the backend
-    ``none`` have no port.
+    A finger that is not in the scene has no board. The ``none`` backend has no port.
     """
 
     def __init__(
@@ -149,15 +148,15 @@ class Emulator:
         faults: Iterable[str] = (),
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Create the hand, which does not respond until :meth:`run` is called.
+        """Create the hand. The hand does not respond until :meth:`run` is called.
 
-        Signal handlers must not raise exceptions during this call, because files would be left
+        Signal handlers must not raise exceptions during this call; otherwise, files are left
         behind.
 
         Parameters
         ----------
         settings, folder, servos
-            Settings of the hand, folder for the links, and servo options.
+            Hand settings, folder for the links, and servo options.
         faults
             Faults; see :func:`parse_faults`.
         tell
@@ -314,10 +313,10 @@ class Emulator:
     # --- requests and faults ---------------------------------------------------------------------
 
     def request(self, text: str) -> str:
-        """Handle words from the control socket; return ``ok`` or ``error: `` with the reason.
+        """Handle words from the control socket; return ``ok``, or ``error: `` and the reason.
 
-        Each word is a fault, whose times are relative to the current time, or one of these
-        requests:
+        Each word is either a fault or a request. Fault times are relative to the current time.
+        These requests exist:
 
         - ``report``: the reply is :meth:`report` as JSON.
         - ``forget``: clear the bus record.
@@ -352,10 +351,10 @@ class Emulator:
         return reply
 
     def press(self, text: str) -> str:
-        """Start the presses in ``text``; return their state as JSON or ``error: `` with a reason.
+        """Start the presses in ``text``; return their state as JSON, or ``error: `` and a reason.
 
-        The JSON object contains ``wait``, the remaining time until the last press is reached [s].
-        If the text is empty, no press is started, and the state is returned.
+        The JSON object contains ``wait``, the time [s] until the plate reaches the last press. If
+        the text is empty, the state is returned without starting a press.
         """
         now = self.clock.now()
         if text.strip():
@@ -373,16 +372,16 @@ class Emulator:
         return json.dumps({"wait": max(0.0, *ends) if ends else 0.0})
 
     def _take_away(self, finger: str) -> None:
-        """Remove a tip's plate, so that its sensor measures the object again."""
+        """Remove the plate from a tip, so that the tip's sensor measures the object again."""
         del self._plates[finger]
         self._sources[finger].stage = None
 
     def turn(self, words: Sequence[str]) -> str:
         """Turn joints as if by hand: ``left=closed`` (to its stop), ``open`` or ``zero``.
 
-        The joints are held until a client writes to the servos. The reply is ``error: `` with a
-        reason, or JSON with the remaining time as from :meth:`press`. Without words, only this
-        reply is returned.
+        The joints are held until a client writes to the servos. The reply is ``error: `` and a
+        reason, or JSON that contains the remaining time, as in :meth:`press`. Without words, no
+        joint is turned.
         """
         now = self.clock.now()
         turns = [word.partition("=") for word in words]

@@ -33,14 +33,14 @@ _QUERY_INTERVAL = 0.1  # interval between queries about the motion of a plate or
 
 
 class FolderError(SoftfingerError):
-    """Raised if the folder can't be used. The message gives the reason and a fix."""
+    """Unusable folder. The message gives the reason and a fix."""
 
 
 class LinkFolder:
     """Folder with links to the ptys, locked by one emulator.
 
-    The user must own the folder, and other users must not have write access. Links left behind by a
-    killed emulator are replaced, but other files are not.
+    The user must own the folder, and other users must not have write access. Links that a killed
+    emulator left behind are replaced, but other files are not.
     """
 
     def __init__(self, path: Path) -> None:
@@ -97,7 +97,7 @@ class LinkFolder:
                 (self.path / name).unlink()
 
     def close(self) -> None:
-        """Remove the lock, and the links whose targets have not changed."""
+        """Remove the lock and all links whose targets have not changed."""
         for link in list(self._links):
             self.unlink(link.name)
         with contextlib.suppress(OSError):
@@ -112,7 +112,7 @@ def find_ports(folder: Path) -> dict[str, Path]:
 
 
 class NoEmulator(SoftfingerError):
-    """Raised if no emulator is running in the folder or it does not respond."""
+    """No emulator is running in the folder, or the emulator does not respond."""
 
 
 class ControlPort:
@@ -126,7 +126,7 @@ class ControlPort:
     ) -> None:
         """Bind the socket.
 
-        Raises FolderError if there is a file of another type with the socket's name.
+        Raises FolderError if a file that is not a socket has the socket's name.
         """
         self._handle = handle
         self._selector = selector
@@ -244,5 +244,5 @@ def _directory(folder: Path) -> Iterator[int]:
 
 
 def _address(folder: int) -> str:
-    """Return the socket's address via the folder's descriptor, because long paths are invalid."""
+    """Return a socket address with the folder's descriptor, because socket paths must be short."""
     return f"/proc/self/fd/{folder}/{_CONTROL}"

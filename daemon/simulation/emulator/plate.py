@@ -1,6 +1,6 @@
-"""Simulate a plate on a stage that presses against a tip with given depth, tilt and speed.
+"""Simulate a plate that a stage presses against a tip with a given depth, tilt and speed.
 
-The plate allows calibration to be tried without hardware: the sensor measures the plate instead of
+With the plate, users can try calibration without hardware: the sensor measures the plate instead of
 the object, and the true contact is known. The plate is frictionless and does not load the finger
 joint, as if the finger were clamped.
 """
@@ -38,7 +38,7 @@ _NUMBER = re.compile(r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)(.*)")
 
 
 class PlateError(SoftfingerError, ValueError):
-    """Raised for invalid or impossible presses. The message gives the expected format or range."""
+    """Invalid or impossible press. The message gives the expected format or range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class PlatePress:
 
     @property
     def is_clear(self) -> bool:
-        """True if the plate lifts off and stays clear of the tip."""
+        """True if this press lifts the plate off the tip."""
         return self.d <= 0.0 and self.pressure == 0.0 and self.hold == math.inf
 
     def __str__(self) -> str:
@@ -73,9 +73,9 @@ def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, lis
     """Parse ``[tip=left] depth=4mm [tilt=10deg] …, …`` and return the presses by finger.
 
     Each press has either a depth (0 lifts off), a force or a pressure (uniform, like a bladder).
-    Optional words are tilt, speed, hold, and tip (left, right or both; default both). If ``hold``
-    is not given, the last press is held and every earlier press lasts one second. Forces are
-    ``scale`` times the ``table`` forces. Raises PlateError.
+    The optional words are tilt, speed, hold and tip. The tip is left, right or both (default). If
+    ``hold`` is not given, the last press is held and every earlier press lasts one second. Forces
+    are ``scale`` times the ``table`` forces. Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
     each = [part.split() for part in text.split(",")]
@@ -135,7 +135,7 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
 
 
 class Plate:
-    """Plate above one tip. The plate's path is piecewise linear in the hand's time [s]."""
+    """Plate above one tip. The plate position is piecewise linear in the hand's time [s]."""
 
     def __init__(self) -> None:
         self._t = [0.0]

@@ -60,8 +60,8 @@ class PtyServoBus:
     bus
         Emulated servos.
     baud
-        If 0, servos reply immediately at any rate. Otherwise, a servo ignores clients whose port is
-        set to another rate, and replies take transmission time.
+        If 0, servos reply immediately at any rate. Otherwise, servos ignore clients that use
+        another rate, and replies are delayed by their transmission time.
     spin
         Duration [s] of busy waiting before a paced reply is due, because sleeps end late.
     clock
@@ -94,7 +94,7 @@ class PtyServoBus:
 
     @property
     def plugged(self) -> bool:
-        """True if the terminal exists."""
+        """True while the terminal exists."""
         return self._master >= 0
 
     def plug(self) -> None:
@@ -128,7 +128,7 @@ class PtyServoBus:
         return int(_TERMIOS2.unpack(raw)[-1])
 
     def next_event(self) -> float:
-        """Return the time [s] of the next :meth:`service` call if no bytes arrive first."""
+        """Return the time [s] at which :meth:`service` must be called if no bytes arrive first."""
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 

@@ -33,14 +33,14 @@ _NOISE_LENGTH = 64  # length of the longest noise burst between frames [bytes]
 
 
 class FrameSource(Protocol):
-    """Source of frames for a board, such as the simulated sensor."""
+    """Frame source for a board, such as the simulated sensor."""
 
     def latest(self) -> Frame | None:
         """Return the newest frame that is due, or None before the first frame."""
 
 
 class FrameWriter:
-    """The board's end of a pty. Frames are sent completely or not at all.
+    """Board side of a pty. Frames are sent completely or not at all.
 
     A pty buffers tens of kilobytes. If there is no reader, frames are dropped early so that the
     next client does not receive old frames. A real board whose port is closed behaves in the same
@@ -104,7 +104,7 @@ class TactileBoard:
     - ``wrong-size``: the grid has half as many rows and columns.
     - ``saturated``, ``zero``: all cells read the maximum count, or 0.
 
-    The last five faults are always active, regardless of their probability.
+    The last five faults ignore the probability and affect every frame.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class TactileBoard:
         delay: float,
         seed: int = 1,
     ) -> None:
-        """Create a board with fault ``seed``; frame k is due at k/rate + delay [Hz, s]."""
+        """Create a board; frame k is due at k/rate + delay [s]. ``seed`` determines the faults."""
         self._source = source
         self._encoder = encoder
         self._requested = not encoder.request
@@ -158,7 +158,7 @@ class TactileBoard:
         return self._writer.dropped
 
     def fileno(self) -> int:
-        """Return a file descriptor that becomes readable when :meth:`hear` must be called."""
+        """Return a file descriptor. When it is readable, the caller must call :meth:`hear`."""
         return self._writer.fileno()
 
     def hear(self) -> None:
@@ -225,7 +225,7 @@ Encode = Callable[[NDArray[np.uint16], int, float], bytes]
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """Framing of a board, and its frame request byte (empty if it needs no requests)."""
+    """Board framing, and the byte that requests a frame (empty if the board needs no requests)."""
 
     encode: Encode
     request: bytes = b""
@@ -239,9 +239,10 @@ def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.
 def encode_glove(
     counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0, values: int = 32
 ) -> bytes:
-    """Encode number + 11, the halves of each count (high, low) + 11, and newline; counts saturate.
+    """Encode a frame for a glove-style board: number + 11, count halves + 11, and a newline.
 
-    Each half takes one of ``values`` values: 32, or 64 with a 12-bit converter.
+    Each count is split into a high half and a low half. Each half has ``values`` possible values:
+    32, or 64 with a 12-bit converter. Counts that are too large saturate.
     """
     counts = np.minimum(counts, values * values - 1)
     halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)
@@ -249,7 +250,7 @@ def encode_glove(
 
 
 def encoder_for(backend: str, full_count: int) -> Encoder:
-    """Return the framing used by a backend's board with the maximum count ``full_count``."""
+    """Return the framing of a backend's board; ``full_count`` is the board's maximum count."""
     if backend == "glove" and 1023 < full_count <= 4095:
         return Encoder(partial(encode_glove, values=64), b"a")
     return ENCODERS[backend]

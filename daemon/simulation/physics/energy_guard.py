@@ -1,11 +1,11 @@
 """Compute the plant energy, and prevent integration steps from creating energy.
 
-With smooth forces, the integration error is small, and shorter steps reduce it. If forces are
-not smooth (for example, when a light object hits the stiff rim of the backing plate) or a step is
-too long, the energy could increase by more than the work of the motors and loads. The guard removes
-any excess energy from the kinetic energy. If the kinetic energy is smaller than the excess, the
-motion stops at an earlier point of the step. Without damping, the energy should be constant; the
-method's small drift is then allowed in smooth steps.
+With smooth forces, the integration error is small, and shorter steps reduce it. If forces are not
+smooth (for example, when a light object hits the stiff rim of the backing plate) or a step is too
+long, the energy could increase by more than the work of the motors and loads. The guard removes any
+excess energy from the kinetic energy. If the kinetic energy is smaller than the excess, the motion
+stops at an earlier point of the step. Without damping, the energy should be constant. In smooth
+steps, the guard then tolerates the small energy drift of the integration method.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def is_on_rim(plant: Plant) -> bool:
 
 @inner_kernel
 def open_guard(plant: Plant) -> None:
-    """Accept the current energy if the state was changed externally since the last step."""
+    """Accept the current energy if the state has been changed externally since the last step."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy
@@ -102,8 +102,8 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
     -------
     int
         0 if the step is unchanged, 1 if the motion was slowed, 2 if the kinetic energy was too
-        small and the motion was stopped. In the last case, the caller must shorten the step with
-        :func:`shorten` until :func:`is_within_limit` is true.
+        small and the motion was stopped. If the result is 2, the caller must shorten the step with
+        :func:`shorten` until :func:`is_within_limit` returns True.
     """
     moving = kinetic_energy(plant)
     weight = weight_energy(plant)
@@ -166,7 +166,7 @@ def allow_changed_energy(plant: Plant) -> None:
 
 @inner_kernel
 def allow_relaxed_energy(plant: Plant) -> None:
-    """Update the energies after tip relaxation; the limit changes by as much as the energy."""
+    """Update the energies after tip relaxation; change the limit by the change in energy."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.energy_limit += energy - plant.energy
     plant.energy = energy

@@ -1,15 +1,15 @@
-"""Evaluate contacts that occur only in some scenes: object on palm and tip on tip.
+"""Evaluate contacts that occur only in some scenes: object to palm, and tip to tip.
 
 The rows of these contacts are added to the step matrix (`solver`).
 
 The palm is a plane parallel to the x axis. Each corner of the object, or the lowest point of a
-disc, has two springs. The first spring pushes up a corner that is below the palm, with viscous
-damping that never pulls. The second spring acts along the palm and models Coulomb friction: it
-sticks until its force would exceed the friction coefficient times the normal force, and then slips.
+disc, has two springs. The first spring pushes a corner that is below the palm up. Its viscous
+damping never pulls. The second spring acts along the palm and models Coulomb friction: it sticks
+until its force would exceed the friction coefficient times the normal force, and then slips.
 Therefore, a resting object does not creep.
 
-Two equal hemispheres meet on the plane midway between their centres. Each tip is compressed as if
-by a rigid plane, with d = a − D/2, where D is the distance between the centres. The total energy of
+Two equal hemispheres meet on the plane midway between their centres. Each tip is compressed by d =
+a − D/2, as if by a rigid plane, where D is the distance between the centres. The total energy of
 both tips is U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With
 different tilts, a real contact surface would bulge towards the softer tip, so this energy is
 slightly too high (second order in the difference of cos² θ). The plane sticks equally to both tips:
@@ -53,7 +53,7 @@ _DISTANCE_MAX = 1.5
 
 @inner_kernel
 def palm_is_far(plant: Plant, now: Motion) -> bool:
-    """Return True if the object can't reach the palm within a step."""
+    """Return True if the object can't touch the palm during this step."""
     p = plant.parameters
     height = now.position[3] - p.palm - p.extent
     rate = now.velocity[3]
@@ -65,10 +65,10 @@ def palm_is_far(plant: Plant, now: Motion) -> bool:
 def touch_palm(
     plant: Plant, now: Motion, stage: Stage, nx: float, ny: float, is_first: bool
 ) -> None:
-    """Add the palm's forces on the object; (nx, ny) is the normal n of the object's faces.
+    """Add the forces of the palm on the object; (nx, ny) is the normal n of the object's faces.
 
-    In the first stage, this function also limits the shears by friction and sets the rows in the
-    full matrix.
+    In the first stage, this function also applies the friction limit to the shears and sets the
+    rows of the full matrix.
     """
     if palm_is_far(plant, now):
         for corner in range(CORNERS):
@@ -216,7 +216,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
 def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
     """Add the tip-to-tip torques if the tips are close or there is no object.
 
-    In the first stage, this function also sets the tips' rows in the full matrix.
+    In the first stage, this function also sets the rows for the tips in the full matrix.
     """
     near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
     touching = near and tip_on_tip(plant, table, now, stage)

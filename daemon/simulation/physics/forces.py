@@ -26,10 +26,10 @@ from softfinger.kinematics.contact.table_record import Table
 
 @inner_kernel
 def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
-    """Return a servo's motor current command [A], limited by all of the servo's limits.
+    """Return a servo's motor current command [A] after all of the servo's limits.
 
-    The limit due to the supply voltage, scaled by the PWM limit, decreases linearly from the stall
-    current at standstill to 0 at no-load speed.
+    The voltage limit decreases linearly from the stall current at standstill to 0 at no-load speed.
+    The PWM limit scales the supply voltage.
     """
     p, goals = plant.parameters, plant.goals
     if goals.torque_on[joint] == 0:
@@ -54,7 +54,7 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 def set_motor_slopes(plant: Plant, g: float) -> None:
     """Set the motor torque derivatives (angle and velocity), divided by (τ + g).
 
-    The derivatives are 0 unless the motors are stiff relative to a step ``g``. The derivatives are
+    The derivatives are 0 unless the motors are stiff at the step size ``g``. The derivatives are
     upper bounds, because the current may enter or leave its limits within the step.
     """
     p, goals = plant.parameters, plant.goals
@@ -76,7 +76,7 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def joint_stiffness(plant: Plant, joint: int) -> float:
-    """Return the stiffness of a joint's bristles and of any end stop within reach [N·m/rad]."""
+    """Return the total stiffness of a joint's bristles and any end stop within reach [N·m/rad]."""
     p = plant.parameters
     stiffness: float = plant.gears[joint].stiffness
     q = plant.state.position[joint]
@@ -105,7 +105,7 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 @inner_kernel
 def friction_level(plant: Plant, finger: int, rate: float, current: float) -> float:
-    """Return the friction torque [N·m] at which a joint slips at a motor ``current`` and load.
+    """Return the friction torque [N·m] at which a joint slips for a motor ``current`` and load.
 
     The base, Stribeck and load terms follow Rhoban's model M4, which was identified for servos of
     this type (arXiv 2410.08650). The gear torque is |external − motor|.
@@ -173,7 +173,7 @@ def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
 
 @inner_kernel
 def place_finger(plant: Plant, finger: int, q: float) -> None:
-    """Set a finger's position for the joint angle ``q``."""
+    """Set the position of a finger from its joint angle ``q``."""
     p, its = plant.parameters, plant.fingers[finger]
     cosine = math.cos(q)
     sine = math.sin(q)
@@ -233,7 +233,7 @@ def evaluate_state(plant: Plant, table: Table) -> None:
 
 @inner_kernel
 def script_x(plant: Plant, t: float) -> float:
-    """Return x [m] of a scripted object at ``t``; the object moves left, back, and then right."""
+    """Return x [m] of a scripted object at ``t``. The object moves left, then back, then right."""
     p = plant.parameters
     x: float = p.script_x
     left = p.script_travel[0]

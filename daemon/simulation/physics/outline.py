@@ -1,4 +1,4 @@
-"""Compute the contact geometry of the object outline: its nearest point, and the backing plate rim.
+"""Compute the contact geometry of the object outline with the tip and the backing plate rim.
 
 The object is a rigid convex polygon or a disc.
 """
@@ -16,12 +16,12 @@ _DISTANCE_MIN = 1e-12  # m
 
 @inner_kernel
 def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
-    """Return direction, distance and radius of curvature of the outline nearest to (u, v).
+    """Return the direction, distance and curvature radius of the outline point nearest to (u, v).
 
     (u, v) is in the object's frame. For an outside point, the direction points to the nearest point
     of the outline. For an inside point, the distance is the negative distance to the nearest face,
-    and the direction is the inward normal of that face. The last result is the local radius of
-    curvature: 0 at a corner, ``FACE`` on a face, or the radius of a disc.
+    and the direction is the inward normal of that face. The curvature radius is 0 at a corner,
+    ``FACE`` on a face, or the radius of a disc.
     """
     if p.shape == DISC:
         away = max(math.sqrt(u * u + v * v), _DISTANCE_MIN)
@@ -63,11 +63,11 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
 
 @inner_kernel
 def rim_on_plane(p: Parameters, tip: TipContact) -> float:
-    """Evaluate both rim ends on a plane; return the larger depth [m], which is negative for a gap.
+    """Evaluate both rim ends on a plane; return the larger depth [m]. A gap has a negative depth.
 
     The depths are d − a(1 ∓ sin θ). Each end has its own spring, so that energy and forces are
-    smooth even if the plate lies flat on the face. If the rim is in contact, its energy and the
-    energy's derivatives are set.
+    smooth even if the plate lies flat on the face. If the rim is in contact, this function sets the
+    rim energy and its derivatives.
     """
     d = tip.d
     sine = tip.sine
@@ -85,10 +85,10 @@ def rim_on_plane(p: Parameters, tip: TipContact) -> float:
 
 @inner_kernel
 def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
-    """Evaluate the rim on a disc like :func:`rim_on_plane`, with one spring for the plate chord.
+    """Evaluate the rim on a disc like :func:`rim_on_plane`, but with one spring for the chord.
 
-    ``away`` is the distance between the disc and tip centres. The depth, which is the disc radius
-    minus the distance of the disc centre from the chord, is a smooth function.
+    ``away`` is the distance between the disc centre and the tip centre. The depth, which is the
+    disc radius minus the distance of the disc centre from the chord, is a smooth function.
     """
     across = away * tip.sine
     up = away * tip.cosine

@@ -1,16 +1,16 @@
 """Integrate the simulated hand: two joints, two soft tips and one rigid object.
 
-Fixed sub-steps of a two-stage Rosenbrock method (ROS2, γ = 1 − 1/√2) advance the coordinates (q1,
-q2, x, y, φ) and their velocities, the shear of each contact and the current of each motor:
+A two-stage Rosenbrock method (ROS2, γ = 1 − 1/√2) with fixed sub-steps advances the coordinates
+(q1, q2, x, y, φ), their velocities, the contact shears and the motor currents:
 
     (1 − γhA) k1 = f(y)    (1 − γhA) k2 = f(y + h k1) − 2 k1    y ← y + h (3 k1 + k2)/2
 
 The method is of second order for any matrix A, and L-stable if A is the Jacobian. Here, A contains
 the stiff parts: normal, rotational and shear stiffness of the contacts with their damping, end
 stops, gear bristles, the secant of table friction, motor lag and servo loops. Only the five
-accelerations are coupled, so a step costs two tip evaluations and one 5 × 5 factorisation. Coulomb
-slip is implemented by limiting shears and bristles at the start of each step. Finally, the energy
-guard checks the step.
+accelerations are coupled, so a step costs two tip evaluations and one 5 × 5 factorisation. To model
+Coulomb slip, shears and bristles are limited at the start of each step. Finally, the energy guard
+checks the step.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
     """Add the motor torques to the load; set the rates of the currents in ``k``.
 
     The rates are those at zero acceleration. A current lags behind its reference: i' = (r(q, ω) −
-    i)/τ. The current's rate k decreases by (r_q g + r_ω) g/(τ + g) per unit of acceleration; the
-    matrix contains this term.
+    i)/τ. The current's rate ``k`` decreases by (r_q g + r_ω) g/(τ + g) per unit of acceleration;
+    the step matrix contains this term.
     """
     p = plant.parameters
     lag = p.electric_time
@@ -90,7 +90,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
 
 @inner_kernel
 def finish_stage(plant: Plant, k: Motion, g: float) -> None:
-    """Solve for the velocities in ``k`` and add their effect to the other rates in ``k``."""
+    """Solve for the velocities in ``k`` and add the effect of the velocities to the other rates."""
     solve(plant, k)
     if plant.has_extra_rows:
         add_extra_shears(plant, k, g)
@@ -141,7 +141,7 @@ def begin_second_stage(plant: Plant, h: float) -> None:
 
 @inner_kernel
 def second_stage(plant: Plant, g: float) -> None:
-    """Compute k2 of the step from the second-stage forces."""
+    """Compute k2 of the step from the forces of the second stage."""
     p, stage, first, k = plant.parameters, plant.stages[1], plant.first, plant.second
     for j in range(5):
         inertia = p.joint_inertia if j < 2 else p.mass if j < 4 else p.inertia
@@ -162,7 +162,7 @@ def second_stage(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def advance_state(plant: Plant, h: float) -> None:
-    """Advance the state to y + h (3 k1 + k2)/2, except for parts that are held fixed."""
+    """Advance the state to y + h (3 k1 + k2)/2, except for bodies that are held fixed."""
     p, state, first, second = plant.parameters, plant.state, plant.first, plant.second
     for j in range(2):
         state.shear[j] += h * (1.5 * first.shear[j] + 0.5 * second.shear[j])
@@ -226,7 +226,7 @@ def senses_other_tip(plant: Plant, finger: int) -> bool:
 
 @inner_kernel
 def sensed_contact_of(plant: Plant, finger: int) -> TipContact:
-    """Return the contact that a tip's sensor measures."""
+    """Return the contact that the tip sensor measures."""
     if senses_other_tip(plant, finger):
         return plant.stages[0].on_tip[finger]
     return plant.stages[0].on_object[finger]
@@ -259,7 +259,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
 
 @inner_kernel
 def settle(plant: Plant, ring: Records[Sample]) -> None:
-    """Take all due samples, then store the current tip contacts."""
+    """Take all samples that are due, then store the current tip contacts."""
     p, stage = plant.parameters, plant.stages[0]
     while plant.sample_count * p.sample_period <= plant.step_count * p.step:
         take_sample(plant, ring)

@@ -40,7 +40,7 @@ Shears = Annotated[FloatArray, SHEARS]
 class Motion(Record):
     """Coordinates, velocities, shears and currents, or their rates of change.
 
-    The bristles' rates of change are the joint velocities.
+    The bristles change at the joint velocities.
     """
 
     position: FloatFive  # [rad], [rad], [m], [m], [rad]
@@ -209,7 +209,7 @@ class TipContact(Record):
 
 
 class Stage(Record):
-    """All contacts for one of a step's two evaluations."""
+    """All contacts for one of the two evaluations in a step."""
 
     on_object: Annotated[Records[TipContact], 2]
     on_tip: Annotated[Records[TipContact], 2]
@@ -217,7 +217,7 @@ class Stage(Record):
 
 
 class ExtraRow(Record):
-    """Row over all coordinates for a contact that occurs only in some scenes."""
+    """Matrix row over all coordinates, for a contact that occurs only in some scenes."""
 
     row: FloatFive
     stiffness: float

@@ -40,7 +40,7 @@ class Shape:
 
     @property
     def half_width(self) -> float:
-        """Half of the width at the height of the centre."""
+        """Half the width at the height of the centre."""
         x, y = np.vstack((self.corners, self.corners[:1])).T
         across = [
             x[k] - y[k] * (x[k + 1] - x[k]) / (y[k + 1] - y[k])
@@ -127,7 +127,7 @@ def disc(simulation: SimulationSettings) -> Shape:
 
 
 def nothing(simulation: SimulationSettings) -> Shape:
-    """Create the placeholder for a scene without an object, with the rectangle's outline."""
+    """Create the placeholder for a scene without an object; it has the outline of a rectangle."""
     return polygon(_trapezoid(simulation, 0.0), NO_OBJECT)
 
 

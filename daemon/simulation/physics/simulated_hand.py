@@ -69,7 +69,7 @@ def geometry_of(settings: Settings) -> HandGeometry:
 
 
 def stiff_step(settings: Settings, table: ContactTable) -> float:
-    """Return the sub-step [s] for the fastest oscillation of an object on fully compressed tips."""
+    """Return a sub-step [s] that resolves an object's fastest oscillation on compressed tips."""
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius, table.header.deepest)
     c = table(d, 0.0)
@@ -195,14 +195,14 @@ def _script(p: Parameters, settings: Settings) -> None:
 
 
 class SimulatedHand:
-    """Two fingers with joints and soft tips, and an object between them, all in one plane.
+    """Planar hand: two fingers with joints and soft tips, and an object between the fingers.
 
-    The tips touch the object, or each other if the object is not between them. If a tip has two
-    contacts, its sensor measures the stronger contact. The object may lie on the palm.
+    The tips touch the object, or each other if there is no object between the tips. If a tip has
+    two contacts, its sensor measures the stronger contact. The object may lie on the palm.
 
-    ``settings.scene.fingers`` selects the tips. With one finger, the object is fixed to the test
-    bench, as in a compression test. Without servos (``settings.servos.backend`` is ``none``), the
-    joints stay at ``settings.hand.open_angle``. If there are no servos and
+    ``settings.scene.fingers`` selects the tips. If only one finger is selected, the object is fixed
+    to the test bench, as in a compression test. Without servos (``settings.servos.backend`` is
+    ``none``), the joints stay at ``settings.hand.open_angle``. If there are no servos and
     ``simulation.compression_speed`` is above 0, the object moves back and forth between both tips
     and compresses each tip by 0.4 radii.
 
@@ -308,7 +308,7 @@ class SimulatedHand:
             remaining -= count
 
     def refresh(self) -> None:
-        """Evaluate the contacts after an external change in state, without advancing time."""
+        """Evaluate the contacts after an external change to the state, without advancing time."""
         self._run(0)
 
     def place_object(self) -> None:
@@ -356,14 +356,14 @@ class SimulatedHand:
     def load(self, push: float = 0.0, twist: float = 0.0) -> None:
         """Apply a permanent ``push`` [N] and ``twist`` [N·m] to the object; zeros remove the load.
 
-        The push acts along the faces, away from the palm. The direction of the push stays the same
-        when the object rotates.
+        The push acts along the faces and away from the palm. Its direction stays the same when the
+        object rotates.
         """
         angle = self.object_pose.item(2)
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
 
     def apply_fault(self, event: FaultEvent) -> bool:
-        """Begin or end a load or measurement fault; return False for other faults."""
+        """Begin or end an object load or a measurement fault; return False for other faults."""
         kind, part = event.kind, event.part
         if part == OBJECT:
             self.load(**{kind: event.value})
@@ -380,7 +380,7 @@ class SimulatedHand:
 
     @property
     def sample_count(self) -> int:
-        """Number of contact samples; sample k is taken at ``start`` + k / tactile.rate."""
+        """Number of contact samples taken; sample k is taken at ``start`` + k / tactile.rate."""
         return self.plant.sample_count
 
     def sample(self, number: int) -> Sample:

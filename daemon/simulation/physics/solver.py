@@ -25,7 +25,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 
 @inner_kernel
 def joint_pivot(plant: Plant, joint: int, g: float) -> float:
-    """Return a joint's diagonal entry: inertia, friction, end stop and motor."""
+    """Return a joint's diagonal entry, which includes inertia, friction, end stop and motor."""
     motor = plant.motor_by_rate[joint] + g * plant.motor_by_q[joint]
     pivot: float = plant.parameters.joint_inertia + g * (
         plant.drag[joint] + g * (joint_stiffness(plant, joint) + motor)
@@ -47,7 +47,7 @@ def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract g K r from the load: first-stage stiffness K, positions and shears r in ``k``."""
+    """Subtract g K r from the load, with the first-stage stiffness K and the rates r in ``k``."""
     for finger in range(2):
         tip = plant.stages[0].on_object[finger]
         rows, stiffness = tip.rows, tip.stiffness
@@ -112,7 +112,7 @@ def factorise(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def solve(plant: Plant, k: Motion) -> None:
-    """Solve for the load and set the velocities in ``k``, which are 0 for parts held fixed."""
+    """Solve for the load and set the velocities in ``k``; bodies that are held fixed get 0."""
     full, out = plant.factors.lower, k.velocity
     for i in range(5):
         value = plant.load[i]
@@ -137,7 +137,7 @@ def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract the extra rows' g K r from the load: positions and extra shears r in ``k``."""
+    """Subtract g K r of the extra rows from the load; r are the rates in ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.stiffness == 0.0:
@@ -151,7 +151,7 @@ def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def add_extra_shears(plant: Plant, k: Motion, g: float) -> None:
-    """Add the effect of the solved velocities to the extra shears of ``k``: g row·k."""
+    """Add g row·k, the effect of the solved velocities, to the extra shears in ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.shear > 0 and extra.stiffness != 0.0:

@@ -7,49 +7,49 @@ All elastic forces are the gradient of a single energy, so the contact can't cre
 U₀ and F are the energy and the force on a plane face, from the contact table. With a constant
 modulus E, F = πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1, the second term then becomes πE(d²
 d_t tan θ + d d_t²), the tangential energy of the parallel-distributed model. For other materials, F
-introduces their effective modulus. w(θ) is 1 on the soft hemisphere and fades to 0 towards the side
-of the finger. U_rim is a stiff spring between the rim of the backing plate and the object. A plane
-reaches the rim at d = a(1 − |sin θ|), which is the end of the soft range. Beyond a slightly smaller
-d, a(1 − √(sin² θ + 0.03²)), U₀ is continued linearly in d, and F is constant.
+contains the effective modulus of the material. w(θ) is 1 on the soft hemisphere and fades to 0
+towards the side of the finger. U_rim is a stiff spring between the rim of the backing plate and the
+object. A plane reaches the rim at d = a(1 − |sin θ|), which is the end of the soft range. Beyond a
+slightly smaller d, a(1 − √(sin² θ + 0.03²)), U₀ is continued linearly in d, and F is constant.
 
-This is the contact law ``simulation.tip_law = "springs"``. With ``"bristles"``, the term sin θ d_t
-is omitted. The tangential force T = 2 s F cos θ d_t/d (2πE s d d_t for a constant E) then comes
-from a bristle at the centre of the contact. Tilt and compression do not bend this bristle, and d_t
-only follows the sliding motion at that point. The upright force, the force at d_t = 0 and the
-sensor readings are the same for both laws. A controller that compensates the springs' tangential
-terms can therefore be tested with ``"bristles"``, a tip without these terms.
+The formulas above are the contact law for ``simulation.tip_law = "springs"``. With ``"bristles"``,
+the term sin θ d_t is omitted. The tangential force T = 2 s F cos θ d_t/d (2πE s d d_t for a
+constant E) then comes from a bristle at the centre of the contact. Tilt and compression do not bend
+this bristle, and d_t only follows the sliding motion at that point. The upright force, the force at
+d_t = 0 and the sensor readings are the same for both laws. A controller that compensates the
+springs' tangential terms can therefore be tested with ``"bristles"``, a tip without these terms.
 
 The tip touches the nearest point of the object. On a face, the contact direction is the face
-normal. At a corner, the direction is that of the line to the corner, as for a plane normal to that
-line. On a disc, the direction is that of the line to the centre. A disc's axis is normal to the
-hand plane, so its face is curved about one axis only, with radius R. To leading order in d, the
+normal. At a corner, the contact direction is the line to the corner, as for a plane normal to that
+line. On a disc, the contact direction is the line to the disc centre. A disc's axis is normal to
+the hand plane, so its face is curved about one axis only, with radius R. To leading order in d, the
 spring model's contact with a disc differs in two ways from its contact with the tangent plane.
 First, the footprint is narrower along the tilt by the factor κ² = R/(R + a), because the curvatures
-add to 1/a + 1/R. Second, force and energy are κ times those of the plane for any θ. For a constant
-modulus, a = 20 mm and d up to 8 mm, integrals over the springs agree with these factors to within
-1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9 % for R = 10 mm. The
-sensor frame is computed from the springs (`sensor.sensor_model`), so the sum of its cells differs
-from the force by the same amount. The force of a solid tip is proportional to d^(3/2) and √κ, as in
-Hertz's theory for a sphere on a cylinder in the limit of small d. The frame of a solid tip is that
-of a plane multiplied by √κ.
+add to 1/a + 1/R. Second, the force and energy are κ times the values for the plane at any θ. For a
+constant modulus, a = 20 mm and d up to 8 mm, integrals over the springs agree with these factors to
+within 1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9 % for R = 10 mm.
+The sensor frame is computed from the springs (`sensor.sensor_model`), so the sum of its cells
+differs from the force by the same amount. The force of a solid tip is proportional to d^(3/2) and
+√κ, as in Hertz's theory for a sphere on a cylinder in the limit of small d. The frame of a solid
+tip on a disc is the frame on a plane multiplied by √κ.
 
-Coulomb friction limits d_t to the range between the two shears at which |T| = μN. If the model's
-ratio |T|/N can't reach μ (with a constant E and s = 1, its maximum at θ = 0 is 1), the tip slips at
-the maximum ratio. Damping is viscous and proportional to the stiffness of the soft part, so it
-increases as the contact grows.
+Coulomb friction limits d_t to the range between the two shears at which |T| = μN. In the model, the
+ratio |T|/N may be unable to reach μ: with a constant E and s = 1, the maximum ratio at θ = 0 is 1.
+In that case, the tip slips at the maximum ratio. Damping is viscous and proportional to the
+stiffness of the soft part, so it increases as the contact grows.
 
-The shear of a stuck tip may relax by creep and by micro-slip. Creep and micro-slip are off by
-default. Without creep and micro-slip, a tip sticks or slips as a whole and has no memory.
-Micro-slip occurs because each spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² −
-r²), compressed by w = ℓ − h, has the pressure Ew/ℓ. When the face has moved by u, the spring has
-the shear traction Eu/ℓ and slips if u > μw. All layers w = 0 … d are equally stiff, because r dr =
-−ℓ dℓ. Starting from zero shear, integration gives
+The shear of a stuck tip may relax by creep and by micro-slip. Both effects are off by default.
+Without these effects, a tip sticks or slips as a whole and has no memory. Micro-slip occurs because
+each spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed by w = ℓ
+− h, has the pressure Ew/ℓ. When the face has moved by u, the spring has the shear traction Eu/ℓ.
+The spring slips if u > μw. All layers w = 0 … d are equally stiff, because r dr = −ℓ dℓ. Starting
+from zero shear, integration gives
 
     T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
 
-where the whole tip slips at u = μd. The layers form an Iwan model with uniformly distributed
-limits. The layers scale with the footprint. The mean of the layer shears is the tip's d_t, and
-their variance adds to d_t² in the tip energy.
+The whole tip slips at u = μd. The layers form an Iwan model with uniformly distributed limits. The
+layers scale with the footprint. The mean of the layer shears is the tip's d_t, and their variance
+adds to d_t² in the tip energy.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def fade(theta: float) -> tuple[float, float]:
 
 @inner_kernel
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
-    """Return the maximum ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of maximum ratio.
+    """Return the maximum ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of the maximum ratio.
 
     In this function, ζ is measured from the shear at which T = 0.
     """
@@ -143,8 +143,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         |T| ≤ μ N limits ζ on both sides of ``neutral`` = −χ d tan θ/2s, where T = 0
         losses: loss · stiffness · rate    stiffness = γ/cos θ (∂F/∂d, 2d/3 ∂U₀/∂d) and t1
 
-    ``factor`` is κ. The input fields of ``tip`` are d, θ, travel, rates, slip rate, shear, shear
-    variance and rim. All other fields are set, except for the rows and the generalised forces.
+    ``factor`` is κ. The function reads d, θ, travel, rates, slip rate, shear, shear variance and
+    rim from ``tip``. All other fields are set, except for the rows and the generalised forces.
     """
     d = tip.d
     sine = tip.sine
@@ -301,7 +301,7 @@ def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: flo
 
 @inner_kernel
 def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
-    """Add the rim stiffness to a tip that may reach the rim in this step.
+    """Add the rim stiffness to a tip whose rim may touch the object in this step.
 
     The rim depth's row is at most the sum of the d row and a times the θ row, so twice each
     stiffness is an upper bound.
@@ -409,7 +409,7 @@ def touch_object(
 
 @inner_kernel
 def relax_shears(plant: Plant) -> None:
-    """Relax the shears after a sub-step, using the contacts from its start."""
+    """Relax the shears after a sub-step, using the contacts from the start of that sub-step."""
     p, state = plant.parameters, plant.state
     for finger in range(2):
         tip, layers = plant.stages[0].on_object[finger], plant.layers[finger]

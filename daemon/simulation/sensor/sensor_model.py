@@ -1,4 +1,4 @@
-"""Model the simulated pressure sensor: convert a contact to the counts sent by a board.
+"""Model the simulated pressure sensor: convert a contact to the counts that a board sends.
 
 `simulated_tactile` handles delayed and lost frames. The imperfections are standard models; the
 profiles ``velostat`` and ``capacitive`` use them.
@@ -6,10 +6,10 @@ profiles ``velostat`` and ``capacitive`` use them.
 `sensing.pressure_grid` computes the pressure of a plane face; this module computes the pressure of
 a cylindrical face, as on a disc. Both calculations use the same spring model: above each point of
 the base, the face compresses a vertical spring whose length is the height of the hemisphere. An
-estimator that assumes a plane face interprets the narrower footprint as a smaller d: it finds 0.72
-of the true value for R = a, and 0.83 for R = 2a. The estimated θ is 1 % to 12 % too small (the
-error increases with d), and the estimated gain is above 1, which compensates for the underestimated
-force.
+estimator that assumes a plane face interprets the narrower footprint as a smaller d: the estimated
+d is 0.72 of the true d for R = a, and 0.83 for R = 2a. The estimated θ is 1 % to 12 % too small
+(the error increases with d), and the estimated gain is above 1, which compensates for the
+underestimated force.
 """
 
 from __future__ import annotations
@@ -137,12 +137,12 @@ class SensorModel:
         fraction: float = 1.0,
         shear: float = 0.0,
     ) -> None:
-        """Apply the contact at time ``t`` to the cells without reading them.
+        """Apply the contact at time ``t`` to the cells without reading the cells.
 
         ``curvature`` [1/m] is the face curvature in the plane of ``tilt_x``, 0 for a plane. The
         face is a cylinder with its axis along the finger's y. All pressures are multiplied by
-        ``fraction``. For a solid tip, the curvature acts only through ``fraction``, and the frame
-        also shows the ``shear`` [N] along x, applied at height a.
+        ``fraction``. For a solid tip, the curvature acts only through ``fraction``. The frame of a
+        solid tip also shows the ``shear`` force [N], which acts along x at height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
         flaws, pressure = self._flaws, self._pressure
@@ -172,10 +172,10 @@ class SensorModel:
 
     @cached_property
     def _points(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Sample points: their positions across the cylinder axis, and the hemisphere heights [m].
+        """Sample point positions across the cylinder axis, and the hemisphere heights there [m].
 
         Both arrays have the shape [lines, points per line]; the height is 0 beyond the rim. The
-        other two results are the weights of the points in a cell's mean, along y and x.
+        other two results are the weights of the points in a cell mean along y and along x.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -188,8 +188,8 @@ class SensorModel:
     def _curved(self, d: float, n_x: float, n_y: float, roundness: float) -> FloatArray:
         """Return the pressure [Pa] on each cell due to a cylinder of radius R = ``roundness`` [m].
 
-        The normal (n_x, n_y, …) points from the tip centre to the axis at a distance a − d + R.
-        With the coordinate p across the axis,
+        The normal (n_x, n_y, …) points from the tip centre to the cylinder axis, whose distance is
+        a − d + R. With the coordinate p across the axis,
 
             z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
 
@@ -298,7 +298,7 @@ def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float)
 def drift(
     value: FloatArray, deviation: float, time: float, elapsed: float, normals: FloatArray
 ) -> None:
-    """Advance the zero drift or gain drift, modelled as an Ornstein-Uhlenbeck process.
+    """Advance the zero drift or gain drift, an Ornstein-Uhlenbeck process.
 
     ``value`` starts at 0 after a tare, and its standard deviation approaches ``deviation`` with the
     correlation time ``time`` [s]. ``normals`` are standard normal numbers.
@@ -321,9 +321,9 @@ def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: Float
 def count(
     signal: FloatArray, active: NDArray[np.bool_], ends: tuple[int, int], out: NDArray[np.uint16]
 ) -> None:
-    """Round a signal to counts in ``out``; inactive cells read 0.
+    """Round a signal to counts and store the counts in ``out``; inactive cells read 0.
 
-    ``ends`` contains the threshold below which counts are set to 0, and the maximum count.
+    ``ends`` contains the maximum count and the threshold below which counts are set to 0.
     """
     lowest, full = ends
     value = np.clip(signal + 0.5, 0.0, full + 0.5)

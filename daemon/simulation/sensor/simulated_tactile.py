@@ -36,7 +36,7 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
 
 
 class StageTouch(NamedTuple):
-    """Contact of a tip, at one instant, with a body other than the object."""
+    """Contact of a tip with a body other than the object at one instant."""
 
     d: float  # m
     theta: float  # rad
@@ -44,13 +44,13 @@ class StageTouch(NamedTuple):
 
 
 class SimulatedTactile:
-    """Source of frames for one fingertip of a :class:`SimulatedHand`.
+    """Frame source for one fingertip of a :class:`SimulatedHand`.
 
     The hand's settings define the sensor. Frame k samples the contact at k / ``tactile.rate`` after
-    the hand's start. The frame arrives ``simulation.tactile_delay`` later, with an additional
-    delay, or not at all (see :class:`Arrivals`). As on hardware, the sample time is unknown; it is
-    assumed to be ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is
-    computed, and only on request; ``seq`` also counts the frames that are not computed. The hand's
+    the hand's start. The frame arrives ``simulation.tactile_delay`` after the sample or later, or
+    is lost (see :class:`Arrivals`). As on hardware, the sample time is unknown; it is assumed to be
+    ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is computed, and
+    only on request. The frames that are never computed are also counted in ``seq``. The hand's
     ``measurement_faults`` are applied to the frames.
 
     If ``stage`` is set, it replaces the contact with the object. ``stage`` is a function of the
@@ -124,7 +124,7 @@ class SimulatedTactile:
         self._open = False
 
     def _read(self, number: int, arrival: float) -> None:
-        """Compute the frame of a sample that the plant still stores; make it the newest frame."""
+        """Compute the newest frame from a sample that the plant still stores."""
         # If readings depend on earlier contacts, samples without a computed frame also matter.
         first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
@@ -197,7 +197,7 @@ class Arrivals:
 
     Frame k is sampled at start + k · period and is due ``delay`` [s] later. A frame is lost with
     probability ``dropped``. A frame that is not lost is late by a uniformly distributed time of up
-    to ``jitter`` [s]. Frames never overtake each other.
+    to ``jitter`` [s]. Frames always arrive in order.
     """
 
     # Allowance for clock rounding errors, so that a frame that is due now counts as arrived.
@@ -238,7 +238,7 @@ class Arrivals:
         return self.number > newest
 
     def _plan(self) -> None:
-        """Determine the next frame that is not lost and its arrival time."""
+        """Find the next frame that is not lost, and set its arrival time."""
         self._next += 1
         while self._dropped > 0.0 and self._random.random() < self._dropped:
             self._next += 1

@@ -59,7 +59,7 @@ def status(packet_id: int, error: int, data: bytes = b"") -> bytes:
 
 
 def fast_head(length: int) -> bytes:
-    """Return the start of the combined reply to a fast group read."""
+    """Return the first bytes of the combined reply to a fast group read."""
     return _PREFIX + bytes((BROADCAST, length & 0xFF, length >> 8 & 0xFF, STATUS))
 
 

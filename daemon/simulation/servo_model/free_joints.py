@@ -1,8 +1,8 @@
 """Simulate independent joints without contact, for servo buses without a hand.
 
-Each joint is a motor with first-order current dynamics, inertia, viscous and Coulomb friction, and
-the servo's inner position loop acting on the current. A fixed step makes runs deterministic. The
-constants approximate an XM430-W350 with a bare horn.
+The model of each joint includes first-order current dynamics, inertia, viscous and Coulomb
+friction, and the servo's inner position loop, which commands the current. A fixed step makes runs
+deterministic. The constants approximate an XM430-W350 with a bare horn.
 """
 
 import numpy as np

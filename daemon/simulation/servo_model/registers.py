@@ -173,7 +173,7 @@ class ControlTable:
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
 
     def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
-        """Restore factory defaults from address ``first`` on, except for the items in ``keep``.
+        """Restore the factory defaults from address ``first``, except for the items in ``keep``.
 
         If ``first`` is `control_table.RAM`, the reset has the effect of a power-up.
         """
@@ -232,7 +232,7 @@ class ControlTable:
         return next(filter(None, refusals), framing.OK), plan
 
     def _refusal(self, item: Item, value: int) -> int:
-        """Return the error if other registers prohibit writing ``value``, otherwise OK."""
+        """Return the error number if other registers prohibit writing ``value``, otherwise OK."""
         memory, address = self.memory, item.address
         if address in _GOALS:
             if memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:

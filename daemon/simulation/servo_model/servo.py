@@ -6,7 +6,7 @@ no known client uses, is rejected as out of range. The integral gain and startup
 have no effect.
 
 The manuals do not specify two details. In this emulation, a write that violates any rule leaves all
-registers unchanged, and switching torque on after a shutdown is rejected with RESULT_FAIL.
+registers unchanged. After a shutdown, an attempt to switch torque on is rejected with RESULT_FAIL.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class EmulatedServo:
 
     @property
     def return_delay(self) -> float:
-        """Time between an instruction and its reply [s]."""
+        """Delay between an instruction and its reply [s]."""
         return self._memory[reg.RETURN_DELAY_TIME] * reg.RETURN_DELAY_UNIT
 
     def answers_reads(self, servo_id: int, fast: bool) -> bool:
@@ -130,7 +130,7 @@ class EmulatedServo:
 
     @property
     def watchdog(self) -> float:
-        """Bus watchdog time [s]; 0 while the watchdog is off or has stopped the motor."""
+        """Bus watchdog timeout [s]; 0 while the watchdog is off or has stopped the motor."""
         ticks = self._memory[reg.BUS_WATCHDOG]
         return ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else 0.0
 
@@ -268,7 +268,7 @@ class EmulatedServo:
         return framing.OK
 
     def report(self, t: float) -> dict[str, Any]:
-        """Return the servo state and the record of received goals."""
+        """Return the servo state and the record of the goals received."""
         stopped = self._memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR
         return {
             "id": self.id,
@@ -422,7 +422,7 @@ class BusRecorder:
             self._goals[address] = min(least, value), max(greatest, value)
 
     def torque_on(self, t: float, joint: ServoJoint, mode: int, position: int) -> None:
-        """Record that torque is on at time t, with the goal ``position`` [counts]."""
+        """Record that torque is on at time t and that the goal is ``position`` [counts]."""
         self._torque_on += 1
         self._torque_t = self._last = t
         if mode in POSITION_MODES:

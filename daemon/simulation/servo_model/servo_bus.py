@@ -1,6 +1,6 @@
-"""Emulate a bus of Dynamixel servos: instruction packets in, status packets out.
+"""Emulate a Dynamixel servo bus, which receives instruction packets and sends status packets.
 
-Input and output are bytes with times, so tests and fuzzers need no port;
+Input and output are bytes with time stamps, so tests and fuzzers need no port.
 :mod:`simulation.emulator.pty_bus` adds the pseudo-terminal. In group reads, each servo replies
 after the previous one in the list, so servos after a missing servo stay silent. Control table
 backups, which no known client uses, return an instruction error. Servos that are set to Protocol
@@ -51,7 +51,7 @@ class TimedReply(NamedTuple):
 
 
 class ServoBus:
-    """Servos that share one wire and one plant. The servos do not reply to corrupted packets."""
+    """Group of servos that share one wire and one plant. They do not reply to corrupted packets."""
 
     def __init__(
         self,
@@ -127,17 +127,17 @@ class ServoBus:
         self._now = t
 
     def next_event(self) -> float:
-        """Return the time of the next servo event [s], or an earlier time."""
+        """Return a time [s] that is not later than the next servo event."""
         return self._due
 
     # --- bytes -----------------------------------------------------------------------------
 
     def feed(self, data: bytes, t: float, baud: int = 0) -> bytes:
-        """Return the replies to ``data``, which arrives at time t, without their delays."""
+        """Return the replies to ``data``, which arrives at time t. The reply delays are omitted."""
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
-        """Return the replies to ``data`` with their delays; ``baud`` 0 suits all servos."""
+        """Return the replies to ``data`` with their delays. With ``baud`` 0, all servos respond."""
         if t >= self._due or t > self._now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []
@@ -283,7 +283,7 @@ class ServoBus:
 def _requested(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], bytes]:
     """Return (ID, address, length) for each part of a group read, and the start of a fast reply.
 
-    The result is empty if the packet is incomplete or contains the same ID twice.
+    The result is empty if the packet is incomplete or if it contains an ID twice.
     """
     requested: list[tuple[int, int, int]] = []
     if instruction not in _SYNC_READS:

@@ -3,7 +3,8 @@
 `ServoJoint` converts counts to angles (turns, homing offset, drive direction), follows the profile,
 drives the plant according to the operating mode, and writes the present values to the control
 table. `ServoHealth` models heat (`ServoHeat`), supply voltage and overload. The manuals do not
-specify the time to overload; in this model, it is OVERLOAD_TIME of current at the configured limit.
+specify when an overload error occurs. In this model, the error occurs after OVERLOAD_TIME at the
+configured current limit.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class ServoJoint:
         return self._scale.position_counts(self._plant.q.item(self._joint)) + self.shift
 
     def forget_turns(self) -> int:
-        """Reset the position to a single turn; return the decrease [counts]."""
+        """Reset the position to a single turn; return the decrease in position [counts]."""
         before = self._turns
         self._turns = self.encoder() // reg.COUNTS_PER_TURN
         return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
@@ -101,7 +102,7 @@ class ServoJoint:
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_current(self, counts: int) -> float:
-        """Convert a goal current to A, positive when closing; a limit's sign has no meaning."""
+        """Convert a goal current to A, positive when closing; ignore the sign of a limit."""
         return self._scale.amperes(self.sign * counts)
 
     # --- trajectory --------------------------------------------------------------------------
@@ -111,7 +112,7 @@ class ServoJoint:
         self.profile.hold(self.position())
 
     def aim(self) -> None:
-        """Start a trajectory to the goal position according to the profile registers."""
+        """Start a trajectory to the goal position, as defined by the profile registers."""
         memory, table, profile = self._memory, self._table, self.profile
         if memory[reg.OPERATING_MODE] not in POSITION_MODES:
             return
@@ -220,7 +221,7 @@ _ARRIVAL_TOLERANCE = 1e-6
 
 
 class Profile:
-    """Velocity-based or time-based trajectory to a goal, with its current position and velocity.
+    """Velocity-based or time-based trajectory to a goal; stores the current position and velocity.
 
     A limit of 0 means no limit.
     """
@@ -360,7 +361,7 @@ class ServoHealth:
         return self.supply - reg.SAG * self._current
 
     def restart(self) -> None:
-        """Restart as after a power-up; temperatures are retained."""
+        """Restart as after a power-up, but keep the temperatures."""
         self._overload = 0.0
 
     def sense(self, table: ControlTable, current: float, pressed: bool) -> list[int]:
