@@ -22,7 +22,7 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_ERROR_SIGMA = 2.0  # torque constant errors up to this many standard deviations are allowed for
+_TORQUE_ERROR_SIGMA = 2.0  # torque constant standard deviations allowed for in the force limit
 _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
 _DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to this controller [rad]

@@ -143,7 +143,7 @@ class Gripping(ControlState):
     """Base class of the states in which the grip controller computes joint torques."""
 
     history: GripHistory
-    reached_for: float = 0.0  # time for which the force and the angle have been at their targets [s]
+    reached_for: float = 0.0  # time for which force and angle have been at their targets [s]
     near_for: float = 0.0  # time for which the force error has been within _FRICTION_TOLERANCE [s]
 
 
@@ -462,7 +462,7 @@ class Control:
         is_reached = True
         if not isinstance(state, Pressing):
             self._end_turn_before_slip(history)
-            is_reached = not abs(pose.angle - grip.target_angle) >= _ANGLE_TOLERANCE  # also true if the angle is NaN
+            is_reached = not abs(pose.angle - grip.target_angle) >= _ANGLE_TOLERANCE  # True for NaN
         if not isinstance(state, Turning):
             streamed = isinstance(state, Pressing) and state.command.is_streamed
             near = abs(self.fingers.force - grip.target) < _FRICTION_TOLERANCE * grip.target

@@ -15,7 +15,7 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
 
-Step = tuple[dict[str, Any], Mode, float]  # command, final mode of the step, pause after the step [s]
+Step = tuple[dict[str, Any], Mode, float]  # command, final mode and subsequent pause [s]
 
 _STEP_TIMEOUT = 10.0  # s
 _RESTART_PAUSE = 2.0  # pause before a restart that gives the user time to read the message [s]

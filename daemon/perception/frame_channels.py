@@ -61,8 +61,8 @@ D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
 # shift by 0.06 radii changes the measured angle by 0.06 rad. The error of correct frames is at most
 # 0.04 rad.
 IMAGE_SHIFT_MIN = 0.06
-_JUMP_SUPPORT = 0.5  # minimum force per tip [N]; below it, an object may rock between the tips
-_NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; at lower forces, an object may rock between the tips
+_JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
+_NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; below it, an object may rock
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
 # A footprint that grows within the response time of the cells appears wider and flatter. The first
 # two values are the relative changes divided by var(d)/d². They result from fitting a paraboloid to

@@ -53,11 +53,11 @@ class GraspState(Record):
     load_curvature: float  # [m/N]
     pull_shear: float  # shear due to a pulling load, measured by solid tips [N]
     twist_shear: float  # shear due to a twisting load, measured by solid tips [N]
-    free_torque: Pair  # accumulated object rotation that the joints do not explain [rad]
-    unexplained_rotation: Pair  # accumulated object rotation that joint motion does not explain [rad]
+    free_torque: Pair  # maximum torque of each joint during an approach without contact [N·m]
+    unexplained_rotation: Pair  # accumulated object rotation that the joints do not explain [rad]
 
-    # running average, expected to be 1
-    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running average of the NIS, expected to be 1
+    # Consistency
+    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running average, expected to be 1
     angle_jump: Pair  # difference between newest frame and prediction in a grip [rad]
     d_jump: Pair  # the corresponding difference in displacement [m], or 0 if d is not measured
     rejects_frames: Pair  # 1 if too many consecutive frames were rejected

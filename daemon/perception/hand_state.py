@@ -91,7 +91,7 @@ class TrackedTip(Record):
     free_torque_max: Pair  # maxima in the current and in the previous _TOUCH_DELAY window
     window_start: float  # [s]
     travel: Pair  # accumulated predicted motion of d [m] and of the joint [rad]
-    law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F due to table and material law
+    law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F
     relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered long-term forces [N]
     relaxation: float  # relaxation factor ρ, the ratio of tip force to long-term force
 

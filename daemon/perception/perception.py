@@ -154,7 +154,7 @@ class FingerPerception:
             self._converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
             self._scale = 1.0
             self._quantum = self._converter.quantum
-        self._readings: NDArray[Any] | None = None  # newest frame in Pa, or in counts above the zero offset
+        self._readings: NDArray[Any] | None = None  # newest frame [Pa or counts]
         self._publishes_pressure = settings.stream.tactile_unit == "Pa"
         self.info = self._info(settings, model)
         self._events = events
