@@ -164,7 +164,7 @@ class Site:
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
-        # Each request contains a secret, so the server accepts any host name.
+        # If each request contains a secret, the server accepts any host name.
         if self._announce is not None:
             here = True
             if not self._allows(request):
