@@ -112,8 +112,7 @@ def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -
         total = math.hypot(tip.tangential, stiffness * touch.shear_across)
         if total <= limit * (1.0 + 1e-9):
             break
-        # The tip slips, so scale both shear components until the force is back on the friction
-        # cone.
+        # The tip slips, so scale both shear components to return the force to the friction cone.
         tip.shear += (limit / total - 1.0) * tip.tangential / stiffness
         touch.shear_across *= limit / total
     touch.shear[:] = tip.shear * touch.along + touch.shear_across * touch.across

@@ -32,8 +32,8 @@ from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
 from tests.harness.perturbed import Perturbation
 
-# All machines test the same examples, without a deadline. --hypothesis-profile=search tries other
-# examples.
+# Run the same Hypothesis examples on all machines, without a deadline. Use
+# --hypothesis-profile=search to try other examples.
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("same")

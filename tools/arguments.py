@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.wire.keys import ClientKeys
 
-WAIT_MAX = 5.0  # maximum wait for the first message with `--no-wait` [s]
+WAIT_MAX = 5.0  # time limit for the first message with `--no-wait` [s]
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:

@@ -90,7 +90,7 @@ def _open_standard_streams() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
-            os.set_inheritable(descriptor, True)  # Let child processes inherit the descriptor.
+            os.set_inheritable(descriptor, True)  # Child processes inherit the descriptor.
             setattr(sys, name, os.fdopen(descriptor, mode))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -182,7 +182,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(argv: Sequence[str] | None) -> int:
-    # Until the subcommand installs its own handler, Ctrl-C ends the process without a traceback.
+    # Until the subcommand installs its own handler, Ctrl-C exits the process without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _open_standard_streams()
     words = list(sys.argv[1:] if argv is None else argv)

@@ -33,7 +33,7 @@ Case = TypeVar("Case")
 Result = TypeVar("Result")
 
 _CONNECT_TIMEOUT = 10.0  # time limit for connecting to the scheduler [s]
-_REDRAW_INTERVAL = 0.1  # time between two redraws of a bar [s]
+_REDRAW_INTERVAL = 0.1  # time between two updates of a progress bar [s]
 _BAR_WIDTH = 20  # columns
 
 

@@ -139,7 +139,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         reply = await asyncio.to_thread(send_once, where, attempts, keys)
         while attempts.again(reply):
             await asyncio.sleep(RETRY_DELAY)
-            if not attempts.remaining():  # the computer was suspended in the meantime
+            if not attempts.remaining():  # The computer was suspended in the meantime.
                 break
             reply = await asyncio.to_thread(send_once, where, attempts, keys)
         return accepted(reply)

@@ -93,7 +93,7 @@ def send(
     reply = send_once(address, attempts, keys)
     while attempts.again(reply):
         time.sleep(RETRY_DELAY)
-        if not attempts.remaining():  # the computer was suspended in the meantime
+        if not attempts.remaining():  # The computer was suspended in the meantime.
             break
         reply = send_once(address, attempts, keys)
     return reply

@@ -18,7 +18,7 @@ REPLY_TIMEOUT = 5.0  # default timeout for a reply or a first message [s]
 SILENCE_TIME = 1.0  # waiting time before a warning is logged [s]
 
 _QUEUE_LENGTH = 100_000  # maximum number of messages queued for a slow program
-# Maximum message size [bytes]. A frame of the largest grid has 131 kB.
+# Maximum message size [bytes]. A frame from the largest grid takes 131 kB.
 _MESSAGE_SIZE_MAX = 4_000_000
 
 

@@ -49,7 +49,7 @@ class Grip:
         self.force = Setpoint(dt, control.smooth_time, state.force)  # mean tip force [N]
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # object angle [rad]
         self.slip = state.slip
-        self.commanded_max = math.inf  # maximum commanded force, set by `limit_force` [N]
+        self.commanded_max = math.inf  # highest commanded force allowed [N], set by `limit_force`
         self.target_angle = math.nan  # target object angle [rad], NaN if not steered
         configure(state.slip, settings)
         law = state.law
@@ -145,7 +145,7 @@ class Grip:
         """Return the force [N] required for the load, including slip margin and undetected load."""
         law, grasp = self.slip.law, self._grasp
         load = self.slip.assumed_load
-        if not law.has_shear and law.object_load == 0.0:  # Friction may hide the load.
+        if not law.has_shear and law.object_load == 0.0:  # Joint friction may hide a load.
             load = max(load, law.joint_friction / max(grasp.load_arm, 0.5 * law.width))
         return max(load / self.slip.usable_friction, self.slip.needed_force)
 

@@ -22,12 +22,12 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_ERROR_SIGMA = 2.0  # number of torque-constant standard deviations in the force limit
+_TORQUE_ERROR_SIGMA = 2.0  # torque constant standard deviations allowed for in the force limit
 _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
-_DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the integral control of the tip force difference [Hz]
-_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation that this integral control may cause [rad]
-_DITHER_STEP_MAX = 0.05  # maximum dither time step after a delayed tick [s]
-_STIFFNESS_MIN = 100.0  # minimum stiffness, because gains are divided by stiffness [N/m]
+_DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
+_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to this controller [rad]
+_DITHER_STEP_MAX = 0.05  # maximum time step of the dither, even after a late tick [s]
+_STIFFNESS_MIN = 100.0  # lower bound of the stiffness [N/m]; gains are divided by the stiffness
 ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
 
 
@@ -39,14 +39,14 @@ class GripLaw(Record):
     force_bandwidth: float  # [rad/s]
     rotate_bandwidth: float  # [rad/s]
     rotate_speed: float  # [rad/s]
-    damping: float  # 2 ζ √J; multiplied by √stiffness, it gives the damping [N·m·s/rad]
+    damping: float  # 2 ζ √J, which is multiplied by √stiffness to obtain the damping [N·m·s/rad]
     friction: float  # joint friction [N·m]
-    driving: float  # ratio of motor torque to tip torque when closing
-    friction_speed: float  # joint speed at which friction is fully compensated [rad/s]
+    driving: float  # motor torque divided by tip torque while a joint closes
+    friction_speed: float  # joint speed above which friction is fully compensated [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
-    turn_decay: float  # decay factor of the rotation rate on each tick without a new frame
-    is_blind: bool  # True if dither brings the object upright without using its measured angle
+    turn_decay: float  # factor by which the rotation rate decays on each tick without a frame
+    is_blind: bool  # True if dither uprights the object without an angle measurement
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
     offset: float  # fingertip offset [m]
@@ -66,16 +66,16 @@ class GripState(Record):
     commanded: float  # commanded force [N]
     force_rate: float  # [N/s]
     joint_stiffness: float  # [N·m/rad]
-    is_steering: bool  # True if the object angle has a target
+    is_steering: bool  # True if a target has been set for the object angle
     integral: float  # [N]
     grip_force: float  # sum of feed-forward and feedback [N]
-    offset_rate: float  # rate of the offset that rotates the object [rad/s]
+    offset_rate: float  # rate of change of the offset that rotates the object [rad/s]
     offset: float  # goal of (q1 − q2)/2 [rad]
     dither_elapsed: float  # time since the dither began [s]
-    last_time: float  # time of the last tick with equal torques, or of the start [s]
-    balance_offset: float  # part of the offset that balances the tip forces [rad]
-    closing_friction: float  # fraction of the joint friction compensated for closing
-    torque: Pair  # last torques of both joints [N·m]
+    last_time: float  # start time, or time of the last tick that gave both joints equal torques [s]
+    balance_offset: float  # part of the offset that equalises the tip forces [rad]
+    closing_friction: float  # fraction of the joint friction that is compensated during closing
+    torque: Pair  # most recent torques of both joints [N·m]
 
 
 @kernel
@@ -182,7 +182,8 @@ def single_torque(
     closing_rate = 0.0
     if not frames_late:
         target = setpoint.advance(g.force, force_windows, g.force_rate)
-        # The object is fixed, so friction between tip and object may carry part of the torque.
+        # The object is fixed, so friction between the tip and the object may carry part of the
+        # torque.
         q, law = grasp.q[finger], g.law
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
         limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
@@ -222,7 +223,7 @@ def _grip_force(g: GripState, target: float, measured: float, bound: float, limi
     """
     law = g.law
     error = target - measured
-    # Anti-windup: do not integrate while a torque is at its limit.
+    # Anti-windup: do not increase the integral while a torque is at its limit.
     full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
     if not full or error < 0.0:
         integral = g.integral + law.force_bandwidth * error * law.dt
@@ -251,7 +252,7 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
     offset_rate = g.angle.speed / rotation
     if not math.isnan(angle):
         error = target - angle
-        # The dead band keeps joints at rest from following noise.
+        # The dead band prevents stationary joints from following noise.
         if setpoint.has_arrived(g.angle):
             noise = GATE * grasp.angle_std
             error -= clip(error, noise)
@@ -359,14 +360,14 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     lengths = (law.half_separation, law.length, law.offset, law.radius)
     spring = upright_spring(mean(q), mean(grasp.d), target, grasp.tilt_moment_ratio, lengths)
     spring = min(spring, g.joint_stiffness)
-    # The subsequent hold must start with the current spring torque.
+    # The next hold must start at the current spring torque.
     g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
-    # The amplitude increases during the first period, and it fades throughout the dither.
+    # The amplitude rises during the first period and decays to zero by the end of the dither.
     phase = law.dither_rate * g.dither_elapsed
     amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
     if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-        # Use the clock instead of counting ticks. Otherwise late ticks could slow the dither to the
-        # resonance of the fingers on the tips, at 1 to 2 Hz.
+        # Measure time with the clock instead of counting ticks. Otherwise, late ticks could slow
+        # the dither down to the resonance of the fingers on the tips (1 to 2 Hz).
         g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
     return torque

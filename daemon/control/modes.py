@@ -14,12 +14,12 @@ class Mode(StrEnum):
     """Mode of the hand."""
 
     DISARMED = "disarmed"  # torque off
-    ARMED = "armed"  # torque on, joints hold their positions
-    MOVING = "moving"  # joints moving to commanded angles
-    GRASPING = "grasping"  # closing the fingers or increasing the force
-    HOLDING = "holding"  # holding force and object angle
-    ROTATING = "rotating"  # rotating the object
-    RELEASING = "releasing"  # opening the fingers
+    ARMED = "armed"  # torque on; the joints hold their positions
+    MOVING = "moving"  # the joints move to the commanded angles
+    GRASPING = "grasping"  # the fingers close or the grip force increases
+    HOLDING = "holding"  # the grip force and the object angle are held
+    ROTATING = "rotating"  # the object is being rotated
+    RELEASING = "releasing"  # the fingers open
     FAULT = "fault"  # torque off until the fault is cleared
 
 
@@ -35,7 +35,7 @@ class Parameter(NamedTuple):
 
     required: bool
     unit: str
-    range: str  # range in words, with the settings that define it
+    range: str  # range in words, including the settings that define the range
     meaning: str
 
 
@@ -56,7 +56,7 @@ class CommandKind(NamedTuple):
     refusals: Mapping[Reason, str] = _NONE
 
 
-# Meanings of the fields in replies.
+# Meanings of the reply fields.
 REPLY = {
     "mode": "mode after the command",
     "torque_off": "`confirmed`, or `unconfirmed` if a servo has not replied yet",
@@ -204,5 +204,6 @@ COMMANDS: dict[str, CommandKind] = {
     ),
 }
 
-# These commands never stiffen or move the hand, so they are accepted even if they arrive late.
+# These commands never stiffen or move the hand, so the daemon accepts them even if they arrive
+# late.
 SAFE_COMMANDS = frozenset({"disarm", "tare", "clear"})

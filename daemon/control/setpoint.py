@@ -28,7 +28,7 @@ class SetpointState(Record):
     target: float
     value: float
     speed: float  # [1/s]
-    ramp: float  # unsmoothed value, which moves to the target at the given rate
+    ramp: float  # unsmoothed value, which approaches the target at a constant rate
     idle_count: int  # number of ticks since the ramp reached the target
     dt: float  # [s]
     first: RunningMean
@@ -77,7 +77,7 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
             return last
         s.idle_count += 1
         if s.idle_count >= length:
-            reset(s, windows, s.target)  # Clear accumulated rounding errors.
+            reset(s, windows, s.target)  # Remove accumulated rounding errors.
             return s.target
     else:
         step_max = rate * s.dt

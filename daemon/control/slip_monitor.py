@@ -48,18 +48,18 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
-_AVERAGE_TIME = 0.1  # averaging time, because velocities fluctuate by one count (0.024 rad/s) [s]
-_SETTLING_TIME = 1.0  # settling time of the residual and hold time of a force increase [s]
-_DECAY_TIME = 2.0  # time to decrease the force by `grip_raise_max`, and decay time of rotations [s]
+_AVERAGE_TIME = 0.1  # averaging time [s]; velocity readings fluctuate by one count (0.024 rad/s)
+_SETTLING_TIME = 1.0  # settling time of the residual, and hold time of a force increase [s]
+_DECAY_TIME = 2.0  # time to remove an increase of `grip_raise_max`, and decay time of rotations [s]
 _SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
-_ROTATION_INCREASE = 0.5  # relative force increase after an object rotation
-_ROTATION_MARGIN = 1.5  # minimum object rotation, relative to the rotation due to shear deformation
-_SHEAR_JUMP = 0.6  # minimum shear jump of solid tips [N], six standard deviations
-_AGREEMENT = 0.25  # minimum share of each joint and each tip in a change, as a fraction of the mean
-_UNCONFIRMED_SHARE = 0.3  # fraction of the commanded force
-_RELAXATION_SHARE = 0.2  # fraction of the tip force that rubber may lose during a hold
+_ROTATION_INCREASE = 0.5  # relative force increase after the object has rotated
+_ROTATION_MARGIN = 1.5  # minimum rotation that counts, relative to the rotation due to shear
+_SHEAR_JUMP = 0.6  # minimum shear jump measured by solid tips [N], equal to six standard deviations
+_AGREEMENT = 0.25  # minimum share of each joint or tip in a change, as a fraction of the mean
+_UNCONFIRMED_SHARE = 0.3  # highest unconfirmed force increase, as a fraction of the force
+_RELAXATION_SHARE = 0.2  # maximum force loss by relaxation during a hold, as a fraction
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
-_SPARE_MIN = 0.3  # minimum fraction of the friction that remains after rolling
+_SPARE_MIN = 0.3  # minimum fraction of the friction coefficient that remains after rolling
 
 
 class SlipLaw(Record):
@@ -68,16 +68,16 @@ class SlipLaw(Record):
     dt: float  # [s]
     width: float  # object width [m]
     arm_min: float  # minimum moment arm [m]
-    yield_speed: float  # minimum speed change of a yielding joint [rad/s]
-    standstill: float  # maximum deviation of a stationary joint from its average angle [rad]
+    yield_speed: float  # minimum speed change of a joint that yields to a load [rad/s]
+    standstill: float  # maximum difference between a stationary joint's angle and its average [rad]
     force_max: float  # [N]
-    friction: float  # Coulomb coefficient between tip and object
-    margin: float  # fraction of the friction that is kept as a margin
+    friction: float  # Coulomb friction coefficient between tip and object
+    margin: float  # fraction of the friction coefficient that is kept as a margin
     joint_friction: float  # [N·m]
     friction_max: float  # maximum joint torque during an approach [N·m]
-    load_friction: float  # fraction of the tip moment that gears hold until the joint opens
+    load_friction: float  # fraction of the tip moment that gear friction can hold
     object_load: float  # [N]
-    has_shear: bool  # frames measure shear
+    has_shear: bool  # True if the frames measure shear
     increase_max: float  # [N]
     increase_ratio: float  # maximum force increase as a fraction of the commanded force
 
@@ -88,30 +88,30 @@ class SlipState(Record):
     law: SlipLaw
     friction: float  # joint friction, including the force-dependent part [N·m]
     residual: Pair  # average joint torque residuals [N·m]
-    variance: Pair  # variance of the mean residual and of half the difference [N²·m²]
+    variance: Pair  # variances of the mean residual and of half the residual difference [N²·m²]
     speed: Pair  # average joint speeds [rad/s]
     q: Pair  # joint angles, averaged over _SETTLING_TIME [rad]
     torque: float  # mean torque of both joints on the previous tick [N·m]
-    is_watched: bool  # True if the initial residual of the hold is known
+    is_watched: bool  # True if the residual at the start of the hold is known
     offset: float  # residual without a load [N·m]
-    start_offset: float  # part of the initial offset that exceeds friction [N·m]
-    deviation: float  # residual attributed to a load [N·m]
-    moment: float  # moment of the tip forces when holding began [N·m]
-    holding_time: float  # time since holding began, up to _SETTLING_TIME [s]
+    start_offset: float  # part of the offset at the start that friction can't explain [N·m]
+    deviation: float  # part of the residual that is attributed to a load [N·m]
+    moment: float  # moment of the tip forces at the start of the hold [N·m]
+    holding_time: float  # time since the start of the hold, at most _SETTLING_TIME [s]
     load: float  # load per tip, including the part hidden by friction [N]
-    assumed_load: float  # maximum of `load`, solid-tip shear and declared load [N]
-    is_confirmed: bool  # True if the load may increase the force by more than _UNCONFIRMED_SHARE
-    pull: float  # average pull measured by solid tips [N]
-    twist: float  # average twist measured by solid tips [N]
-    usable_friction: float  # Coulomb coefficient minus the shares for slip margin and rolling
+    assumed_load: float  # maximum of `load`, measured shear and half the declared load [N]
+    is_confirmed: bool  # True if a load may increase the force by more than _UNCONFIRMED_SHARE
+    pull: float  # average pulling force measured by solid tips [N]
+    twist: float  # average twisting force measured by solid tips [N]
+    usable_friction: float  # friction coefficient minus the parts for slip margin and rolling
     rotation_seen: Pair  # value of `unexplained_rotation` at the previous update [rad]
-    rotation: Pair  # unexplained rotation per tip over the last _DECAY_TIME [rad]
-    has_turned: bool  # True if the object has rotated in the grip on this tick
-    reflex_triggered: bool  # True if a sudden event occurred on this tick
-    needed_force: float  # required force, held for _SETTLING_TIME [N]
+    rotation: Pair  # unexplained rotation per tip during the last _DECAY_TIME [rad]
+    has_turned: bool  # True if a rotation of the object in the grip was detected on this tick
+    reflex_triggered: bool  # True if a sudden load or a rotation was detected on this tick
+    needed_force: float  # required force [N], held for _SETTLING_TIME
     force_limit: float  # [N]
-    balanced_max: float  # mean force at which the more loaded tip reaches its limit [N]
-    idle_time: float  # time since a force increase was last required [s]
+    balanced_max: float  # mean tip force at which the more heavily loaded tip reaches its limit [N]
+    idle_time: float  # time since the last request for a force increase [s]
 
 
 def configure(s: SlipState, settings: Settings) -> None:
@@ -217,10 +217,10 @@ def update(
         s.has_turned = _has_turned(s, grasp)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.torque = mean(torques)
-    # Ignore the torques if joint friction hides more load than the grip can bear.
+    # Ignore the torques if joint friction could hide a load larger than the grip can carry.
     if law.friction * commanded * grasp.load_arm <= s.friction:
         s.load = 0.0
-    if law.has_shear:  # A load estimate above the measured shear is due to a force error.
+    if law.has_shear:  # Any load beyond the measured shear is due to a force error.
         s.load = min(s.load, pull + _SHEAR_JUMP)
     if grasp.sensor_fault:
         s.load = pull = s.needed_force = 0.0
@@ -248,7 +248,8 @@ def _increased_force(s: SlipState, grasp: GraspState, commanded: float, sudden: 
     """Return the grip force [N] that the assumed load and the events of this tick require."""
     s.reflex_triggered = s.has_turned or sudden
     s.is_confirmed = s.is_confirmed or s.reflex_triggered
-    # A push across the faces presses the object into one tip. The torques show it first.
+    # If the object is pushed towards one finger, that tip's force increases. The joint torques show
+    # the push first.
     by_torque = abs(grasp.torque_residual[0] - grasp.torque_residual[1])
     by_torque /= max(mean(grasp.moment_arm), s.law.arm_min)
     imbalance = 0.5 * max(abs(grasp.force[0] - grasp.force[1]), by_torque)
@@ -384,7 +385,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     _update_offset(s, grasp, residual, torque_change)
-    # Friction that decreases or reverses does not count as a load.
+    # If friction decreases or reverses, the change is not a load.
     deviation = residual - s.offset
     increase = residual - s.start_offset
     s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
@@ -392,8 +393,8 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
-    # While the detected load rises from half to all of the load that friction can hide, the
-    # estimate rises from 0 to |L| + hidden.
+    # Joint friction can hide a load of the size `hidden`. While the detected load |L| rises from
+    # half of `hidden` to `hidden`, the estimate rises from 0 to |L| + `hidden`.
     threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
     hidden = s.friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)

@@ -47,28 +47,31 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
-# Maximum distance between a joint and its goal on arrival [rad]. The value is five times the
-# position error that the default joint friction causes at the default servos.stiffness.
+# Maximum distance between a joint and its goal at arrival [rad]: five times the position error that
+# the default joint friction causes at the default servos.stiffness.
 _ARRIVAL_DISTANCE = 0.03
-# Fraction of the force target. The force noise is 0.3 to 0.6 % (1 σ) with simulated sensors.
+# Tolerance as a fraction of the force target. With simulated sensors, the force noise is 0.3 to 0.6
+# % (1 σ).
 _FORCE_TOLERANCE = 0.03
-# Fraction of the force target: error that joint friction or gear friction may cause. For the
-# default finger, 0.05 N·m corresponds to a tenth of 6 N. The integral term removes this error
-# within seconds.
+# Maximum force error due to joint or gear friction, as a fraction of the force target. With the
+# default finger, a friction of 0.05 N·m corresponds to 10 % of 6 N. The integral term removes this
+# error within seconds.
 _FRICTION_TOLERANCE = 0.1
-# Time after which friction holds a joint that has not reached its goal, or a force within
-# _FRICTION_TOLERANCE [s]. The value is ten times the frictionless settling time of the force.
+# Waiting time [s]: a joint that has not reached its goal by then is held by friction, and so is a
+# force that is still within _FRICTION_TOLERANCE. The value is ten times the settling time of the
+# force without friction.
 _STUCK_TIME = 2.0
 # Time for which the tips must appear to touch each other before the grip counts as empty [s]. The
 # value is longer than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
-# Fraction of the force target. A streamed target may change continuously, so a grip also settles
-# when it follows a setpoint that is within this distance of the target.
+# Tolerance for a streamed force target, as a fraction of the target. A streamed target may change
+# continuously, so a grip also counts as settled when the force follows a setpoint within this
+# tolerance.
 _STREAM_TOLERANCE = 0.25
-# Smaller changes in a streamed setpoint or in the force increase are treated as noise. The units
-# are fractions of the force, and rad (1 σ of the angle).
+# Smaller changes in a streamed setpoint or in the force increase are treated as noise. The first
+# value is a fraction of the force. The second value is the standard deviation of the angle [rad].
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
 
 
@@ -91,7 +94,7 @@ class Armed(ControlState):
 
     mode = Mode.ARMED
     current: float  # current limit [A]
-    following_count: int = 0  # number of remaining ticks during which setpoints follow the joints
+    following_count: int = 0  # remaining ticks during which the setpoints follow the joints
 
 
 @dataclass
@@ -99,7 +102,7 @@ class Travelling(ControlState):
     """The joints move to their setpoint targets: MOVING or RELEASING."""
 
     mode: Mode
-    arrived_for: float = 0.0  # time since the setpoints arrived [s]
+    arrived_for: float = 0.0  # time since the setpoints reached their targets [s]
 
 
 @dataclass
@@ -107,7 +110,7 @@ class GraspCommand:
     """Values commanded for a grasp, stored until the grasp has settled."""
 
     force: float  # [N]
-    is_streamed: bool  # True if the force is a streamed setpoint
+    is_streamed: bool  # True if the client streams the force
     angle: float | None = None  # target after the grasp has settled [rad]
 
 
@@ -117,9 +120,9 @@ class Approaching(ControlState):
 
     mode = Mode.GRASPING
     command: GraspCommand
-    touching: set[int] = field(default_factory=set)  # fingers
+    touching: set[int] = field(default_factory=set)  # indices of the fingers in contact
     arrived_for: float = 0.0  # time since the setpoints reached the joint limits [s]
-    empty_for: float = 0.0  # duration of apparent tip-to-tip contact [s]
+    empty_for: float = 0.0  # time for which the tips have appeared to touch each other [s]
 
 
 @dataclass
@@ -128,7 +131,7 @@ class GripHistory:
 
     lost_for: float = 0.0  # [s]
     lost_current: float = 0.0  # current limit while a contact is missing [A]
-    empty_for: float = 0.0  # duration of apparent tip-to-tip contact [s]
+    empty_for: float = 0.0  # time for which the tips have appeared to touch each other [s]
     settled_force: float = math.nan  # commanded force when the grip last settled [N]
     settled_angle: float = math.nan  # commanded angle when the grip last settled [rad]
     increase_reported: bool = False
@@ -180,10 +183,10 @@ class Control:
         self.grip = Grip(settings, self.fingers.indices, grasp)
         self.state: ControlState = Off()
         self.events: list[Event] = []
-        # A contact may be missing as long as frames may be missing [s].
+        # The contact may be lost for as long as frames may be missing [s].
         self._contact_loss_time = settings.safety.frame_age_fault / settings.tactile.rate
-        # Force and angle have settled when they have stayed at their targets for the time over
-        # which their setpoints are averaged, including the second average [s].
+        # Force and angle count as settled when they have stayed at their targets for the averaging
+        # time of their setpoints. The setpoints are averaged twice [s].
         self._settling_time = 2.0 * settings.control.smooth_time
 
     @property
@@ -224,8 +227,8 @@ class Control:
 
     def arm(self) -> None:
         """Switch torque on and hold the joints at their positions."""
-        # Torque is switched on at the end of the first tick, so the joints may move until the
-        # second tick.
+        # The servos switch torque on at the end of the first tick, so the joints may still move
+        # until the second tick.
         self._enter(Armed(self._settings.safety.current_move, following_count=2))
 
     def disarm(self) -> None:
@@ -336,7 +339,7 @@ class Control:
         goal.force = goal.angle = math.nan
         if not goal.valid:
             return
-        current = self._current()  # current for the state before any transition on this tick
+        current = self._current()  # current limit of the state before any transition on this tick
         if isinstance(self.state, Armed) and self.state.following_count:
             self.state.following_count -= 1
             self.fingers.hold_here()
@@ -344,7 +347,7 @@ class Control:
             self._travel(self.state, dt)
         elif isinstance(self.state, Approaching):
             self._approach(self.state, dt)
-        if isinstance(self.state, Gripping):  # This also applies if the grip began on this tick.
+        if isinstance(self.state, Gripping):  # The grip may have begun on this tick.
             self._step_grip(self.state, dt, goal)
         else:
             self.fingers.follow_setpoints(goal, current)
@@ -368,11 +371,11 @@ class Control:
             return state.current
         if not isinstance(state, Approaching):
             return self._settings.safety.current_move
-        # The tip must not exceed the commanded force if it reaches the object before the sensor
-        # detects contact.
+        # The tip may reach the object before the sensor detects contact. Limit the current so that
+        # the tip force can't exceed the commanded force.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
-        # If this torque does not move a joint in free motion, the friction of the joint exceeds the
-        # setting. `free_torque` is the measured friction torque.
+        # If the joint does not move under this torque, the joint friction is larger than the
+        # setting. Therefore also use `free_torque`, the friction torque measured in free motion.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 
@@ -429,7 +432,7 @@ class Control:
         if not fingers.in_contact:
             self._handle_contact_loss(history, dt, goal)
             return
-        if history.lost_for:  # Joint motion is not a load while the force increases again.
+        if history.lost_for:  # While the force increases again, joint motion is not due to a load.
             history.lost_for = state.reached_for = 0.0
             if isinstance(state, Settled):
                 self._enter(state := Changing(history))
@@ -444,7 +447,7 @@ class Control:
         """Hold the joints while a contact is missing; end the grip if it remains missing."""
         if not history.lost_for:
             self.fingers.hold_here()
-            # A sensor failure must not increase the force with which the joints press.
+            # A sensor failure must not cause the joints to press harder.
             pressed = max(goal.current[index] for index in self.fingers.indices)
             history.lost_current = min(pressed, self._settings.safety.current_move)
         self.fingers.follow_setpoints(goal, history.lost_current)

@@ -15,10 +15,10 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
 
-Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, subsequent pause [s]
+Step = tuple[dict[str, Any], Mode, float]  # command, final mode and subsequent pause [s]
 
 _STEP_TIMEOUT = 10.0  # s
-_RESTART_PAUSE = 2.0  # pause before a restart, so that the user can read the message [s]
+_RESTART_PAUSE = 2.0  # pause before a restart that gives the user time to read the message [s]
 
 
 class TaskEnded(SoftfingerError):

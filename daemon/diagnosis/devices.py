@@ -63,7 +63,7 @@ def check_servos(settings: Settings) -> list[Finding]:
     servos = settings.servos
     model = by_name(servos.model)
     try:
-        # Low-latency mode is not requested, because it would change the adapter's settings.
+        # Do not request low-latency mode, because the request would change the adapter's settings.
         with open_line(servos.port, servos.baud, low_latency=False) as line:
             _wait_for(line, settings)
             found = examine(line, settings, model)

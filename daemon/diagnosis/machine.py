@@ -20,7 +20,7 @@ from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_fo
 _MEMORY = 1 << 30  # upper bound on the daemon's mapped memory [bytes]
 _WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
-# Minimum plausible Unix time [s]. An earlier time means that the clock was never set.
+# Minimum plausible Unix time [s]. If the time is earlier, the clock has never been set.
 _CLOCK_MIN = 1_700_000_000.0
 
 

@@ -16,8 +16,8 @@ STEP_CPU_TIME_MAX = 3.0  # CPU time limit of one step [s], after which the kerne
 # Elapsed time limit of one step [s]. This limit is higher than the CPU limit, because the process
 # may have to wait on a busy machine.
 STEP_TIME_MAX = 30.0
-# Longest poll interval [s]. After a longer interval, new requests are stamped with the time of the
-# previous poll.
+# Longest poll interval [s]. After a longer interval, the gateway stamps new requests with the time
+# of the previous poll.
 POLL_GAP_MAX = 0.05
 
 # Connections
@@ -26,14 +26,14 @@ SOCKET_QUEUE_LENGTH = 64  # number of requests, replies or subscriptions queued 
 PART_SIZE_RATIO = 4  # size limit of one message part, as a multiple of commands.max_bytes
 PART_COUNT_MAX = 16  # maximum number of parts in a request, including routing frame and envelope
 ENVELOPE_SIZE_MAX = 1024  # maximum combined size of routing frame and envelope [bytes]
-HANDSHAKES_PER_TURN = 64  # completed before the gateway serves the loop and the stream
+HANDSHAKES_PER_TURN = 64  # handshakes completed before the loop and the stream are served
 SUBSCRIPTION_SIZE_MAX = 1024  # maximum size [bytes]; handshake messages are longer than topics
 SUBSCRIPTIONS_PER_TURN = 64
 REPEAT_INTERVAL = 0.1  # minimum interval between message repetitions for late subscribers [s]
 KEY_CHECK_INTERVAL = 0.5  # interval between key folder checks [s]
 
-# Stops
-# Time after a stop in which all requests except status are refused [s]. A flood extends this time.
+# Time after a stop during which all requests except status are refused [s]. A flood of requests
+# extends this time.
 REFUSAL_TIME = 0.02
 ANSWER_DELAY_MAX = 0.25  # maximum time for which replies are held back after a stop [s]
 
@@ -46,12 +46,12 @@ CLIENT_QUEUE_LENGTH = 64  # queued requests per client
 TOTAL_QUEUE_LENGTH = 2048  # queued requests of all clients
 TOTAL_RATE = 2000.0  # requests per second, all clients combined
 CLIENT_RATE_MIN = 2.0  # requests per second, guaranteed to each client
-RECOVERY_TIME = 0.05  # pause after which a client that exceeded its rate is accepted again [s]
+RECOVERY_TIME = 0.05  # pause after which a client over its rate limit is accepted again [s]
 
 # Steps
 STEP_WAIT_MAX = 0.01  # longest wait in a step [s]
 TURN_TIME = 0.004  # time limit for reading requests in a step [s]
-LINGER_TIME = 0.2  # time limit for sending queued messages after the loop has ended [s]
+LINGER_TIME = 0.2  # time limit for sending queued messages once the loop has ended [s]
 
 READY = "ready"  # printed by the process once its sockets are bound
 

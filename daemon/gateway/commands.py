@@ -46,7 +46,7 @@ class Client:
     def __init__(self) -> None:
         self.waiting: deque[Ask] = deque()
         self.urgent = False  # True while an urgent request awaits its reply
-        self._behind = False  # True after the client has exceeded the rate, until it pauses
+        self._behind = False  # True from the time a client exceeds its rate until it pauses
         self._tokens = math.inf
         self.last = -math.inf  # time of the last request
 
@@ -81,14 +81,15 @@ class CommandEndpoint:
         self.stops = 0  # stop count stamped on new requests
         self._fence = 0  # current stop count
         self._last_poll = clock()
-        # Time of the last poll before a gap, or infinity if no requests from the gap are unread.
+        # Time of the last poll before a gap, or infinity once all requests from the gap have been
+        # read.
         self._dated = math.inf
         self._unread_max = 0  # maximum number of requests from the gap that are still unread
         self._since = 0.0  # time of the last stop, gap or check for older requests
         self._arrived = 0  # number of requests since `_since`, except status
         self._replies: deque[list[bytes]] = deque()  # replies that have not been sent yet
-        # Time for which replies have been held back [s]. A step adds at most REFUSAL_TIME, so that
-        # a stall of the process has little effect.
+        # Time for which replies have been held back [s]. One step adds at most REFUSAL_TIME, so a
+        # stall of the process has little effect.
         self._held_for = 0.0
         # Clients that sent a request in the last second, in the order of their last requests.
         self._clients: dict[bytes, Client] = {}
@@ -121,8 +122,8 @@ class CommandEndpoint:
             if parts:
                 self._take([part.bytes for part in parts], self._sockets.name(parts[-1]), now)
                 continue
-            # The socket is empty, but the libzmq thread may still deliver older requests. Older
-            # requests count as read only after some time with few new requests.
+            # The socket is empty, but the libzmq thread may still deliver older requests. They
+            # count as read only after a period with few new requests.
             if now - self._since > bounds.REFUSAL_TIME:
                 if self._arrived <= bounds.TOTAL_RATE * bounds.REFUSAL_TIME:
                     self.stops, self._dated = self._fence, math.inf

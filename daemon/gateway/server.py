@@ -33,7 +33,7 @@ from softfinger.daemon.wire.loop_link import (
     machine_time,
 )
 
-_TIMER_INTERVAL = 0.5  # interval between resets of the timers that end a stalled process [s]
+_TIMER_INTERVAL = 0.5  # interval at which the timers that end a stalled process are reset [s]
 
 
 class Server:
@@ -95,7 +95,7 @@ def main(words: list[str]) -> int:
     Returns 1 if the sockets could not be bound or if all clients must reconnect, otherwise 0.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # The loop's last messages must still be sent.
+        signal.signal(number, signal.SIG_IGN)  # The loop's last messages still have to be sent.
     channel = Channel(socket.socket(fileno=int(words[0])))
     _limit_resources()
     try:
@@ -117,7 +117,7 @@ def main(words: list[str]) -> int:
 
 
 def _tell_supervisor(text: str) -> None:
-    with contextlib.suppress(BrokenPipeError):  # The daemon has ended.
+    with contextlib.suppress(BrokenPipeError):  # The daemon has exited.
         os.write(sys.stdout.fileno(), f"{text}\n".encode())
 
 

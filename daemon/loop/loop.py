@@ -94,7 +94,7 @@ class Loop:
             self.emit,
             command_age_max(settings, clock.pauses_when_late),
         )
-        self._after_opening: Breach | None = None  # fault to latch once the hand is open
+        self._after_opening: Breach | None = None  # fault that is latched once the hand is open
         self.statistics = Statistics()
         self._lateness = Lateness(settings, self.state.timing, clock.pauses_when_late)
         self._publishing = None
@@ -105,9 +105,9 @@ class Loop:
         self._ending = False
         self._stopping = False
         self._began = -math.inf  # start of the current tick, machine time [s]
-        self._commanded = False  # True if a command that may be slow was executed on this tick
+        self._commanded = False  # True if a potentially slow command was executed on this tick
 
-    # The following methods may be called from outside the tick, including from signal handlers.
+    # Other threads and signal handlers may call the following methods.
 
     def end(self) -> None:
         """Leave `run` after this tick and turn torque off."""
@@ -353,7 +353,7 @@ class Loop:
             self._on_event(level, kind, text)
 
     def _with_cause(self, name: str, text: str) -> str:
-        # A command may have occupied the bus for a long time, even if the machine is not busy.
+        # A command may have kept the bus busy for a long time, even if the machine is idle.
         at_work = 0.0 if self._commanded else self._clock.host() - self._began
         return self._lateness.with_cause(name, text, at_work)
 

@@ -180,7 +180,7 @@ class _Commands:
             try:
                 handler(request, 0.0)
             except Refused:
-                pass  # The comparison of the states will reveal the difference.
+                pass  # The state comparison will reveal the difference.
         self.waiting = []
 
     def close(self) -> None:

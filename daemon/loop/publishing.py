@@ -20,7 +20,7 @@ _STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
     bit, (schema.STATE, schema.TACTILE, schema.STATS, schema.INPUT, schema.TRUTH)
 )
 _STATS_RATE = 1.0  # Hz
-_STATS_PHASE = 3  # number of ticks from state to statistics, so that no tick publishes both
+_STATS_PHASE = 3  # ticks from state to statistics, so that no tick publishes both
 
 
 def every(rate: float, wanted: float) -> int:
@@ -60,9 +60,9 @@ class Publishing:
         self.truth: Truth | None = None  # for simulated hands only
         self._numbers = [0, 0]  # number of published frames per finger
         self._seen: list[Frame | None] = [None, None]  # newest frame per finger
-        self._published = [-1, -1]  # number of the last published group of n frames, per finger
+        self._published = [-1, -1]  # number of the last published group of frames, per finger
         self._states = self._maps = 0  # numbers of published messages
-        # Time [s] and counts when the rates were last published.
+        # Time [s] and counts at the last publication of the rates.
         self._counted: tuple[float, ...] = (0.0,) * 6
 
     def __call__(self, state: State) -> None:
@@ -73,7 +73,7 @@ class Publishing:
             for perception in self._perceptions:
                 if perception.frame is not self._seen[perception.finger]:
                     self._frame(state, perception)
-        if wanted & _INPUT:  # Inputs must be published after the frames that they refer to.
+        if wanted & _INPUT:  # Publish inputs after the frames that they refer to.
             frames: list[Frame | None] = [None, None]
             for perception in self._perceptions:
                 frames[perception.finger] = perception.frame

@@ -27,7 +27,7 @@ _KEEP_ALIVE_FRACTION = 0.25  # keep-alive interval as a fraction of the watchdog
 _NEVER = float("inf")
 _LATENCY_DEVICE = "/dev/cpu_dma_latency"
 
-# Shell commands that grant the requested permissions to a user.
+# Shell commands that grant a user the requested permissions.
 _LIMITS_FILE = "/etc/security/limits.d/softfinger.conf"
 _UDEV_RULE_FILE = "/etc/udev/rules.d/99-softfinger.rules"
 _LATENCY_UDEV_RULE = f'KERNEL=="cpu_dma_latency", GROUP="{serial_group()}", MODE="0660"'
@@ -63,7 +63,7 @@ class RealTime:
 
     def __init__(self, settings: Settings) -> None:
         self.granted: list[str] = []
-        self.refused: list[str] = []  # refused measures, each with its consequence and remedy
+        self.refused: list[str] = []  # rejected measures, each with its consequence and remedy
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
@@ -95,7 +95,7 @@ class RealTime:
             try:
                 self._undo.pop()()
             except OSError:
-                pass  # The thread may have ended.
+                pass  # The thread may have exited.
 
     def __enter__(self) -> RealTime:
         return self
@@ -222,7 +222,7 @@ class RealTime:
         if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
             why = os.strerror(ctypes.get_errno())
             self._refused(f"timer slack denied ({why}): wake-ups may be 50 µs late")
-        else:  # A value of 0 restores the thread's initial slack.
+        else:  # A value of 0 restores the initial slack.
             undo = partial(libc.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
             self._granted(f"timer slack {nanoseconds} ns", undo)
 

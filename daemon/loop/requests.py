@@ -344,7 +344,8 @@ class Requests:
         if self._torque.servos is None or not silent:
             return
         if self._torque.pending and not state.read_error:
-            # The port works. Connecting now would end the bus silence that makes the servos stop.
+            # The port works. A connection attempt would break the bus silence that makes the servos
+            # stop.
             return
         try:
             self._torque.reconnect()

@@ -41,7 +41,7 @@ LATENESS_MIN = 0.05  # minimum delay that is reported [s]
 # previous report.
 REPORT_INTERVAL = 60.0
 ATTRIBUTION_TIME = 0.25  # time after a late tick during which faults may be attributed to it [s]
-# Limits that a single late tick can violate.
+# Limits that a single late tick can exceed.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
 Event = tuple[str, str, str]
@@ -117,7 +117,7 @@ class Lateness:
         self._period = 1.0 / settings.loop.rate
         self._waits = waits
         self._sum = 0.0  # total tick delay, or total time for which the hand has waited [s]
-        self._reported = (0.0, -math.inf)  # total delay and time of the last report [s]
+        self._reported = (0.0, -math.inf)  # total delay and time at the last report [s]
         self._busy_until = -math.inf
 
     def look(self, t: float, own_doing: bool) -> Event | None:

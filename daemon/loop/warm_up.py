@@ -62,7 +62,7 @@ class Part(NamedTuple):
     name: str
     kernels: int  # approximate number of kernels, for the progress bar
     run: Callable[[WantedScene], None]
-    after: str = ""  # name of a part that must be built first
+    after: str = ""  # name of a part that must be compiled first
 
 
 def parts(settings: Settings) -> list[Part]:

@@ -71,7 +71,7 @@ def make_models(
             calibration = calibration_for(settings, finger)
         if measured:
             if name not in settings.scene.fingers:
-                continue  # This finger gets the other finger's model below.
+                continue  # The loop below gives this finger the other finger's model.
             material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
             table = make_table(settings, material, tip)
         elif calibration is not None and calibration.modulus is not None:
@@ -104,7 +104,8 @@ def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
     """Return a finger's prior from `calibrate scales` or, without one, from the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales
-        # The gain changes with temperature and load, so it remains uncertain after calibration.
+        # The gain varies with temperature and load, so it remains uncertain even after a
+        # calibration.
         gain = found.gain[0], max(found.gain[1], settings.tactile.gain_error)
         return Prior(found.modulus, gain, found.torque)
     error = settings.material.modulus_error or MODULUS_ERROR
@@ -180,7 +181,7 @@ def make_estimator(
         converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
         alive &= converter.live
         saturation, quantum = converter.saturation, converter.quantum
-        # The estimator subtracts 0.5 frame units from a threshold.
+        # The estimator itself subtracts half a frame unit from the threshold.
         threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0
     if settings.tip.physics == "measured":
         return MeasuredEstimator(

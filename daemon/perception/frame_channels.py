@@ -57,18 +57,20 @@ from softfinger.kinematics.hand.grasp_state import FloatPair, total_tilt
 FloatArray = NDArray[np.float64]
 
 D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
-# rad, or fraction of the tip radius: smallest shift of a pressure image that is a fault. A shift by
-# this fraction of the radius changes the angle by 0.06 rad; correct frames are within 0.04 rad.
+# Smallest shift of a pressure image that counts as a fault [rad, or fraction of the tip radius]. A
+# shift by 0.06 radii changes the measured angle by 0.06 rad. The error of correct frames is at most
+# 0.04 rad.
 IMAGE_SHIFT_MIN = 0.06
 _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
-_NORMAL_FORCE_MIN = 1.0  # N per tip; below this, an object may rock between the tips
+_NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; below it, an object may rock
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
-# A footprint that grows during the response time of the cells looks wider and flatter. These are
-# the relative changes per var(d)/d², from fitting a paraboloid to a mean of paraboloids.
+# A footprint that grows within the response time of the cells appears wider and flatter. The first
+# two values are the relative changes divided by var(d)/d². They result from fitting a paraboloid to
+# the mean of several paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
-_SLOPE_SMOOTHING = 0.9  # low-pass coefficient of ∂ ln F/∂d, applied once per frame
+_SLOPE_SMOOTHING = 0.9  # low-pass coefficient for ∂ ln F/∂d, applied on every frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
-_FIRST_D_ERROR = 0.5  # relative standard deviation of d at first contact
+_FIRST_D_ERROR = 0.5  # relative standard deviation of d in the first frames of a contact
 
 
 class FrameContact(NamedTuple):
@@ -111,7 +113,7 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
     fraction = 0.0
     for back in range(size):
         row = (newest - back) % size
-        if history[row].t == -math.inf:  # The frame is older than the first reading.
+        if history[row].t == -math.inf:  # No joint reading is as old as the frame.
             before = after
             break
         before = row
@@ -228,8 +230,7 @@ def update(
     if is_new_contact:
         tip.touch_time = h.t
         _begin_contact(h, finger, sense, face + scan.rotation)
-    # While the cells still respond to the touch, they show motion that precedes the contact
-    # history.
+    # Shortly after the touch, the cells still show motion from before the contact.
     cells_respond = h.t - tip.touch_time < h.response
     if is_new_contact or cells_respond:
         reset(h, D + finger, d + scan.d, (_FIRST_D_ERROR * d) ** 2)
@@ -251,7 +252,7 @@ def update(
     tip.shear = found.shear
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
-    if tip.gain_is_fixed:  # GAIN is a state, so its part of the error is not shared.
+    if tip.gain_is_fixed:  # The filter estimates GAIN, so remove the gain's part of the error.
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = not cells_respond
@@ -339,7 +340,7 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
         if measured > 0.0:
             h.mean[FRICTION] += 0.5 * (measured - h.prior_mean[FRICTION])
             h.covariance[FRICTION, FRICTION] *= 0.5
-    # A load may already act on the object.
+    # A load may already be acting on the object.
     h.covariance[FRICTION, FRICTION] += TORQUE_NOISE * TORQUE_NOISE
 
 
@@ -410,7 +411,7 @@ def _is_rejected(
     d = grasp.d_jump[finger]
     angle_jumps = abs(angle) > max(2.0 * IMAGE_SHIFT_MIN, OUTLIER_GATE * angle_std)
     d_jumps = abs(d) > max(IMAGE_SHIFT_MIN * h.radius, OUTLIER_GATE * d_std)
-    # Two velocity units per joint
+    # threshold: two velocity units per joint
     joints_move = abs(tip.speed) + abs(h.tip[other].speed) > 4.0 * h.velocity_unit
     continues = tip.rejected_count > 0 and abs(angle - tip.last_angle_jump) > IMAGE_SHIFT_MIN
     tip.last_angle_jump = angle

@@ -57,7 +57,7 @@ from softfinger.kinematics.hand.grasp_state import (
 
 FloatArray = NDArray[np.float64]
 
-_SUPPORT_FRICTION = 0.4  # friction between object and table [N]
+_SUPPORT_FRICTION = 0.4  # friction force between object and table [N]
 _D_BIAS_MIN = 0.1  # fraction of d
 
 
@@ -71,7 +71,7 @@ class TipResult(NamedTuple):
     d_std: float
     theta_std: float
     force_std: float
-    inside: bool  # True if d and θ are within the contact table
+    inside: bool  # True if d and θ lie within the contact table
 
 
 class GraspResult(NamedTuple):
@@ -122,14 +122,14 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
     h.torque_max = max(h.torque_max, torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
-    if h.closing_speed > h.velocity_unit:  # Friction opposes the motion.
+    if h.closing_speed > h.velocity_unit:  # In a closing joint, friction opposes the motion.
         innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
-        # After a torque decrease, the gears may hold any part of the decrease.
+        # When the torque decreases, gear friction may hold any part of the decrease.
         held_torque = min(h.torque_max - torque, h.load_held * torque)
         variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
         if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
-            h.covariance[FRICTION, FRICTION] += innovation * innovation  # A load has been removed.
+            h.covariance[FRICTION, FRICTION] += innovation * innovation  # The load has disappeared.
         correct(h, TORQUES, innovation, variance, GATE)
     h.slopes[:] = 0.0
     normal = h.grasp.normal

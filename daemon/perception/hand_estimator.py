@@ -43,7 +43,7 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
 
-# Standard deviations of the settings.
+# Standard deviations of two settings
 _TAPER_ERROR = 0.1  # `object.taper` [rad]
 _LATENCY_ERROR = 0.03  # `tactile.latency` [s]
 _GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
@@ -107,9 +107,9 @@ class HandEstimator:
             _tilt_moment_ratio(table, state.radius) for table in tables
         )
         self._joints_read = False
-        self._factors_outdated = True  # True if a frame arrived after the last write
+        self._factors_outdated = True  # True if frames have arrived since the last write
         self._in_contact = [False, False]
-        self._invalid = [Invalid.NO_FRAME] * 2  # reason why the newest estimate is not used
+        self._invalid = [Invalid.NO_FRAME] * 2  # why each finger's newest estimate is not used
 
     def _set_prior(self, settings: Settings, priors: tuple[Prior, Prior]) -> None:
         """Set the priors and reset the state to them."""
@@ -174,8 +174,8 @@ class HandEstimator:
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
-            return  # The contact is still predicted from joint motion, but its age increases.
-        # Without a joint reading, the estimate is based on the frame alone.
+            return  # Prediction from joint motion continues, and the age of the contact increases.
+        # Before the first joint reading, use the frame alone.
         in_contact = estimate.contact and self._joints_read
         if in_contact and self._in_contact[finger] and not has_changed:
             contact.t_valid = frame.t_arrival
@@ -203,7 +203,7 @@ class HandEstimator:
         if not in_contact:
             tip = self._state.tip[finger]
             if tip.in_contact:
-                self.grasp.free_torque[finger] = 0.0  # measured again on the next approach
+                self.grasp.free_torque[finger] = 0.0  # to be measured on the next approach
                 tip.free_torque_max[:] = 0.0
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0

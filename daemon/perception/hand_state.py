@@ -38,33 +38,33 @@ FloatArray = NDArray[np.float64]
 D, ENCODER, D_BIAS, ANGLE_BIAS, MODULUS, GAIN, TORQUE = range(0, 14, 2)
 ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 
-# Measurement channels, in the order of `grasp.CHANNELS`. The first four are pairs.
+# Measurement channels in the order of `grasp.CHANNELS`; the first four exist once per tip.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-HISTORY_TIME = 0.5  # duration of stored joint motion [s]; older frames are treated as this old
+HISTORY_TIME = 0.5  # time span of the stored joint motion [s]; older frames are treated as this old
 LAW_POINTS = 17  # nodes in d from 0 to the radius
 
-GATE = 3.0  # number of standard deviations above which an innovation has a reduced effect
-OUTLIER_GATE = 5.0  # number of standard deviations above which a deviation is a fault
-MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
+GATE = 3.0  # Innovations beyond this number of standard deviations have a reduced effect.
+OUTLIER_GATE = 5.0  # Deviations beyond this number of standard deviations count as faults.
+MODEL_ERROR = 0.05  # relative error of predicted motion and of normal forces
 MODEL_ERROR_TIME = 0.1  # correlation time of these errors [s]
-TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with place and time
+TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with position and time
 
-# Random walks during a grip, per √s
-_WALK_CLOSING = 2e-5  # walk of d1 + d2 [m]; small because the object width is constant
-_WALK_SIDEWAYS = 3e-4  # walk of d1 − d2 [m]; the object can move between the tips
-_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # walk of d1 − d2 if frames do not measure d independently [m]
-_WALK_LOOSE_D = 5e-3  # walk of d in a contact without a grip [m]
-_WALK_LOOSE_ANGLE = 2e-2  # walk of the angle in a contact without a grip [rad]
-_WALK_ANGLE = 2e-4  # walk of the angle due to tip creep [rad]
+# Random walks during a grip (per √s)
+_WALK_CLOSING = 2e-5  # random walk of d1 + d2 [m]; small because the object has a constant width
+_WALK_SIDEWAYS = 3e-4  # random walk of d1 − d2 [m]; the object can move between the tips
+_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # random walk of d1 − d2 if frames measure only force times gain
+_WALK_LOOSE_D = 5e-3  # random walk of d for a contact without a grip [m]
+_WALK_LOOSE_ANGLE = 2e-2  # random walk of the angle for a contact without a grip [rad]
+_WALK_ANGLE = 2e-4  # random walk of the angle due to tip creep [rad]
 _WALK_D_BIAS = 1e-4  # zero drift during sensor warm-up [m]
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
-_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only the product of force and gain
-_VELOCITY_TIME = 0.02  # correlation time of velocity rounding [s]
-_VARIANCE_MIN = 1e-6  # minimum ratio of the variance after a measurement to the variance before it
-_CURRENT_ERROR = 0.25  # allowed relative deviation of a current from its goal
-_CURRENT_NOISE = 0.02  # additional allowed deviation of a current [A]
+_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times gain
+_VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
+_VARIANCE_MIN = 1e-6  # smallest ratio by which one measurement may reduce a variance
+_CURRENT_ERROR = 0.25  # tolerated deviation of a current from its goal, as a fraction of the goal
+_CURRENT_NOISE = 0.02  # additional tolerance for this deviation [A]
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
 
 
@@ -72,17 +72,17 @@ class TrackedTip(Record):
     """Per-finger data that is not part of the state vector."""
 
     in_contact: bool
-    touch_time: float  # start of the contact [s]
-    has_new_frame: bool  # True if a frame has arrived since the last torque update
-    gain_is_fixed: bool  # True if the frames measure force times gain but not displacement
-    rejected_count: int  # consecutive rejected frames
+    touch_time: float  # time at which the contact began [s]
+    has_new_frame: bool  # True if a frame has arrived since the last update by torques
+    gain_is_fixed: bool  # True if the frames measure force times gain instead of displacement
+    rejected_count: int  # number of consecutive rejected frames
     last_angle_jump: float  # `grasp.angle_jump` of the previous frame [rad]
     current_off_time: float  # time for which the current has differed from its goal [s]
     tilt_y: float  # [rad]
-    shear: float  # shear along the face in the hand plane, from the newest frame of a solid tip [N]
+    shear: float  # shear along the face in the hand plane, measured by a solid tip [N]
     log_slope: float  # ∂ ln F/∂d, low-pass filtered [1/m]
-    d_innovation: float  # innovation of the newest frame [m]
-    shared_variance: Pair  # variance of d and θ that is common to all frames
+    d_innovation: float  # innovation of d in the newest frame [m]
+    shared_variance: Pair  # variances of d and θ due to errors common to all frames
     q: float  # tracked joint angle [rad]
     encoder: float  # last encoder reading [rad]
     speed: float  # joint speed [rad/s]
@@ -90,8 +90,8 @@ class TrackedTip(Record):
     free_torque: float  # average torque without contact [N·m]
     free_torque_max: Pair  # maxima in the current and in the previous _TOUCH_DELAY window
     window_start: float  # [s]
-    travel: Pair  # integrated predicted motion of d [m] and of the joint [rad]
-    law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F due to table and law
+    travel: Pair  # accumulated predicted motion of d [m] and of the joint [rad]
+    law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F
     relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered long-term forces [N]
     relaxation: float  # relaxation factor ρ, the ratio of tip force to long-term force
 
@@ -114,7 +114,7 @@ class HandFilter(Record):
     covariance: Annotated[FloatArray, STATES, STATES]
     prior_mean: Annotated[FloatArray, STATES]  # state means before a contact
     prior_variance: Annotated[FloatArray, STATES]  # state variances before a contact
-    slopes: Annotated[FloatArray, STATES]  # measurement row H, which is 0 between updates
+    slopes: Annotated[FloatArray, STATES]  # row of the measurement matrix, zero between updates
     scratch: Annotated[FloatArray, STATES]
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
@@ -124,24 +124,24 @@ class HandFilter(Record):
     velocity_unit: float  # [rad/s]
     latency: float  # `tactile.latency` [s]
     frame_rate: float  # `tactile.rate` [Hz]
-    frame_age_max: float  # time for which a channel may be missing or wrong [s]
-    rejected_max: float  # number of consecutive frames that may be missing
+    frame_age_max: float  # maximum time for which a channel may be missing or wrong [s]
+    rejected_max: float  # maximum number of consecutive rejected frames
     response: float  # `tactile.response` [s]
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
     relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
     torque_constant: float  # output torque per current of a closing joint [N·m/A]
     inertia: float  # joint inertia [kg·m²]
-    load_held: float  # fraction of the tip moment that the gears hold when torque decreases
+    load_held: float  # fraction of the tip moment that gears hold when the torque decreases
     is_single: bool  # True for a one-finger hand
-    is_gripping: bool  # True if a grip sets the joint torques
+    is_gripping: bool  # True if a grip controls the joint torques
     gain_is_known: bool  # True if `estimator.free_gain` is false
     t: float  # time of the last reading [s]
     newest_row: int  # index of the newest row in the history
-    rotation: float  # integrated predicted rotation [rad]
-    closing_speed: float  # mean speed of both joints, low-pass filtered [rad/s]
-    last_closing_speed: float  # mean closing speed on the previous tick [rad/s]
+    rotation: float  # accumulated predicted rotation [rad]
+    closing_speed: float  # mean closing speed of both joints [rad/s], low-pass filtered
+    last_closing_speed: float  # value of `closing_speed` on the previous tick [rad/s]
     torque_max: float  # maximum mean torque during this grip [N·m]
-    balance_time: float  # time of the last torque and balance update [s]
+    balance_time: float  # time of the last update by torques and force balance [s]
     tip: Annotated[Records[TrackedTip], 2]
     grasp: GraspState
 
@@ -185,7 +185,7 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
             h.mean[i] += gain * innovation
             for j in range(STATES):
                 h.covariance[i, j] -= gain * h.scratch[j]
-        for k in (TORQUE, TORQUE + 1, LATENCY):  # These states are hardly observable.
+        for k in (TORQUE, TORQUE + 1, LATENCY):  # These states are barely observable.
             bound = OUTLIER_GATE * math.sqrt(h.prior_variance[k])
             error = h.mean[k] - h.prior_mean[k]
             h.mean[k] = h.prior_mean[k] + min(max(error, -bound), bound)
@@ -268,7 +268,7 @@ def predict(
         if not tip.in_contact:
             _measure_free_torque(h, k, t, dt, dq[k] - last_speed[k])
     h.t = t
-    if dt > HISTORY_TIME:  # After a pause, the joint angles come from the encoders alone.
+    if dt > HISTORY_TIME:  # After a long pause, use the encoder angles alone.
         dt = 0.0
         for k in range(2):
             h.tip[k].q = h.tip[k].encoder = q[k]
@@ -317,7 +317,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
-    # Before contact, the gap closes at the rate at which d would increase in contact.
+    # Before contact, the gap shrinks at the rate at which d would grow in contact.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:
@@ -336,7 +336,8 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     right.q += step2
     left.travel[1] += step1
     right.travel[1] += step2
-    # An impossible step, for example at a taper of 180°, would stay in the state forever.
+    # An impossible step would corrupt the state permanently. A taper of 180°, for example, leads to
+    # such steps.
     if not abs(d_step1) + abs(d_step2) + abs(rotation) * h.radius < h.radius:
         return
     left.travel[0] += d_step1
@@ -443,11 +444,11 @@ def _encoder_measurement(h: HandFilter, finger: int, q: float, step: float) -> t
     resolution = h.encoder_resolution
     jump = q - tip.encoder
     if abs(jump) > 0.5 * resolution:
-        # The joint has crossed this count edge since the last reading. After a jump of several
-        # counts, the joint angle is only known to within one count.
+        # The joint has crossed an edge between two encoder counts since the last reading. After a
+        # jump of several counts, the joint angle is known only to within one count.
         spread = max(step, 0.05 * resolution) if abs(jump) < 1.5 * resolution else resolution
         return _edge(h, q, jump), spread
-    if abs(q - tip.q) > 0.5 * resolution:  # The tracked angle has left the count.
+    if abs(q - tip.q) > 0.5 * resolution:  # The tracked angle lies outside the measured count.
         return _edge(h, q, q - tip.q), resolution
     if h.covariance[ENCODER + finger, ENCODER + finger] > resolution * resolution / 6.0:
         return q, resolution
@@ -493,7 +494,7 @@ def _relax(h: HandFilter, finger: int, dt: float) -> None:
     """Advance a tip's relaxation (Prony series) by ``dt`` seconds and set its relaxation factor."""
     tip = h.tip[finger]
     lasting = h.grasp.force[finger] / tip.relaxation if tip.in_contact else 0.0
-    if not lasting < math.inf:  # The step is beyond the range of the tip's material law.
+    if not lasting < math.inf:  # The step lies outside the range of the tip's material law.
         lasting = 0.0
     factor = 1.0
     for k in range(3):

@@ -24,10 +24,10 @@ from softfinger.daemon.types import FINGERS, Event, Frame, SensorInfo, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAME_COUNT = 16
-_ZERO_INTERVAL = 8  # number of frames between zero updates; thermal drift takes seconds
-_PRESSURE_STEPS = np.iinfo(np.uint16).max  # quantisation steps of a published pressure
-_STORED_TIME = 2.0  # time for which frames are stored [s]
-_CHANGED_CELLS_MIN = 4  # minimum number of changed cells; noisy cells may repeat by chance
+_ZERO_INTERVAL = 8  # frames between zero updates; thermal drift takes seconds
+_PRESSURE_STEPS = np.iinfo(np.uint16).max  # number of quantisation steps in a published pressure
+_STORED_TIME = 2.0  # time for which frame digests are stored [s]
+_CHANGED_CELLS_MIN = 4  # minimum number of changed cells; a few noisy cells may repeat by chance
 
 
 class Perception:
@@ -40,7 +40,7 @@ class Perception:
         models: tuple[FingerModel, FingerModel],
     ) -> None:
         """Create the perception; ``sensors`` maps finger indices to sensors and may be empty."""
-        self.events: list[Event] = []  # events that the loop publishes and removes
+        self.events: list[Event] = []  # events for the loop, which publishes and removes them
         self.fingers = [
             FingerPerception(sensor, models[finger], settings, self.events)
             for finger, sensor in sorted(sensors.items())
@@ -86,7 +86,7 @@ class RepeatDetector:
         """
         self._enabled = enabled
         self.period = 0  # repetition period in frames, or 0 without repetition
-        self._repeated_count = 0  # number of consecutive frames with this period
+        self._repeated_count = 0  # number of consecutive frames that repeat with this period
         self._fault_count = fault_count
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
         self._last: NDArray[np.uint16] | None = None  # frame
@@ -124,7 +124,7 @@ class FingerPerception:
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
         """Create the perception for one finger; each tare appends an event to ``events``."""
-        full = getattr(sensor, "full_count", None)  # Some recordings specify their own full count.
+        full = getattr(sensor, "full_count", None)  # Some recordings specify their own value.
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
             settings = settings.model_copy(update={"tactile": own})
@@ -137,28 +137,28 @@ class FingerPerception:
         self.frame_count = 0  # number of received frames
         self.has_changed = True  # True if the newest frame is not a repetition
         self.changed_time = 0.0  # arrival time of the last frame that changed [s]
-        # A recording played in a loop repeats its frames.
+        # A recording that plays in a loop repeats its frames.
         self.repeats = RepeatDetector(
             tactile.rate, settings.safety.frame_age_fault, tactile.backend != "replay"
         )
         self.estimate = ContactEstimate()  # estimate from the last valid frame
-        active = getattr(sensor, "live", None)  # Some recordings lack cells.
+        active = getattr(sensor, "live", None)  # Some recordings contain only part of the cells.
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration
         )
         self._full_count = float(tactile.full_count)
-        self._scale = tactile.pascal_per_count  # Pa per unit of reading
-        self._quantum = tactile.pascal_per_count  # Pa per count
+        self._scale = tactile.pascal_per_count  # pressure per unit of `_readings` [Pa]
+        self._quantum = tactile.pascal_per_count  # pressure per sensor count [Pa]
         self._converter: Converter | None = None
         if calibration is not None:
             self._converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
             self._scale = 1.0
             self._quantum = self._converter.quantum
-        self._readings: NDArray[Any] | None = None  # newest frame in counts above zero or in Pa
+        self._readings: NDArray[Any] | None = None  # newest frame [Pa or counts]
         self._publishes_pressure = settings.stream.tactile_unit == "Pa"
         self.info = self._info(settings, model)
         self._events = events
-        self._zero: NDArray[np.uint16] | None = None  # zero offset, used without a converter
+        self._zero: NDArray[np.uint16] | None = None  # zero offset if there is no converter
         self._live = np.ones(model.grid.shape, np.bool_) if active is None else active
         self._unloaded = UnloadedCells(model.grid, settings.tip.radius, self._live)
         self._noise = tactile.noise  # cell noise from the settings [Pa]
@@ -224,7 +224,7 @@ class FingerPerception:
             return self.frame.data
         if self._converter is None:
             return self._readings
-        # If the zero offset is below its calibrated value, a cell reading may exceed the scale.
+        # A zero offset below its calibrated value may push a reading beyond the scale.
         steps = np.minimum(self._readings * (1.0 / self.info.scale), _PRESSURE_STEPS)
         return np.rint(steps).astype(np.uint16)
 
@@ -254,7 +254,7 @@ class FingerPerception:
             return
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
-        if not np.median(ends) > 0.0:  # With such a zero offset, no contact could be measured.
+        if not np.median(ends) > 0.0:  # No contact could be measured with this zero offset.
             text = f"the {side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))
             return

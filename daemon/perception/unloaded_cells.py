@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_RIM_DISTANCE = 2.0  # distance from the tip rim above which a cell is unloaded, in pitches
-_CELL_COUNT_MIN = 50  # minimum number of cells for estimating zero shift and noise
+_RIM_DISTANCE = 2.0  # distance from the tip rim beyond which a cell is unloaded, in pitches
+_CELL_COUNT_MIN = 50  # number of cells required to estimate the zero shift and the noise
 _AVERAGED_FRAME_COUNT = 8  # time constant of the noise average, in calls of `update`
-_CLIPPED_FRACTION = 0.25  # fraction of cells at 0 above which the noise counts as clipped
-_CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping
+_CLIPPED_FRACTION = 0.25  # fraction of cells reading 0 above which the noise counts as clipped
+_CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping at 0
 
 
 class UnloadedCells:
@@ -39,9 +39,9 @@ class UnloadedCells:
         self._last_readings: NDArray[np.float64] | None = None  # last readings of the live cells
         self._squared_changes: NDArray[np.float64] | None = None  # running average
         self._zero_fraction = 0.0  # fraction of the live cells that read 0
-        self._reference: float | None = None  # median of the unloaded cells at the tare
+        self._reference: float | None = None  # median of the unloaded cells at the last tare
         self._variance: float | None = None
-        self.zero_shift = 0  # increase in zero offset since the tare [counts]
+        self.zero_shift = 0  # change in zero offset since the tare [counts]
 
     @property
     def noise(self) -> float:
@@ -77,9 +77,9 @@ class UnloadedCells:
         if self._reference is None:
             self._reference = level
         self.zero_shift = round(level - self._reference)
-        # Use only readings above the median, since readings below the median may be clipped. Limit
-        # the deviation to three standard deviations, since some cells may be loaded. Subtract the
-        # quantisation error (1/12), which the error budget adds separately.
+        # Readings below the median may be clipped, so use only readings above it. Some cells may be
+        # loaded, so limit each deviation to three standard deviations. The error budget adds the
+        # quantisation error separately, so subtract its variance (1/12).
         above = np.maximum(read - level, 0.0)
         deviation_max = 3.0 * max(self.noise, 1.0) if self._variance is not None else math.inf
         square = 2.0 * float(np.square(np.minimum(above, deviation_max)).mean()) - 1.0 / 12.0

@@ -29,8 +29,8 @@ _PROFILES = Path(softfinger.__file__).parent / "config"
 _FILE_SIZE_MAX = 256 << 10
 _DEPTH_MAX = 8  # maximum nesting depth of tables and arrays
 _ERROR_COUNT_MAX = 20  # maximum number of errors reported per load
-# Pattern for dotted keys with 16 or more parts. tomllib needs minutes for keys with thousands of
-# parts.
+# Pattern for dotted keys with 16 or more parts. tomllib takes minutes to parse keys with thousands
+# of parts.
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
 _WORD = re.compile(r"\w+")
 _MESSAGE_START = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
@@ -224,7 +224,7 @@ def _change(data: dict[str, Any], change: str) -> str:
     try:
         value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
-        value = text.strip()  # The shell has removed the quotes of this string.
+        value = text.strip()  # The shell has removed the string's quotes.
     held = data
     for section in sections:
         held = held.setdefault(section, {})

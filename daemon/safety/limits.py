@@ -35,8 +35,8 @@ _WARNING_FRACTION = 0.9  # fraction of a fault limit above which a warning is is
 # Expected current per position error [A/rad]. Every servo model has a stiffer position loop.
 _CURRENT_PER_ERROR = 2.0
 _STANDSTILL_SPEED = 0.05  # maximum speed of a joint at standstill [rad/s]
-# Minimum relative increase in commanded force, and minimum fraction of this increase that the tips
-# must measure.
+# Minimum relative increase in commanded force, and the fraction of the increase that the tips must
+# measure.
 _FORCE_RISE_MIN = 0.2
 _RESPONSE_TIME = 0.3  # time within which the measured force must follow [s]
 _STEP_TOLERANCE = 0.02  # step tolerance beyond the distance travelled at maximum velocity [rad]
@@ -46,7 +46,7 @@ _DRIFT_TIME = 0.1  # time window of the drift check [s], which allows for veloci
 # 3 ticks.
 _LATE_TIME = 0.02
 _FAILURE_TIME = 0.72  # time constant of the fraction of failed readings [s]
-_FAILED_FRACTION_MAX = 0.75  # fraction that is reached after 1 s without a valid reading
+_FAILED_FRACTION_MAX = 0.75  # value reached after 1 s without a valid reading
 _GAP_TIME = 0.1  # interval between readings above which position steps are not checked [s]
 
 
@@ -120,7 +120,7 @@ class View:
         self.bad_goal = False  # True if a goal since the previous check was not finite
         self.grip_width = math.nan  # object width at the start of the grip [m]
         self._target = math.nan  # commanded grip force on the previous tick [N]
-        self.rise_t = math.inf  # time of a commanded increase without a measured response [s]
+        self.rise_t = math.inf  # time of a commanded increase that the tips have not measured [s]
         self.rise_felt = 0.0  # measured force at `rise_t` [N]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":
@@ -168,8 +168,9 @@ def _touches(contact: Contact) -> bool:
     return contact.valid and contact.contact
 
 
-# A check receives the fraction of the bound to apply. The check returns a description of the
-# violation, or "" if there is none. Checks do not modify the state, and NaN violates every bound.
+# A check receives the fraction of the bound that applies. It returns a description of the
+# violation, or "" if the state is within the bound. Checks do not modify the state. NaN violates
+# every bound.
 Check = Callable[[View, State, float], str]
 FingerCheck = Callable[[View, State, float, int], str]
 
@@ -382,7 +383,7 @@ def _joint_current(view: View, state: State, _: float, i: int) -> str:
     return "" if well else f"the {FINGERS[i]} joint draws {current:.2f} A, more than {bound:g} A"
 
 
-_FULL_CURRENT = 0.9  # minimum fraction of the goal's current limit that counts as saturated
+_FULL_CURRENT = 0.9  # minimum fraction of the goal's current limit that counts as saturation
 
 
 @Limit("joint.stall", "joint that is stalled at maximum current before it reaches its "
@@ -459,7 +460,7 @@ def _joint_opens(view: View, state: State, _: float) -> str:
     )
 
 
-_CURRENT_FRACTION_MAX = 0.95  # minimum fraction of the maximum current that counts as saturated
+_CURRENT_FRACTION_MAX = 0.95  # minimum fraction of the maximum current that counts as saturation
 
 
 @Limit("joint.strained", "joint that requires the maximum current in a grip", "warn",
@@ -737,7 +738,7 @@ _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
-    # Estimates from the newest frames only.
+    # Use only estimates from the newest frames.
     left, right = (sensor.estimate for sensor in view.sensors)
     if not (left.contact and right.contact):
         return ""

@@ -94,7 +94,7 @@ class Safety:
         ]
         self._each_tick = [watch for watch in watches if not watch.limit.in_turn]
         self._in_turn = [watch for watch in watches if watch.limit.in_turn]
-        # Keep the table order, because the first violation determines the name of the fault.
+        # Keep the table order: the first violation gives the fault its name.
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
         self._found: dict[_Watch, str] = {}  # current violations of fault limits
@@ -104,7 +104,7 @@ class Safety:
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
         dt = 1.0 / settings.loop.rate
         self._step = limits.goal_speed * dt
-        # In position mode, no current limit bounds the effect of a goal jump.
+        # In position mode, no current limit restricts the effect of a goal jump.
         self._travel = 0.0 if settings.servos.mode == "position" else limits.goal_reach
         self._rise = limits.current_rate * dt
         self._ends = [(i, hand.q_min[i], hand.q_max[i]) for i in view.fingers]
@@ -198,7 +198,7 @@ class Safety:
         near = min(max(inside, lowest), highest)
         if near != inside:
             self._count("goal.step")
-        # Apply the joint limits last, so that they always take effect.
+        # Apply the joint limits last so that no other step overrides them.
         goal.q[i] = min(max(near, low), high)
         limit = min(max(current, 0.0), self._limits.current_max)
         if limit != current:

@@ -52,9 +52,9 @@ class TorqueState:
         self._silence = units * WATCHDOG_UNIT
         self._tried_since = math.inf  # start of the current series of attempts [s]
         self._silent_until = -math.inf
-        self._first = math.inf  # time of the first torque-off request [s]
+        self._first = math.inf  # time of the first request to turn torque off [s]
         self._reported = False
-        self._port_gone = False  # True if the port is lost and nothing can be sent
+        self._port_gone = False  # True if the port is lost and the daemon cannot send anything
         self._last_try = -1  # seq of the tick with the last attempt
         self._unused = Reading()  # buffer for readings that are discarded
 

@@ -15,13 +15,13 @@ from softfinger.daemon.types import FINGERS, State
 
 _STANDING_MAX = 0.02  # maximum motion of the stationary joint [rad]
 _CLOSING_MIN = 0.05  # minimum closing motion of the other joint [rad]
-# Minimum tip tilt as a fraction of the closing motion. With swapped IDs, a tip tilts by about the
-# rotation angle of its finger: in the simulated hand with a sliding object, by 0.9 of that angle.
-# With correct wiring, the fraction is 0.25.
+# Minimum tip tilt as a fraction of the closing motion. If the IDs are swapped, a tip tilts by about
+# the angle through which its finger rotates. In simulation, a tip on a sliding object tilts by 0.9
+# of that angle. With correct wiring, the fraction is 0.25.
 _TILT_RATIO = 0.5
 _TILT_SIGMA = 2.0  # number of tilt standard deviations added to the threshold
 _FORCE_RISE_MIN = 1.0  # minimum tip force increase [N]
-_SETTLING_TIME = 0.07  # settling time after a touch [s]; covers frame latency and stopping time
+_SETTLING_TIME = 0.07  # settling time after a touch [s], including frame latency and stopping time
 _WRONG_ROTATION = math.radians(4.0)  # minimum rotation opposite to the command [rad]
 _TILT_SIGNS = (1.0, -1.0)  # sign of the tip tilt while the finger closes
 
@@ -82,7 +82,7 @@ class WiringWatch:
 
     def _check_turn(self, state: State) -> None:
         angle, goal = state.object.angle, state.goal.angle
-        # This condition is also true for NaN. A streamed goal changes on every tick.
+        # The condition is also true for NaN. A streamed goal changes on every tick.
         if goal != self._goal:
             self._goal, self._turn = goal, math.nan
         if math.isnan(self._turn):

@@ -29,7 +29,7 @@ class Finding:
 
     status: Status
     subject: str  # for example ``servo 1 (left)``
-    text: str  # description of the found value and of the expected value
+    text: str  # description of the actual value and of the expected value
     fix: str = ""  # command or action, empty if none is needed
 
     def __str__(self) -> str:

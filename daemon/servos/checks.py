@@ -36,8 +36,8 @@ _WATCHDOG_FIRMWARE = 38
 _FAULT_AFTER_LONG = 0.5  # value of servos.fault_after above which a notice is issued [s]
 _CONSTANT_RATIO_MAX = 1.3  # maximum ratio of a torque constant to its data sheet value
 _TEMPERATURE_MARGIN = 10  # margin below the temperature limit [°C]
-# Tolerance beyond the hand's limits [rad]. A larger angle is implausible. Possible causes are a
-# wrong zero offset, or a servo that lost its turn count when it was switched off.
+# Tolerance beyond the hand's limits [rad]. A larger angle is implausible. Either the zero offset is
+# wrong, or the servo lost its turn count while it was switched off.
 ANGLE_MARGIN = 0.25
 
 
@@ -63,7 +63,7 @@ class Examined:
     table: Registers = field(default_factory=Registers)
     errors: tuple[Finding, ...] = ()
     notices: tuple[Finding, ...] = ()
-    misplaced: Finding | None = None  # finding that the joint angle is implausible, or None
+    misplaced: Finding | None = None  # finding that reports an implausible joint angle, or None
 
     @property
     def name(self) -> str:
@@ -147,7 +147,7 @@ def check_servo(
     )
     if not low <= volts <= high:
         fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
-        # If the voltage suits the model, the servo's own limits are too narrow.
+        # The supply voltage suits the model, so the servo's own limits are too narrow.
         fix = FIX if fits else "check the power supply"
         wrong(f"supply voltage is {volts:.1f} V, expected {low:.1f} to {high:.1f} V", fix)
     firmware = table[reg.FIRMWARE_VERSION]

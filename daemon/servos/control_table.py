@@ -13,7 +13,7 @@ from typing import Any, Final
 
 # --- addresses -----------------------------------------------------------------------------------
 
-# The EEPROM registers are retained over a reboot and are writable only while torque is off.
+# EEPROM registers keep their values across a reboot and are writable only while torque is off.
 MODEL_NUMBER: Final = 0
 MODEL_INFORMATION: Final = 2
 FIRMWARE_VERSION: Final = 6

@@ -20,15 +20,16 @@ from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.servos.protocol import TRY_COUNT, FastGroupRead, GroupRead, PacketHandler
 
 Span = tuple[int, int]  # first and last address
-# Register spans that are read in one exchange. PRESENT is read on most ticks, CHECK adds goals and
-# bus watchdog, HEALTH adds supply voltage and temperature, and ENABLED begins at torque enable.
+# Register spans that are read in one exchange. Most ticks read PRESENT. CHECK also covers the goals
+# and the bus watchdog, HEALTH also covers supply voltage and temperature, and ENABLED begins at the
+# torque-enable register.
 PRESENT: Span = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
 CHECK: Span = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
 HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 # A late reply could be mistaken for the reply to the next request. After a missing reply, the next
 # requests therefore use spans of different lengths, so that their replies can be distinguished.
-LENGTH_COUNT = 11  # number of versions of each span, with zero to ten preceding registers
+LENGTH_COUNT = 11  # versions of each span, which include zero to ten preceding registers
 
 EXCHANGE_COUNT = 50  # number of exchanges that `doctor` times
 _TIMED_REPLY_TIMEOUT = 0.1  # minimum reply timeout for timed exchanges [s]

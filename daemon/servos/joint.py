@@ -115,7 +115,7 @@ class Joint:
     q: float = 0.0  # angle in the last valid reading [rad]
     dq: float = 0.0  # [rad/s]
     sent: deque[bytes] = field(default_factory=deque)  # recently sent goals as register bytes
-    ticks: int = -1  # reading of the servo clock at the last check
+    ticks: int = -1  # servo clock reading at the last check
     ticked: float = math.inf  # time when the servo clock last advanced [s]
 
     @property

@@ -23,8 +23,8 @@ with contextlib.suppress(ModuleNotFoundError):  # On Windows, only simulated ser
     import termios
 
 BITS_PER_BYTE = 10
-# Reply timeout outside the loop, for setup and calibration [s]. This timeout allows for a new servo
-# with its factory return delay, on a slow adapter and a busy machine.
+# Reply timeout outside the loop, for setup and calibration [s]. The timeout is long enough for a
+# new servo with the factory return delay on a slow adapter and a busy machine.
 UNPACED_TIMEOUT = 0.5
 _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")

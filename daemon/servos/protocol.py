@@ -76,7 +76,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         self.crc_errors = 0  # replies with an invalid CRC
         self.torn = 0  # incomplete replies
         self.late = 0  # number of replies to an earlier request
-        self.refused = 0  # number of reads that were answered with an error
+        self.refused = 0  # number of reads to which a servo replied with an error
         self.skipped_bytes = 0  # number of bytes outside any reply
 
     @property
@@ -133,7 +133,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 known = sender == BROADCAST_ID if fast_option else sender <= MAX_ID
                 if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != INST_STATUS:
                     self.skipped_bytes += 1
-                    del buffer[0]  # Skip an echo of the request, or noise.
+                    del buffer[0]  # Skip an echo of the request, or line noise.
                     continue
                 end = 7 + length
                 if len(buffer) >= end:

@@ -196,7 +196,7 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
-    # An emulator without line timing replies at every baud rate.
+    # An emulator that does not simulate line timing replies at every baud rate.
     anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
@@ -335,7 +335,7 @@ def _set_up(
     def failed(problem: str) -> None:
         result.append(Finding("warn", name, problem))
 
-    # At status return level 0, servos do not reply to reads, so set this level before the first
+    # At status return level 0, servos do not reply to reads, so set the level before the first
     # read.
     if line.read(servo_id, reg.STATUS_RETURN_LEVEL, 1) is None:
         if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):

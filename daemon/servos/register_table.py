@@ -24,8 +24,8 @@ from softfinger.daemon.servos.base import Status
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 
-# A read takes the sum of both servos' return delays. With delays longer than 50 µs, a read would
-# exceed a tick at 500 Hz.
+# The duration of a read includes the return delays of both servos. With delays above 50 µs, a read
+# would take longer than a tick at 500 Hz.
 RETURN_DELAY_MAX: Final = 25
 # Drive mode bits that must be clear. These bits make a servo follow another servo, or switch torque
 # on when a goal is written.
@@ -53,8 +53,8 @@ class Register(NamedTuple):
         return value.to_bytes(self.size, "little", signed=value < 0)
 
 
-# Registers that `doctor --save` stores for a later restore. ID, baud rate and protocol are
-# excluded, because a servo no longer replies at its old address once they have changed.
+# Registers that `doctor --save` stores so that they can be restored later. ID, baud rate and
+# protocol are excluded, because a servo stops replying at its old address once they change.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),
@@ -94,8 +94,8 @@ class Requirement(NamedTuple):
 
     register: Register
     holds: Callable[[int], bool]
-    mended: Callable[[int], int]  # function that returns the replacement for a wrong value
-    told: Callable[[int], str]  # function that describes a wrong value and the expected value
+    mended: Callable[[int], int]  # function that returns the correct value for a wrong one
+    told: Callable[[int], str]  # function that describes the wrong value and the expected value
     status: Status
     armed: bool = False  # True for RAM that `arm` writes
     then: str = ""  # action required after the value is corrected

@@ -27,7 +27,7 @@ from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
 
 Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: request and its age [s]
 
-_ANSWER_TIMEOUT = 0.4  # maximum wait for the gateway before a local stop is confirmed [s]
+_ANSWER_TIMEOUT = 0.4  # maximum time to wait for the gateway before confirming a local stop [s]
 _COMMANDS_PER_TICK = 2  # maximum number of commands per tick, not counting stops
 _UNPACKED_SIZE_MAX = 4096  # number of bytes after which unpacking continues on the next tick
 _OUTCOME_COUNT_MAX = 256  # number of stored outcomes of requests with a key
@@ -53,7 +53,7 @@ class CommandServer:
         # first: the reply, or for a late request the counts of stops and changes.
         self._outcomes: OrderedDict[tuple[str, bytes], bytes | tuple[int, int]] = OrderedDict()
         self._stopped = b""  # reply to the last local stop
-        self._answer_by = 0.0  # time at which local stops are answered without the gateway
+        self._answer_by = 0.0  # time after which local stops are answered without the gateway
 
     def serve(self, handler: Handler) -> None:
         """Pass this tick's requests to ``handler`` and send its replies.

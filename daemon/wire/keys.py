@@ -35,7 +35,7 @@ import zmq.utils.z85
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.kinematics.compiled.own_folder import check_above, fault
 
-LOCAL = "local"  # client that every key folder contains
+LOCAL = "local"  # name of the client that every key folder contains
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _LENGTH = 32  # length of a key [bytes]
@@ -143,7 +143,7 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
             client.mkdir()
             zmq.auth.create_certificates(client, "client")
             shutil.copyfile(server / "server.key", client / "server.key")
-            # This step comes last, so that the server accepts only clients with complete keys.
+            # Perform this step last, so that the server accepts only clients with complete keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     finally:
         os.umask(before)

@@ -92,7 +92,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
         ):
             require_own(folder)
             asking.settimeout(seconds)
-            # The system assigns a name to the socket, and the daemon replies to this name.
+            # The system assigns the socket a name, to which the daemon replies.
             asking.bind("")
             asking.connect(str(folder / _name(address)))
             asking.send(b"stop")

@@ -19,7 +19,7 @@ import msgpack
 # From the loop
 PUBLISH = "publish"  # topic index, number of messages to keep for late subscribers, message
 REPLY = "reply"  # the request's `Ask.urgent` and `Ask.route`, reply
-FENCE = "fence"  # stop count so far
+FENCE = "fence"  # number of stops so far
 
 # From the gateway
 ASK = "ask"  # the `Ask` fields
@@ -75,7 +75,7 @@ class Channel:
         self._end = end
         self._unsent = bytearray()
         self._unpacker = msgpack.Unpacker(max_buffer_size=_MESSAGE_SIZE_MAX)
-        self.over = False  # True once either end has been closed
+        self.over = False  # True once one of the two ends has been closed
 
     def fileno(self) -> int:
         return self._end.fileno()
@@ -93,7 +93,7 @@ class Channel:
                 del self._unsent[: self._end.send(self._unsent)]
         except BlockingIOError:
             return False
-        except OSError:  # The other end is closed, but its last messages may be unread.
+        except OSError:  # The other end is closed, but it may have left unread messages.
             self._unsent.clear()
         return True
 
@@ -121,7 +121,7 @@ class Link:
         self.wanted = 0  # bit mask of topics with subscribers
         self.refused = 0  # number of requests that the gateway's rate and queue limits refused
         self.stops = 0  # number of stops so far
-        self.confirmed = 0  # stop count with which the gateway stamps new requests
+        self.confirmed = 0  # stop count that the gateway stamps on new requests
         self.asked: deque[Ask] = deque()  # received requests, with urgent requests first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # queued for a later tick
         self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # gateway warnings

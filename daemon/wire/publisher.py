@@ -39,8 +39,8 @@ def packer(topic: bytes) -> Callable[..., bytes]:
 
 def _packer(record: type[Any]) -> Pack:
     """Return a function that packs a record's map from its source."""
-    # Each source after the first is derived from an earlier source. Each value comes from a single
-    # source.
+    # Every source except the first is derived from an earlier source, and each value comes from a
+    # single source.
     sources: list[tuple[int, Getter]] = []
     found: dict[FieldSource[Any], int] = {}
 

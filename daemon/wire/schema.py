@@ -89,7 +89,7 @@ def _ns(t: float) -> int:
     return int(t * 1e9)
 
 
-# Fields that several sources share are declared in only one of them.
+# If several sources share a field, only one of them declares it.
 _tick = FieldSource["StateSource"]()
 _state = _tick.of(lambda m: m.state)
 _timing = _state.of(lambda s: s.timing)

@@ -19,13 +19,13 @@ _GAP_MAX = 0.035  # maximum gap in the data across which values are interpolated
 # Speed above which static friction has mostly vanished [rad/s]. For the XL330, this speed is 0.12
 # rad/s.
 _SLIDING_SPEED = 0.2
-# Speed below which a joint is at standstill, one count of 1.5 mrad in 0.08 s [rad/s].
+# Speed below which a joint counts as stationary [rad/s]: one count of 1.5 mrad in 0.08 s.
 _REST_SPEED = 0.02
-# Travel from standstill at which a joint breaks away [rad]. This travel is three counts, or ten
-# times the gear compliance.
+# Rotation from standstill at which a joint counts as broken away [rad]: three counts, or ten times
+# the gear compliance.
 _BREAK_AWAY_DISTANCE = 5e-3
-# Maximum goal velocity at break-away [rad/s], and number of steps over which it applies. The limit
-# keeps the inertial torque small.
+# Maximum goal velocity at break-away [rad/s], and number of steps for which the limit applies. The
+# limit keeps the inertial torque small.
 _BREAK_AWAY_RATE = 0.1, 20
 _MOTION_TIME_MIN = 0.5  # minimum motion time in each direction [s]
 _CORRELATION_TIME = 0.2  # correlation time of the residuals [s]
@@ -90,7 +90,7 @@ def fit_friction(
     place, rate, acceleration = _motion(shown)
     after = np.clip(np.searchsorted(at, grid, "right"), 1, at.size - 1)
     whole = at[after] - at[after - 1] < _GAP_MAX
-    # Use only instants at which the direction of motion is constant over the whole smoothing
+    # Use only instants for which the direction of motion is constant throughout the smoothing
     # window.
     closes, opens = (_throughout(whole & (sign * rate > _SLIDING_SPEED)) for sign in (1.0, -1.0))
     seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
@@ -159,8 +159,8 @@ def _least_squares(
     std = np.sqrt(np.diag(covariance))
     if found[1] < 0.0:  # b cannot be negative, so use the solution for b = 0
         found = found - covariance[:, 1] * (found[1] / covariance[1, 1])
-    # A constant current always has the same quantisation error, so averaging does not reduce this
-    # error.
+    # At a constant current, the quantisation error is also constant, so averaging does not reduce
+    # it.
     std[0] = math.hypot(float(std[0]), math.sqrt(rounding))
     return found, std
 

@@ -21,7 +21,7 @@ _RAMP_MARGIN = 0.2  # time before and after a ramp that still counts as part of 
 _CLOSING_MIN = 8e-4  # minimum closing distance in a ramp [m], seven encoder counts
 _FRAME_COUNT_MIN = 8  # minimum number of frames
 _TIME_ERROR = 1e-3  # standard deviation of the times of ticks, readings and frames [s]
-# Widening of a growing footprint; see `perception.frame_channels`.
+# Apparent widening of a growing footprint; see `perception.frame_channels`.
 _WIDENING, _SPREAD_MAX = 1.4, 0.1
 _ITERATIONS = 3  # number of iterations that alternate between the first touch and the fit
 
@@ -90,7 +90,7 @@ def fit_latency(
         shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # The encoder error at standstill is constant, and half of this error shifts the ramp.
+    # At standstill, the encoder error is constant. Half of this error shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))

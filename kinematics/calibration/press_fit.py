@@ -27,7 +27,7 @@ _ROTATION_STEP = 1e-4  # rad
 _ROTATION_STARTS = 8  # number of initial rotations to try
 _GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
 _POISSON_TOLERANCE = 4e-3  # tolerance of ν
-# Presses whose d [m] and θ [rad] differ by less are repetitions.
+# Presses with smaller differences in d and θ [rad] count as repetitions.
 _REPEATED_D, _REPEATED_THETA = 5e-5, 0.009
 _DRIFT_MIN = 0.02  # minimum significant drift of E, given the accuracy of presses and tables
 

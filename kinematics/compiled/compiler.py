@@ -161,8 +161,8 @@ class BitcodeKernel(plain.InnerKernel):
             no_cfunc_wrapper=True,
             **options,
         )(self.py_func)
-        # Otherwise, Numba would recompile for each literal argument. LLVM folds the constants
-        # anyway.
+        # Without this step, Numba would recompile for each literal argument. LLVM folds the
+        # constants anyway.
         resolve = self.dispatcher.get_call_template
         self.dispatcher.get_call_template = lambda args, kws: resolve(
             tuple(types.unliteral(each) for each in args), kws
@@ -325,7 +325,7 @@ def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     try:
         dispatcher._cache = KernelCache(function)
     except RuntimeError:
-        pass  # There is no folder; `kernel_folder` has already issued a warning.
+        pass  # There is no folder, and `kernel_folder` has already issued a warning.
     called = inner(function, options).dispatcher  # The cache does not store bitcode.
     dispatcher.get_call_template = called.get_call_template
     dispatcher.get_overload = called.get_overload

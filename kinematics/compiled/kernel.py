@@ -24,9 +24,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # Minor versions of Numba that were tested with `compiler`, which uses private interfaces.
 TESTED_NUMBA = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
-# index(k) converts k to an unsigned index. Numba checks whether a signed index is negative, because
-# negative indices count from the end. This check prevents vectorisation. Do not mix signed and
-# unsigned integers in a sum.
+# index(k) converts k to an unsigned index. Negative indices count from the end, so Numba tests the
+# sign of each signed index. The test prevents vectorisation. Do not mix signed and unsigned
+# integers in a sum.
 index: Callable[[int], int] = cast(Any, np.uint64)
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}

@@ -31,7 +31,7 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 ROOT = Path(__file__).resolve().parents[2]  # directory of the `softfinger` package
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-# Number of other cache folders to keep, for example those of other checkouts or of the previous
+# Number of other cache folders to keep, for example those of other checkouts or the previous
 # release.
 _FOLDERS_MAX = 4
 _RECENT = 600.0  # age below which a folder is kept [s], because it may still be in use

@@ -152,5 +152,5 @@ def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
     inner = base.__args__[-1]
     if isinstance(inner, type) and issubclass(inner, Record):
         return inner, inner.dtype, shape
-    # The type argument of NDArray[np.float64] is dtype[float64], or float64 since NumPy 2.5.
+    # The type argument of NDArray is dtype[float64], or float64 since NumPy 2.5.
     return None, getattr(inner, "__args__", (inner,))[0], shape

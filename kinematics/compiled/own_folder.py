@@ -13,8 +13,8 @@ import stat
 from functools import cache
 from pathlib import Path
 
-# On Windows, there are no owner or mode bits to check, and a folder cannot be held open. The access
-# control lists of the user profile protect the folder instead.
+# Windows has no owner or mode bits to check, and a folder cannot be held open. The access control
+# lists of the user profile protect the folder instead.
 HAS_OWNERS = hasattr(os, "geteuid")
 NO_FOLLOW: int = getattr(os, "O_NOFOLLOW", 0)
 _PLAIN: int = NO_FOLLOW | getattr(os, "O_BINARY", 0)

@@ -28,7 +28,7 @@ __all__ = ["ClosedForms", "Fingertip", "closed_forms"]
 
 
 HALF_PI = math.pi / 2
-RADIUS_MAX = 1.0  # maximum radius [m]; a larger value was probably given in millimetres
+RADIUS_MAX = 1.0  # maximum radius [m]; larger values were probably given in millimetres
 POISSON = (0.45, 0.4995)  # range of Poisson's ratio covered by the solid tip data
 
 
@@ -135,7 +135,7 @@ def _real(value: ArrayLike) -> FloatArray:
     return np.asarray(array, dtype=np.float64)
 
 
-# NaN and infinite inputs give NaN without a warning.
+# NaN and infinite inputs result in NaN without a warning.
 _quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
 
 

@@ -105,8 +105,8 @@ def _ratios(
     count = circle.shape[1]
     share = 1.0 / count
     nodes = gauss.shape[1]
-    # The integrand has poles at y² = −2 sin θ and, unless y0 = 0, at y = 0. For h = 0, the
-    # integrand has no poles.
+    # The integrand has poles at y² = −2 sin θ and, if y0 is not 0, at y = 0. For h = 0, it has no
+    # poles.
     start = max(2.0 * y0, _PIECE_MIN * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0

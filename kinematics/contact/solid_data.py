@@ -55,8 +55,8 @@ class SolidData:
     edges: FloatArray  # ring edges, r/a [rings + 1]
     modes: FloatArray  # B averaged over each ring [k, rings]
     shear: FloatArray  # B_T [rings]
-    error: float  # error of N relative to other meshes
-    pressure_error: float  # rms error of the base pressure relative to other meshes
+    error: float  # relative deviation of N from the results of other meshes
+    pressure_error: float  # rms deviation of the base pressure from the results of other meshes
 
 
 @lru_cache(maxsize=8)

@@ -84,7 +84,7 @@ _numbers: Any = tuple.__new__
 
 _EDGE_FACTOR = 1.0 - 1e-12  # factor that keeps edge points inside the domain despite rounding
 
-_LAW_ERROR = 0.05  # relative force error due to the law's misfit above which `build` warns
+_LAW_ERROR = 0.05  # relative force error due to the law's misfit, above which `build` warns
 
 
 class ContactTable:

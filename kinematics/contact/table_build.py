@@ -37,7 +37,7 @@ from softfinger.kinematics.contact.table_record import (
     set_piece,
 )
 
-# Rounding error of the closed forms and of the last products in the kernel.
+# Rounding error of the closed forms and of the final products in the kernel.
 _ROUNDING = 16.0 * np.finfo(float).eps
 # Bound on the relative rounding error of a piece. An error analysis of the pieces of seven laws of
 # degree 7 to 11 gives at most 3.5e-13. The largest part comes from y², because cos² θ − ρ² cancels
@@ -101,7 +101,7 @@ def _build_pieces(
 
 def _fill(table: Table, material: Material) -> Iterator[_WorstError]:
     """Set the coefficients piece by piece; yield the error bound of each piece."""
-    # Additional coefficients in each direction give the truncation error.
+    # The additional coefficients in each direction determine the truncation error.
     rows, width = POWERS_V + _EXTRA_V, POWERS_U + _EXTRA_U
     mask = np.zeros((rows, width), dtype=np.bool_)
     mask[:POWERS_V, :POWERS_U] = True
@@ -144,7 +144,7 @@ def _bound(values: FloatArray, lost: FloatArray, h: FloatArray, y: FloatArray) -
     k = int(np.argmax(bounds))
     here = np.abs(_dense_nodes(len(h)) @ lost[k] @ _dense_nodes(len(y)).T)
     i, j = np.unravel_index(int(np.argmax(here)), here.shape)
-    # The dense points are in ascending order, four per node, whereas the nodes are in descending
+    # The dense points (four per node) are in ascending order, whereas the nodes are in descending
     # order.
     return _WorstError(float(bounds[k]), float(h[-1 - i // 4]), float(y[-1 - j // 4]))
 

@@ -22,10 +22,11 @@ from softfinger.kinematics.estimation.state import (
 from softfinger.kinematics.sensing.footprint import Grid, line_span, set_around, set_face, steps
 
 # Levels of the activity test, in noise standard deviations. Common errors and correlated noise
-# increase the second one.
+# raise the second level.
 PEAK_LEVEL, PATCH_LEVEL = 3.0, 4.9
 OUTLIERS_MAX = 6  # maximum number of outliers that are excluded from a frame
-# Ratio of the detection level during a contact to the level before it. The ratio avoids flicker.
+# Detection level during a contact, divided by the level before contact. A ratio below 1 prevents
+# flicker.
 _HYSTERESIS = 0.5
 _NOISE_RATIO = 1.75  # ratio of measured noise to noise setting above which a frame is noisy
 _SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviations

@@ -196,8 +196,8 @@ _TOLERANCE = 16.0  # squared ratio of step to noise floor below which the iterat
 # noise of 0.2 % of the modulus and tilts of up to 25°, the bias is at most a quarter of the noise
 # floor. Within 4° of the domain limit, the bias is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
-_DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum d/a and sin θ in a spring fit
-_STEP_MARGIN = 1.01  # factor by which the fit of a solid tip may exceed the range of the data
+_DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum values of d/a and sin θ in a spring fit
+_STEP_MARGIN = 1.01  # factor by which a solid-tip fit may exceed the range of the data
 # Width of the excluded rim of a solid tip, relative to the radius.
 _RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
 CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact and shear

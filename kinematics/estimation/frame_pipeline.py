@@ -33,7 +33,8 @@ from softfinger.kinematics.estimation.state import (
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-# Noise standard deviations; a solid tip's signal above it without the contact pattern is a fault.
+# Signal level in noise standard deviations. If a solid tip's signal exceeds this level but lacks
+# the contact pattern, the frame is faulty.
 _STRONG_SIGNAL = 6.0
 # Clipping the noise at 0 raises the sums over neighbourhoods. Raising the detection level by this
 # amount restores the false alarm rate.
@@ -48,8 +49,8 @@ R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a v
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
-# The sensor needs a tare if at least ABOVE_FRACTION of the cells under the tip exceed both levels,
-# one relative to the noise and one relative to the peak. A solid tip loads all cells, but 5 % of
+# The sensor needs a tare if at least ABOVE_FRACTION of the cells under the tip exceed both levels.
+# One level is relative to the noise, the other to the peak. A solid tip loads all cells, but 5 % of
 # them read less than 0.32 of the peak.
 ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among the cells above half the peak
@@ -188,7 +189,7 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
     reason = _fit_frame(state, model, frame, cells)
     _set_results(state)
     if state.options.is_solid and reason == Invalid.NOT_CONVERGED:
-        # For a contact of this tip, the fit either converges within the data range or explains the
+        # If this tip is in contact, the fit either converges within the data range or explains the
         # frame at the limit of the range.
         unexplained = fit.misfit > (1.0 - R_SQUARED_MIN) * fit.readings
         reason = Invalid.MODEL_MISMATCH if unexplained or not fit.is_limited else reason
@@ -211,8 +212,8 @@ def _reset_results(state: EstimatorState, scale: float, step: float, saturation:
     signal.saturation = saturation * scale
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
-    # A contact that is no wider than a cell causes a strain of at most about pitch²/2a². Allow for
-    # gains of up to 3.
+    # A contact no wider than a cell causes a strain of at most about pitch²/2a². The bound allows
+    # for a gain of up to 3.
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate

@@ -41,7 +41,7 @@ _GAIN_CURVATURE = 6.0
 _ITERATIONS = 20
 _HALVINGS_MAX = 5
 _SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear force, relative to its normal force
-_LIMITED_MAX = 4  # maximum number of consecutive steps that are clamped to the limits of the model
+_LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of the model
 # Minimum pivot of a scaled normal matrix. For a 2 × 2 matrix, the pivot is the determinant divided
 # by the product of the diagonal elements, with a rounding error of 1e-12.
 _PIVOT_MIN = 1e-11
@@ -156,7 +156,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
         reading = max(raw, floor)
         residual = reading - pressure
         if clipped:
-            # The excess above max(pressure, floor) is symmetric about the floor.
+            # The excess over max(pressure, floor) is symmetric about the floor.
             depth = (pressure - floor) * per_clip
             z = min(abs(depth), CLIP_END)
             above = 1.0 - z * (1.0 / CLIP_END)
@@ -355,7 +355,8 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
     variance = _check_fit(state, cells)
     fit.widening = 1.0
     if options.free_gain:
-        # The larger the uncertainty of d, the less linear is the relation between d and the gain.
+        # As the uncertainty of d increases, the relation between d and the gain becomes less
+        # linear.
         uncertain = variance * fit.inverse[DEPTH, DEPTH] + state.budget.shared[DEPTH, DEPTH]
         fit.widening += _GAIN_CURVATURE * min(uncertain / (d * d), 1.0)
     fit.variance = fit.widening * variance

@@ -23,8 +23,8 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _CONTACT_SIGMA = 5.0  # contact threshold of the sum of readings, in standard deviations
 _EXTRAPOLATION_MAX = 1.02  # extrapolation limit, relative to the measured depth and tilt
-_EXTENT_ERROR_MAX = 0.08  # maximum relative difference between measured and expected extent
-_ITERATIONS_MAX = 20  # maximum number of iterations that alternate between d and θ
+_EXTENT_ERROR_MAX = 0.08  # maximum relative difference between the measured and the expected extent
+_ITERATIONS_MAX = 20  # maximum number of iterations that solve for d and θ in turn
 _TOLERANCE = 1e-7  # convergence tolerance, relative to the range
 
 
@@ -86,7 +86,7 @@ class MeasuredEstimator:
 
     saturation: float | None = None  # Saturated cells are treated like all other cells.
 
-    noise = 0.0  # This noise is not used, because the curves include the measured noise.
+    noise = 0.0  # not used, because the curves already include the measured noise
 
     def __init__(
         self,
@@ -197,9 +197,9 @@ class MeasuredEstimator:
         n = s * direction
         inverse, errors = self._errors(t, n)
         std = math.sqrt(direction @ errors[1:, 1:] @ direction)
-        # Where the centroid hardly determines the tilt, the tilt range of the calibration presses
-        # serves as a prior. As in a Kalman update, the prior pulls the tilt towards 0; this error
-        # is common to all frames.
+        # Where the centroid barely determines the tilt, the tilt range of the calibration presses
+        # serves as a prior. As in a Kalman update, the prior pulls the tilt towards 0. The
+        # resulting error is common to all frames.
         prior = self._tilt_sine_max**2 * np.eye(2)
         pull = errors[:, 1:] @ np.linalg.inv(errors[1:, 1:] + prior)
         n -= pull[1:] @ n

@@ -32,9 +32,10 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 # centres within this margin, even after a small motion of the contact.
 _MARGIN = 0.75
 _BLUR_MARGIN = 2.0  # additional margin around the footprint, in standard deviations of the blur
-# Tilt at which the centroid's moment arm is computed [rad]. The arm hardly depends on the tilt.
+# Tilt at which the centroid's moment arm is computed [rad]. The arm is nearly independent of the
+# tilt.
 _TILT = 0.2
-_WEAK_PEAK = 15.0  # peak below which neighbourhoods are used, in noise standard deviations
+_WEAK_PEAK = 15.0  # peak below which neighbourhood sums are used, in noise standard deviations
 _SINE_MAX = 0.95
 
 
@@ -83,7 +84,8 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
     guess = state.estimate.guess
     guess[:] = 0.0
     if state.options.is_solid:
-        # A solid tip loads its whole base, and the extent of the pressure hardly depends on d.
+        # A solid tip loads its whole base, and the width of the pressure distribution is nearly
+        # independent of d.
         _select_inside(cells, 0.0, 0.0, 0.0)
         _set_moments(m, frame, cells)
         _set_contact(state)

@@ -86,7 +86,7 @@ class Estimate(Record):
     guess: Column  # fit parameters of the last fit, or of the initial estimate
     residual: float  # sum of (reading − model)² − reading² over the footprint [Pa²]
     undetected: float  # relative error of d that a smooth misfit may cause
-    shared: float  # relative standard deviation of d due to known uncertainties
+    shared: float  # relative standard deviation of d due to known errors
     covariance: Matrix  # covariance of (d, tilt_x, tilt_y, gain)
     systematic: Matrix  # part of the covariance that is common to all frames
 

@@ -244,8 +244,7 @@ def load_torques(
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, _, _, across = motion
-    # Remove the motion along the bisector, because this motion does not contribute to the moment
-    # arms.
+    # Remove the motion along the bisector, because it does not contribute to the moment arms.
     face_slope = math.tan(0.5 * taper)
     scale = 1.0 / (1.0 + face_slope * face_slope)
     moment_arm1 = scale * (across * turn1 - face_slope * arm1)

@@ -72,7 +72,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
         return
     _predict(s, square, dt)
     stepped = reading - s.reading
-    if abs(stepped) > 1.0:  # The filter missed steps, or the sensor was replaced.
+    if abs(stepped) > 1.0:  # The filter missed some steps, or the sensor was replaced.
         _correct(s, reading, 1.0)
     elif stepped != 0.0:
         _correct(s, reading - 0.5 * stepped, _STEP_STD * _STEP_STD)

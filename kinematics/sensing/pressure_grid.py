@@ -22,7 +22,7 @@ from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, coun
 
 __all__ = ["SensorGrid"]
 
-_PITCH_MAX = 0.1  # maximum pitch [m]; a larger value was probably given in millimetres
+_PITCH_MAX = 0.1  # maximum pitch [m]; larger values were probably given in millimetres
 _POINTS_PER_RADIUS = 150.0  # minimum number of sample points per tip radius
 
 

@@ -232,7 +232,7 @@ def press_springs(
     count_y, reach = points.along.shape
     size_x = 0.5 * grid.pitch_x / count_x
     size_y = 0.5 * grid.pitch_y / count_y
-    # If the outline cuts a rectangle, the centre of the rectangle may be outside the outline.
+    # If the outline cuts a rectangle, the rectangle's centre may lie outside the outline.
     set_around(around, face, a, math.hypot(size_x, size_y))
     low, high = extremes(around, a)
     lines = points.y.shape[0]

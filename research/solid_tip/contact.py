@@ -20,8 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from research.solid_tip.green import FloatArray, Green
 
-# Distance in units of a. Cells up to this distance outside the undeformed overlap may be in
-# contact.
+# Cells up to this distance outside the undeformed overlap may be in contact (in units of a).
 BEYOND = 0.06
 
 

@@ -341,7 +341,7 @@ class Body:
     def _solve_at_rest(self, right: FloatArray, known: FloatArray) -> FloatArray:
         """Solve for linear elements as in `solve`, using the response to forces on the face."""
         assert self.moves is not None
-        # From the start, all forces except those on the face are in equilibrium.
+        # From the start, all forces are in equilibrium, except for those on the face.
         given = ~np.isnan(known[self.pushed])
         load = right[self.pushed]
         if given.any():

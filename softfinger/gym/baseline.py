@@ -28,7 +28,7 @@ from softfinger.tools.sweep import Sweep, add_sweep
 SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, and episodes per sample
 STEPS = 200
 FEATURES = 5
-# Scale of the weights, which keeps the joints slow, because an action of 1 is fast (1 rad/s).
+# Scale of the weights. An action of 1 is fast (1 rad/s), so small weights keep the joints slow.
 _WEIGHT_SCALE = 0.2
 _ADDED_STD = 0.2  # increase in standard deviation that avoids premature convergence
 

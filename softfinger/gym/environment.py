@@ -116,7 +116,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._window: Window | None = None
         self._pack_state, self._pack_truth = packer(STATE), packer(TRUTH)
-        # With joint goals, the fingers may press as hard as with the grip law.
+        # With joint goals, the fingers may press as hard as under the grip law.
         ours = ("loop.clock=virtual", "safety.current_move=1.2")
         file = None if profile is None else Path(profile)
         self._settings = load(file, changes=(*ours, *changes))

@@ -22,7 +22,7 @@ from softfinger.daemon.types import FINGERS, Frame, Goal, Reading
 
 __all__ = ["check_servos", "check_shape", "check_tactile", "load"]
 
-_POLL = 1e-3  # poll interval [s], as long as a control tick
+_POLL = 1e-3  # poll interval [s], equal to a control tick
 
 
 def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:

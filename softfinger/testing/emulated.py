@@ -25,8 +25,8 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.tools.processes.emulate import emulator_process
 
 _SERVOS_MAX = 8
-_LOOK = 0.005  # time between checks for changes made by another thread [s]
-_STALL = 0.5  # maximum pause of this process that counts as servo time [s]
+_LOOK = 0.005  # interval between checks for changes made by another thread [s]
+_STALL = 0.5  # maximum pause of this process that the servos' clock includes [s]
 
 
 class EmulatedHand:

@@ -26,7 +26,7 @@ from tests.harness.daemon_process import SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # marks processes started by a command, which run separately
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
-# Commands with one of these options end by themselves, so the tests run them.
+# Commands with one of these options exit on their own, so the tests run them.
 _ENDS = {"--record", "--recompute"}
 _SHOWN = re.compile(r"# (?P<mode>\w+)(?: (?P<force>[\d.]+) N)?(?:.*?(?P<angle>-?[\d.]+)°)?")
 _CLIENT = """\

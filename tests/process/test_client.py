@@ -457,7 +457,7 @@ def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeyp
         pass  # This address has no host.
     monkeypatch.undo()
     with Hand("tcp://127.0.0.1:0;127.0.0.1:9872", "tcp://[::1]:9873"):
-        pass  # One address has a source address, and the other address is numeric.
+        pass  # One address includes a source address; the other is numeric.
 
 
 @pytest.mark.parametrize("words", [["monitor"], ["send", "stop"], ["status"], ["record", "a.mcap"]])

@@ -49,7 +49,7 @@ FENCE = re.compile(
 )
 # `softfinger status` with its expected exit status.
 STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")
-PRINTS = 20  # number of lines after which a program that never ends is stopped
+PRINTS = 20  # number of output lines after which a program that runs forever is stopped
 PATIENCE = 300.0  # time limit for one code block [s]
 
 

@@ -34,7 +34,7 @@ def running(hand: Sequence[str] = (), daemon: Sequence[str] = ()) -> Iterator[Ri
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")
         made.config.write_text(text, encoding="utf-8")
         made.hand_words = tuple(word for each in hand for word in ("--set", each))
-        told = ("servos.fault_after=1.0", *daemon)  # The time is that of the hand.
+        told = ("servos.fault_after=1.0", *daemon)  # Times are measured on the hand's clock.
         made.start(*(word for each in told for word in ("--set", each)))
         yield made
 

@@ -86,7 +86,7 @@ def test_frames_are_received_through_a_port_with_their_times(own_threads, board)
     counters = tactile.counters()
     assert counters["resyncs"] == counters["port_lost"] == 0
     tactile.close()
-    assert len(own_threads()) == 1  # The only thread is that of the board.
+    assert len(own_threads()) == 1  # The board's thread is the only thread.
 
 
 def test_a_frame_is_delivered_before_the_next_one_arrives(board):

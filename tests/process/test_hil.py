@@ -26,7 +26,7 @@ REAL = [
     *("--set", f"servos.watchdog={WATCHDOG}", "--set", f"servos.fault_after={WATCHDOG}"),
     *("--set", "servos.reply_timeout=0.1", "--set", "servos.open_timeout=60"),
 ]
-# These settings use the hand's time, which hardly advances while the emulator gets no processor
+# These settings use the hand's clock, which barely advances while the emulator gets no processor
 # time.
 WAITING = [
     *("--set", "servos.fault_after=1.0", "--set", "safety.frame_age_fault=100"),

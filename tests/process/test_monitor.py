@@ -39,7 +39,7 @@ def test_page_shows_the_hand_and_the_state_of_its_stream(fake):
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
         fake.silent.set()
-        # The stale state before this lasts at most 1.5 s.
+        # The page first shows a stale state for at most 1.5 s.
         page.shows("○ lost", "the stream has stopped")
         fake.changes = {}
         fake.silent.clear()
@@ -296,7 +296,7 @@ def test_no_wait_exits_without_a_stream_and_when_the_stream_ends(fake):
         assert page.is_restored()
         assert f"no stream from {NOBODY} within 5 s" in page.written.decode()
     with TerminalProcess(command(fake, "--no-wait")) as page:
-        page.wait(lambda: b"HOLDING" in page.written)  # The process may already have ended.
+        page.wait(lambda: b"HOLDING" in page.written)  # The process may already have exited.
         fake.silent.set()
         assert page.ended() == 0
         assert page.is_restored()

@@ -244,7 +244,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
 def test_images_of_tips_without_contact_are_blank() -> None:
     kept = Kept()
     noise = np.random.default_rng(1).normal(0.0, Settings().tactile.noise / 4.0, (44, 44))
-    counts = np.clip(noise, 0.0, None).astype("<u2")  # one count is 4 Pa
+    counts = np.clip(noise, 0.0, None).astype("<u2")  # one count corresponds to 4 Pa
     kept.pictures.take(schema.TACTILE, {**frame(0.0, 0), "data": counts.tobytes()})
     kept.pictures.take(schema.STATE, state(0.0, 1))
     kept.pictures.draw()

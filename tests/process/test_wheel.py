@@ -162,7 +162,7 @@ def test_pinned_versions_support_the_oldest_supported_python():
     assert oldest.startswith(">=")
     looked_at = 0
     for line in (ROOT / "constraints.txt").read_text().splitlines():
-        with contextlib.suppress(PackageNotFoundError):  # The tests do not need this package.
+        with contextlib.suppress(PackageNotFoundError):  # The tests do not require this package.
             wanted = metadata(line.split("==")[0]).get("Requires-Python") or ""
             assert SpecifierSet(wanted).contains(oldest.removeprefix(">=")), f"{line}: {wanted}"
             looked_at += 1

@@ -45,10 +45,10 @@ _FAULT_FOR = 0.3
 _SETPOINT = 0.02  # time between setpoints [s]
 _STREAM = 3.0  # duration of a setpoint stream [s]
 _SPLIT = 300  # time per recorder file [s]; the recorder keeps an index until the file is closed
-# These faults leave the object tilted after a stop, and the soak then puts the object upright.
+# These faults leave the object tilted after a stop. The soak test then uprights the object.
 _ASKEW = ("hand.angle", "tip.tilt")
-_DROPPED = 20.0  # time without a grip after which an object that slipped away is put back [s]
-_HELD = 0.3  # minimum fraction of grasps that must reach a hold
+_DROPPED = 20.0  # time without a grip after which the test puts a lost object back [s]
+_HELD = 0.3  # minimum fraction of grasps that must settle
 _MANY = 50  # number of grasps above which _HELD is required
 _BEGUN = 1500  # maximum difference between the numbers of states received by any two listeners
 
@@ -64,7 +64,7 @@ class Account:
     done: Counter[str] = field(default_factory=Counter)  # accepted commands
     injected: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
-    held: int = 0  # number of grips that reached a hold
+    held: int = 0  # number of grips that settled
     placed: int = 0  # number of times the object was put upright
     # Pairs (received, lost) for each subscriber.
     received: list[tuple[int, int]] = field(default_factory=list)

@@ -43,7 +43,7 @@ from softfinger.tools.recordings.record import RecordingWriter
 
 SEQUENCES, TICKS = 1000, 5000
 LONG = 1_000_000  # number of ticks above which a sequence counts as long
-HELD = 0.3  # fraction of the sequences that must reach a hold
+HELD = 0.3  # fraction of the sequences that must reach a settled grip
 _GRIPPING = ("grasping", "holding", "rotating")
 _COMMAND_EVERY = 150  # average number of ticks between commands
 _DISTURBED_EVERY = 800  # average number of ticks between loads or faults
@@ -170,7 +170,7 @@ class FaultyServos:
         self.finger = 0
         self.last_good = -math.inf
         self.torque = False
-        self.armed = False  # True if the hand was armed after the last event that disarms
+        self.armed = False  # True if the hand has been armed since the last event that disarmed it
         self._last = 0.0  # last angle reported by a numb joint [rad]
         self._unheard = 0
 
@@ -312,7 +312,7 @@ class Account:
     """Results of the sequences."""
 
     sequences: int = 0
-    held: int = 0  # number of sequences that reached a hold
+    held: int = 0  # number of sequences that reached a settled grip
     ticks: int = 0
     seconds: float = 0.0  # run time
     judged: Counter[str] = field(default_factory=Counter)
@@ -764,7 +764,7 @@ def main() -> int:
     else:
         for seed in range(arguments.seed, arguments.seed + arguments.sequences):
             sequence(seed, arguments.ticks, account)
-            gc.collect()  # A daemon's reference cycles hold megabytes of frames.
+            gc.collect()  # Reference cycles in a daemon keep megabytes of frames in memory.
     account.seconds = time.monotonic() - begin
     print("\n".join(account.lines()))
     few = account.held < HELD * account.sequences

@@ -81,7 +81,7 @@ def test_numbers_may_have_units(words, numbers):
 
 def test_profiles_and_keys_are_shown_from_any_folder(inline, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "hil").mkdir()  # A project may have a folder with this name.
+    (tmp_path / "hil").mkdir()  # A user's project may contain a folder with the same name.
     listed = inline("config", "list").stdout.splitlines()
     assert [line.split()[0] for line in listed] == names()
     assert all(len(line.split()) > 2 for line in listed), "each profile must have a description"

@@ -217,9 +217,9 @@ def test_path_of_rotation_and_rolling(folder: Path) -> None:
         law = rolling[f"F/F(0) of Table I's law at d = {d} mm [1]"]
         for curve in (ratio, law):
             assert theta[np.argmin(curve)] == 0.0
-        # A modulus that increases with strain deepens the minimum.
+        # A modulus that increases with strain deepens the energy minimum.
         assert np.all(law[theta != 0.0] > ratio[theta != 0.0])
-        # Springs that point to the tip's centre give no minimum.
+        # Springs that point towards the tip's centre produce no energy minimum.
         assert np.ptp(rolling[f"F of radial springs at d = {d} mm [N]"]) == 0.0
         # The rotation ends in the state in which the rolling begins.
         last = rotation[f"F, d up to {d} mm [N]"][-1]

@@ -86,13 +86,13 @@ def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
     assert decoder.feed(frame(images[6])[:7], 0.06) is None
     assert decoder.feed(frame(images[6])[7:], 0.07) is None
     assert decoder.settle() is not None
-    # An image that contains the marker waits for the next frame.
+    # If an image contains the marker, the decoder waits for the next frame.
     assert decoder.feed(frame(bytes(spare)), 0.08) is None
     assert decoder.settle() is None
     decoded = decoder.feed(frame(images[7]), 0.09)
     assert decoded.data[0, 0] == 7
     assert decoder.counters()["frames"] == 9
-    # Without gaps on the line, the bytes that follow confirm the frame.
+    # Without gaps on the line, the next bytes confirm the frame.
     assert decoder.feed(frame(images[8]), 0.0903) is None
     assert decoder.feed(MARKER, 0.0904) is not None
 
@@ -186,7 +186,7 @@ def test_a_quiet_line_does_not_confirm_a_frame_that_could_be_incomplete():
     decoder.feed(torn + MARKER[:1], 0.0)
     assert decoder.pending
     assert decoder.settle() is None
-    # If the next marker is lost, the bytes that follow immediately reject the frame.
+    # If the next marker is lost, the decoder rejects the frame because of the bytes that follow.
     decoder = FlexiTacDecoder(ROWS, COLS)
     decode(decoder, [frame(image) for image in numbered(3)])
     spliced = frame(bytes(CELLS))[:-4] + bytes([9]) * (CELLS - 3)

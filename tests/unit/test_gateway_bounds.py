@@ -48,7 +48,7 @@ def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
         Asking(context, served, addresses[1], "arm") for _ in range(2 * bounds.UNANSWERED_MAX)
     ]
     until(lambda: served.settle() or served.service.commands.count == bounds.UNANSWERED_MAX)
-    clock.sleep_until(clock.now() + 2.0)  # This delay represents a busy machine.
+    clock.sleep_until(clock.now() + 2.0)  # The delay simulates a busy machine.
     served.settle()
     assert len(served.link.asked) == bounds.UNANSWERED_MAX
     assert is_served(served, context, addresses[1])

@@ -238,7 +238,7 @@ def test_scripted_compression_indents_each_tip_by_eight_millimetres():
     np.testing.assert_allclose(deepest, 0.008, atol=2e-5)
     np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
     assert both == 0
-    # F = πE d²/cos θ holds at all times.
+    # The force follows F = πE d²/cos θ at all times.
     run(hand, 1.7)
     d = hand.d[0]
     assert d > 0.004
@@ -286,8 +286,8 @@ def test_samples_are_interpolated_at_the_frame_times():
     for number in range(hand.sample_count - 5, hand.sample_count):
         sample, exact = hand.sample(number), finer.sample(number)
         assert sample.t == number / 130.0
-        # The motion of a tick is 1e-4 rad and 4e-6 m. A sample without interpolation would have
-        # this error.
+        # The motion per tick is 1e-4 rad and 4e-6 m. Without interpolation, a sample would have an
+        # error of this size.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):

@@ -110,7 +110,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 
 _EIGHT_BITS = 255
-_NOISE_RATIO = 1.5  # multiple of tactile.noise above which the noise is reported
+_NOISE_RATIO = 1.5  # noise divided by tactile.noise, above which the noise is reported
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:

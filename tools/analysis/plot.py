@@ -82,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Plot a recording. Raises RecordingError, Missing, MissingExtra or OSError."""
-    require("plot")  # Fail early, before reading a long recording.
+    require("plot")  # Report a missing package before reading a long recording.
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
     # Reject files that are not recordings before loading the kernels.
@@ -248,7 +248,7 @@ def _against_angle(
 
     depths = _depths(seen["d"])
     widest = max(1.1 * float(np.abs(seen["theta"]).max()), 5.0 / DEGREES)
-    # Omit the yellow end of the colour map, because it is too faint in print.
+    # Omit the yellow end of the colour map, which is too faint in print.
     scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)
     for depth in depths:
         limit = float(table.tip.theta_limit(depth))

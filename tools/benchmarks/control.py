@@ -103,7 +103,7 @@ class Way(NamedTuple):
     is_steered: bool = False  # True if the measured angle is controlled to 0
     law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's control law
     force: float = _FORCE
-    # Load along x and y that is applied after the grip is established [N].
+    # Load along x and y that is applied once the grip is established [N].
     weight: tuple[float, float] = (0.0, 0.0)
 
 

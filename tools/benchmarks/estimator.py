@@ -55,7 +55,7 @@ _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
 _D_MAX, _TILT_MAX = 0.008, math.radians(30.0)  # [m], [rad]
-_SINGLE_POINT_COUNT = 16  # number of points used in turn by calls with floats
+_SINGLE_POINT_COUNT = 16  # number of points through which calls with floats cycle
 _CALL_AIM_NS = 800.0  # target duration of one call [ns]
 
 
@@ -150,7 +150,7 @@ def frames_to_contacts(rounds: int) -> Report:
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
     times = {name: taken / _FRAME_COUNT for name, taken in interleave(subjects, rounds).items()}
-    # Use the minimum, because other load on the machine affects the minimum least.
+    # Use the minimum, which is least affected by other load on the machine.
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
     for name, (run, truth, aim) in cases.items():

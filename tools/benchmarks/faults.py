@@ -29,12 +29,12 @@ _TRIAL_COUNT = 20
 _FORCES = (6.0, 12.0)  # requested forces [N]
 _EVENT_PREFIX = "consistency."  # prefix of the event kinds that report a faulty measurement
 
-# Criteria. Forces are relative to the requested force, and times are in seconds.
+# Pass criteria. Forces are relative to the requested force, and times are in seconds.
 SETTLES = "settles at 0.8 to 1.2 without a force increase"
 BOUNDED = "≤ 50 ms above 1.3, reported within 0.3 s"
 _SETTLED_RANGE = (0.8, 1.2)
-_EXCESS_TIME_MAX = 0.05  # maximum time above 1.3 times the requested force [s]
-_REPORT_TIME_MAX = 0.3  # report time limit, counted from half of the final error [s]
+_EXCESS_TIME_MAX = 0.05  # maximum time during which the force may exceed 1.3 times the request [s]
+_REPORT_TIME_MAX = 0.3  # time limit for a report [s], counted from half of the final error
 _SLIDE_MAX = 0.010  # m
 
 # Phases of a trial.

@@ -34,7 +34,7 @@ SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor has o
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
 SOFTFINGER = (sys.executable, "-m", "softfinger")
-_FRAME_COUNT = 16  # number of frames used in turn
+_FRAME_COUNT = 16  # number of frames through which the benchmark cycles
 
 
 class RigError(SoftfingerError):

@@ -29,13 +29,12 @@ _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
 # Relative force errors, and displacement [m].
 _ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01
 _REPORT_TIME_MAX = 2.0  # time limit for reporting a force error above `_ERROR_MAX` [s]
-# Without a load, the maximum ratio to the requested force, and the maximum time above this ratio
-# [s].
+# Limits without a load: force divided by the requested force, and time above that ratio [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
 _EVENT_PREFIX = "consistency."
-# Logarithm of the gain error above which it is correct to report a sensor as faulty.
+# Logarithm of the gain error. For larger errors, reporting a faulty sensor is correct.
 _GAIN_ERROR_MIN = math.log(1.3)
-_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which no object should be lost
+_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which no object may be lost
 
 # Full scale of 127.5 kPa, as on real tactile boards. The default of the simulated sensor is 262
 # kPa.
@@ -49,7 +48,7 @@ class HandCase:
 
     name: str
     force: float
-    # Settings of the hand that differ from the daemon's settings.
+    # Settings that differ between the hand and the daemon.
     hand: Sections = field(default_factory=dict)
     daemon: Sections = field(default_factory=dict)
     torque: float = 1.0  # ratio of the true torque constant to its setting
@@ -178,7 +177,7 @@ class Outcome:
     settled: float = math.nan  # final mean force over both tips, or NaN if the object was released
     peak: float = 0.0  # maximum force over both tips without a load
     above: float = 0.0  # longest time above `_EXCESS_RATIO` without a load [s]
-    first_off: float = math.inf  # time when the mean error first exceeded `_ERROR_MAX` [s]
+    first_off: float = math.inf  # time when the mean error first rose above `_ERROR_MAX` [s]
     named: float = math.inf  # time of the first diagnosis [s]
     accused: tuple[str, ...] = ()  # channels that were wrongly diagnosed
     raised: bool = False  # True if the force was increased without a load

@@ -99,7 +99,7 @@ class VirtualGrip(SimulatedDaemon):
 
     def __exit__(self, *ended: object) -> None:
         super().__exit__(*ended)
-        gc.collect()  # Reference cycles in a daemon keep megabytes of frames alive.
+        gc.collect()  # Reference cycles in a daemon keep megabytes of frames in memory.
 
     def command(self, name: str, **numbers: float) -> dict[str, Any]:
         """Send a command and ignore refusals."""

@@ -32,9 +32,9 @@ STEPS = (
     "relaxation",
     "scales",
 )
-_OF_PROFILE = STEPS[: STEPS.index("tare")]  # All other steps calibrate a tip.
-# Fraction of the prior standard deviation of a sensor's gain. A standard deviation above this
-# fraction means that the gain has not been measured in a grip.
+_OF_PROFILE = STEPS[: STEPS.index("tare")]  # All other steps calibrate a single tip.
+# Fraction of the prior standard deviation of a sensor's gain. If the standard deviation is larger
+# than this fraction, the gain has never been measured in a grip.
 _LEARNT = 0.8
 # Minimum relative standard deviation of each factor, because rubber and joints change from day to
 # day.

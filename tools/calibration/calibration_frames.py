@@ -77,7 +77,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
                 raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
-            # If a single recording contains the whole run, each frame with a contact is a load.
+            # If one recording contains the whole run, each frame with a contact counts as a load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
             frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
             return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
@@ -130,7 +130,7 @@ def _live(
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
                 bring(arguments, told, {"load": k + 1, **load})
-            # Frames that were scanned earlier may still show the previous load.
+            # Frames that were scanned earlier may still show the load before this one.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads

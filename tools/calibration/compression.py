@@ -228,7 +228,7 @@ def _force_law(
         raise CalibrationError(f"law: {'; '.join(notes)}")
     best, deepest = ours[0], max(run.depth for run in runs)
     force = max(float(np.ptp(run.force)) for run in runs)
-    # Attribute residuals in excess of the noise to the material law.
+    # Attribute any residual beyond the noise to the material law.
     misfit = best.residual * math.sqrt(max(1.0 - 1.0 / best.chi2, 0.0)) / force
     count = 0 if _is_constant(best) else _POINTS
     strain = np.linspace(0.0, deepest / tip.radius, count + 1)[1:]

@@ -23,7 +23,7 @@ from softfinger.tools.calibration.live_hand import LiveHand
 from softfinger.tools.recordings.reader import read_recording
 
 # Speed [rad/s], angle [rad] and number of strokes of each sweep. Slow sweeps determine the
-# break-away friction, and fast sweeps the other friction parameters.
+# break-away friction; fast sweeps determine the other friction parameters.
 _SWEEPS = ((0.05, 0.06, 2), (0.3, 0.4, 2), (0.6, 0.4, 2))
 _WIDEST = max(wide for _, wide, _ in _SWEEPS)
 _FROM_ENDS = 0.05  # margin to each end of the joint range [rad]

@@ -26,15 +26,15 @@ from softfinger.tools.recordings.recomputed import counts_of, recorded_models, r
 
 FloatArray = NDArray[np.float64]
 
-_STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces relative to the first force
+_STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, divided by the first force
 _HELD = 0.5  # hold time per force [s]
 _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
 # Accepted ratio of d from frames to d from joints. A ratio outside this range means that the frames
 # do not follow the joints.
 _SCALE = 0.5, 2.0
 _MISFIT_MAX = 0.3e-3  # RMS limit [m]; larger values indicate sliding, tilting or a second contact
-# Relative errors of d from frames. The first error applies if d is estimated from the shape of the
-# frame, and the second error if d is estimated from the amplitude.
+# Relative errors of d from frames: the first applies if d is estimated from the frame's shape, the
+# second if d is estimated from its amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 

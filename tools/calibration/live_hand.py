@@ -19,7 +19,7 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import client_keys
 
 _MOST = 1000  # maximum number of messages per read
-_WITHIN = 20.0  # time limit for each command, in the hand's time [s]
+_WITHIN = 20.0  # time limit for each command on the hand's clock [s]
 
 
 class LiveHand:

@@ -64,8 +64,8 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-# Minimum softening after the first loads that is reported, as a fraction. Plates and noise cause
-# less softening.
+# Minimum softening after the first loads that is worth reporting, as a fraction. Test plates and
+# noise cause less softening.
 _SOFTENS = 0.03
 # New calibration, summary line, and panels of the plot.
 Done = tuple[Calibration, str, tuple[Panel, ...]]

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 PITCH = 0.058 / 44  # m
 GRID = SensorGrid(rows=44, cols=44, pitch=PITCH)
 
-TILTED = -11.5  # relative angle after the finger rotation [degrees]
+TILTED = -11.5  # relative angle after the finger has rotated [degrees]
 ROLLED = 9.2  # relative angle after the object has rolled by 20.7° [degrees]
 
 

@@ -51,7 +51,7 @@ _WIDTH = 0.040
 _HALF_SEPARATION = 0.050
 _ROLL_STEPS = 104  # number of frames during rolling
 _LATE_FRAME_COUNT = 2  # number of frames in transit
-_RELATIVE_D_MIN = 1.0  # displacement above which relative errors are shown [mm]
+_RELATIVE_D_MIN = 1.0  # displacement above which the page shows relative errors [mm]
 _ROLLED_AT = 4  # displacement in the figure of the whole path [mm]
 _PATH = -12.5, 10.5
 _SCALES = {"d": 1e3, "theta": 1.0}  # factors for displayed errors
@@ -151,7 +151,7 @@ def _frames(
     assert hand is not None
     if place is not None:
         place(hand, 0.0)
-        loop.advance(3.0 * SCAN)  # Let all older frames arrive first.
+        loop.advance(3.0 * SCAN)  # Wait until all older frames have arrived.
     last = loop.state.contacts[0].seq
     for k in range(count + _LATE_FRAME_COUNT):
         if place is not None:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 SHARES = (0.0, 0.02, 0.05, 0.1)  # values drawn
 _EACH = tuple(k / 100.0 for k in range(11))
-DEPTH, SHARE = 6, 0.05  # depth [mm] and share that are also simulated with the plant
+DEPTH, SHARE = 6, 0.05  # depth [mm] and share of the case that the plant also simulates
 _STEPS = 208
 _FORCE, _SLOPE, _ENERGY = "F on the base", "dU/dd", "U"
 

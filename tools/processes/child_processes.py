@@ -81,7 +81,7 @@ class MonitorProcess:
                 on_end()
 
         signal.signal(signal.SIGCHLD, child_changed)
-        child_changed()  # The monitor may have ended before the handler was set.
+        child_changed()  # The monitor may have exited before the handler was installed.
 
     def close(self, patience: float = 2.0) -> None:
         """End the monitor if it is running, and wait until it has restored the terminal.
@@ -132,8 +132,8 @@ class RecorderProcess:
         self._closing = False
         self._said = ""
         self._lifeline = _Lifeline()
-        # The recorder runs in its own session, so that Ctrl-C does not reach it and it can record
-        # the daemon's last messages.
+        # The recorder runs in its own session, so Ctrl-C does not reach it. The recorder can
+        # therefore record the daemon's last messages.
         self._process = self._lifeline.start(
             ["record", *words],
             keys,

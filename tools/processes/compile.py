@@ -219,7 +219,7 @@ def _start() -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
         text=True,
-        process_group=0,  # Ctrl-C reaches only the parent process, which then ends the children.
+        process_group=0,  # Ctrl-C reaches only the parent process, which then stops its children.
     )
 
 

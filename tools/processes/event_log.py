@@ -137,5 +137,5 @@ class _LogHandler(logging.Handler):
         level = _LEVELS.get(record.levelno, "error")
         try:
             self._log.line(level, record.name.rpartition(".")[2], record.getMessage())
-        except Exception:  # A logging error must not end the caller.
+        except Exception:  # A logging error must not stop the caller.
             self.handleError(record)

@@ -137,7 +137,7 @@ def _serve(
                 log.plain(f"softfinger: {error}")
                 return 1
         page: AbstractContextManager[Any] = nullcontext()
-        log.quiet = arguments.monitor  # From here on, the page uses the terminal.
+        log.quiet = arguments.monitor  # From this point on, the page uses the terminal.
         if arguments.monitor:
             addresses = settings.stream.address, settings.commands.address
             page = MonitorProcess(*addresses, loop.end, settings.access.keys)

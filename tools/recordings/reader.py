@@ -166,8 +166,7 @@ class Recording:
         for _, message in self.messages():
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
             if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):
-                # The clock time of a frame is its scan time, whereas its timestamp is its arrival
-                # time.
+                # A frame's clock time is its scan time, but its timestamp is its arrival time.
                 after = stamp - self.start - float(message.get("delay_s", 0.0))
                 self._left, self.chunks = state
                 # The Unix time is a float with a resolution of 0.2 µs.

@@ -28,7 +28,7 @@ from softfinger.tools.recordings.reader import MessageSource, Recording
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
-# Fields that depend on the machine's timing and not on the loop's inputs.
+# Fields that depend on the machine's timing rather than on the loop's inputs.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of hand/settings
@@ -202,7 +202,8 @@ def _run(
             _compare(result, state, again)
 
 
-# Input of a tick, counts of recent frames by (finger, seq), commands, and state (None if missing).
+# Tick input, numbers of recent frames by (finger, seq), commands, and state (None if the state is
+# missing).
 _Tick = tuple[
     dict[str, Any], dict[tuple[int, int], Any], list[dict[str, Any]], dict[str, Any] | None
 ]

@@ -54,13 +54,13 @@ _SILENCE_TIME = 2.0  # time without messages before a notice is printed [s]
 # Time between socket reads [s]. Waking up for each message would take longer than processing it.
 _POLL_INTERVAL = 0.1
 _BACKLOG_TIMEOUT = 10.0  # time limit for processing queued messages at the end [s]
-_TRANSIT_TIME = 0.5  # waiting time at the end for messages in transit on a busy machine [s]
+_TRANSIT_TIME = 0.5  # time allowed at the end for messages that are still in transit [s]
 _PROGRESS_INTERVAL = 0.5  # time between progress lines and between flushes [s]
 _BATCH_SIZE = 1000  # number of messages between time checks
 
 
-# A killed recorder loses only the incomplete chunk, which contains the messages since the last
-# flush.
+# If the recorder is killed, only the incomplete chunk is lost. The chunk contains the messages
+# since the last flush.
 CHUNK_SIZE = 256 * 1024  # chunk size before compression [bytes], 0.2 s of state at 1 kHz
 
 
@@ -90,7 +90,7 @@ class RecordingWriter:
         # Repeated messages that arrived before any other message.
         self._early: list[tuple[bytes, dict[str, Any]]] = []
         try:
-            # The buffer is large enough for one write per chunk.
+            # The buffer is large enough to hold a chunk in one write.
             self._file = path.open("xb", buffering=4 * CHUNK_SIZE)
         except FileExistsError:
             raise RecordingError(f"{path}: already exists; choose another file") from None
@@ -219,7 +219,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "tick)",
     )
     add_split(parser)
-    # The process ends when this pipe closes.
+    # The process exits when this pipe closes.
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)
     parser.add_argument(
         "--recover", action="store_true", help="repair a truncated FILE instead of recording"
@@ -296,8 +296,8 @@ class _Recorder:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)
                 shown = now
-        # Messages that were sent before a signal, such as the daemon's last ones, may arrive after
-        # the signal.
+        # Messages sent before a signal may arrive after the signal. The daemon's last messages are
+        # an example.
         self._read_remaining(
             socket, _TRANSIT_TIME if ending.is_requested or not ending.is_met else 0.0
         )
@@ -320,7 +320,7 @@ class _Recorder:
                     return
                 began = time.monotonic()
                 socket.poll(int(_POLL_INTERVAL * 1e3))
-                # A stall of the process counts as one poll interval.
+                # If the process stalls, the stall counts as one poll interval.
                 quiet -= min(time.monotonic() - began, _POLL_INTERVAL)
 
     def _take(self, frames: list[bytes]) -> None:

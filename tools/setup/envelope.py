@@ -174,7 +174,7 @@ def grasped(
         if hand.mode != "holding":
             return Cell(REFUSED, math.nan)
         before = hand.plant.object_pose.copy()
-        # The friction of the table opposes the load, so add it to the load.
+        # Table friction opposes the load, so increase the load by the friction.
         pull = weight * (1.0 + settings.simulation.table_friction)
         for k in range(_LOAD_STEP_COUNT):
             load, phi = pull * (k + 1) / _LOAD_STEP_COUNT, float(hand.plant.object_pose[2])

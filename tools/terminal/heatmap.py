@@ -19,8 +19,8 @@ FloatArray = NDArray[np.float64]
 LEVELS = 32  # number of colours; redraws are faster with fewer colours
 SHADES = " ·░▒▓█"  # shades for terminals with too few colours
 
-# Lightness increases in equal steps from dark blue to bright yellow, so that the order of the
-# colours is also visible in greyscale and to colour-blind users.
+# Lightness increases in equal steps from dark blue to bright yellow. The order of the colours is
+# therefore also visible in greyscale and to colour-blind users.
 _ANCHORS = (
     (24, 18, 56),
     (50, 46, 110),

@@ -36,8 +36,8 @@ from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGon
 STEP_ANGLE = math.radians(5.0)  # object rotation per press of an arrow key [rad]
 # Upper limit of a force range [N], and step in this range [N].
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
-_ACCUMULATION_TIME = 1.0  # interval within which key presses add up [s]
-_CONFIRMATION_TIME = 3.0  # time limit for the second press of d, which confirms disarming [s]
+_ACCUMULATION_TIME = 1.0  # time within which key presses are combined [s]
+_CONFIRMATION_TIME = 3.0  # time limit for the second d key press, which confirms disarming [s]
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
@@ -139,7 +139,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plain", action="store_true", help="print plain lines instead of the page"
     )
-    # The process ends when this pipe closes.
+    # The process exits when this pipe closes.
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)
 
 
@@ -271,7 +271,7 @@ def _page_loop(
         for each in ending.wait_readable(due - time.monotonic(), *keyboards):
             typed = _read(each)
             if not typed:
-                keyboard = None  # The keyboard was closed; continue without it.
+                keyboard = None  # Standard input was closed; continue without a keyboard.
             for key in keys.decode(typed):
                 if key == "q":
                     return ending.end()

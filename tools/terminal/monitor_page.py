@@ -92,8 +92,8 @@ class MonitorPage:
     coloured: bool = True  # True if the terminal has more than 16 colours
     keys: bool = True  # True if a keyboard is available
     guarded: bool = False  # True if the page has subscribed with access keys
-    force: float = math.nan  # force requested by the grasp key [N]
-    explains: bool = False  # True if explanations are shown instead of the numbers
+    force: float = math.nan  # force requested when the grasp key is pressed [N]
+    explains: bool = False  # True if the page shows explanations instead of numbers
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
 
     def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:

@@ -38,7 +38,7 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-RECENT_TIME = 3.0  # time window for the sum of waits for a busy machine [s]
+RECENT_TIME = 3.0  # time window over which waits for a busy machine are added up [s]
 EVENT_COUNT_MAX = 200  # number of stored events
 GLOSSARY = (  # meanings of the terms on the pages
     ("d", "displacement of the tip by the object's face"),
@@ -134,8 +134,8 @@ class StreamState:
         self._lease_holder = "", -math.inf  # holder of the command lease, and end of the lease [s]
         self._lease = math.nan  # lease duration [s]
         self.commanded = math.nan  # force in the last grasp command from any client [N]
-        self.force_default = math.nan  # force of a grasp command that specifies no force [N]
-        self.force_limit = math.inf  # maximum grip force for commands [N]
+        self.force_default = math.nan  # default force of a grasp command [N]
+        self.force_limit = math.inf  # maximum grip force that a command may request [N]
         self.skipped_count = 0
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # smoothed time between states [s]
@@ -193,8 +193,8 @@ class StreamState:
         )
 
     def _read_event(self, event: schema.Event, _: float) -> None:
-        # An event that is repeated to a late subscriber has its original seq and time. An event
-        # from another daemon has a different time.
+        # A late subscriber receives repeated events with their original seq and time. An event from
+        # another daemon has a different time.
         name = event.seq, event.timestamp
         if event.again and name in self._event_times:
             return
@@ -317,7 +317,7 @@ class _Pending:
     # Refusal due to lateness, stored until the command is sent again.
     late: dict[str, Any] | None = None
     again_at: float = 0.0  # time of the next attempt
-    warned: bool = False  # True once a message about the missing reply has been shown
+    warned: bool = False  # True once the page has reported the missing reply
 
 
 class Commander:

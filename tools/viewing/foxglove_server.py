@@ -38,7 +38,7 @@ _FRAME = "hand"  # coordinate frame [m]: x from the left to the right pivot, y a
 _LIST = {"type": "array", "items": {"type": "object", "properties": {}}}
 _ENTITIES = {"type": "object", "properties": {"deletions": _LIST, "entities": _LIST}}
 _HEAD = struct.Struct("<BIQ")  # message header with kind, subscription and time [ns]
-_EVENT_COUNT = 50  # number of events stored for new subscribers, as in the daemon
+_EVENT_COUNT = 50  # number of events that are stored for new subscribers, as in the daemon
 _QUEUE_LENGTH = 500  # maximum number of messages queued for a client; excess messages are dropped
 _SEND_TIMEOUT = 2.0  # timeout for a client to accept a message [s]
 

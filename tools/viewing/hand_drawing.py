@@ -56,7 +56,7 @@ class FingerLines(NamedTuple):
     link: FloatArray  # pivot, link end, and centre of the tip's base
     base: FloatArray
     skin: FloatArray
-    face: FloatArray | None  # end points of the contact line on the object's face
+    face: FloatArray | None  # end points of the line along which the tip touches the object's face
     # Point at which the tip pushes on the object, and unit vector in the push direction.
     push: FloatArray | None
 

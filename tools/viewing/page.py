@@ -164,7 +164,7 @@ class Site:
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
-        # In this case, each request contains a secret, so any host name is accepted.
+        # If each request contains a secret, the server accepts any host name.
         if self._announce is not None:
             here = True
             if not self._allows(request):
@@ -261,8 +261,8 @@ class Site:
             asked = json.loads(text)
             name = str(asked["command"])[:_NAME_LENGTH_MAX]
             age = time.monotonic() - float(asked.pop("seen", "nan"))
-            # This call fails for values that msgpack cannot represent, such as deep nesting and
-            # long integers.
+            # The call fails for values that msgpack cannot represent, such as deeply nested maps
+            # and very large integers.
             msgpack.packb(asked)
         except _NO_COMMAND:
             return '✗ invalid command: expected a JSON object with "command", not nested deeply'
@@ -304,7 +304,7 @@ def listen(host: str, port: int | None) -> socket.socket:
             at = f"--host {host}" if port is None else f"port {port} of {host}"
             raise ViewError(f"{at} can't be used: {error.strerror}") from None
         return listen(host, 0)
-    # Use a small buffer, because buffered data count as accepted before the client has read them.
+    # Use a small buffer, because buffered data count as sent before the client has read them.
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_SIZE)
     return listener
 

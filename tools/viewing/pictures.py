@@ -49,7 +49,7 @@ _LIMIT_FRACTION = 0.8  # fraction of a limit above which a value is reported
 _DARK_SIGMA = 2.0  # minimum visible pressure, in standard deviations of the cell noise
 _FULL_SCALE_MIN = 10.0  # minimum full scale, in standard deviations of the cell noise
 _OLD_TIME = 0.35  # age above which the last message is shown as old [s]
-_OLD_PERIODS = 4.0  # the same age limit in stream periods; the longer time applies
+_OLD_PERIODS = 4.0  # age limit in stream periods; the longer of the two limits applies
 _NUMBER_MAX = 1e6  # limit for drawn numbers, because messages may contain any value
 _DEGREE = math.degrees(1.0)
 
@@ -90,7 +90,7 @@ _HEADLINE = (  # title, decimals and plotted fields
     ("Displacement d", 2, "left.d right.d"),
 )
 _SERVOS = ("q", "current")  # fields that are missing in a hand without servos
-_DEVIATED = ("force", "d", "theta")  # finger fields whose {}_std is drawn, too
+_DEVIATED = ("force", "d", "theta")  # finger fields whose {}_std is also drawn
 _OTHERS = {  # names and colours of lines that do not belong to a finger
     "object.angle": ("object", OBJECT),
     "object.width": ("object", OBJECT),
@@ -153,7 +153,7 @@ class Pictures:
         self._period = period
         self._number = 0  # number of rows so far
         self._marks: list[Any] = []
-        self.recording: dict[str, Any] = {}  # status set by the page's recorder
+        self.recording: dict[str, Any] = {}  # status that the page's recorder sets
         self._settings_text = ""  # last settings message, unparsed
         self.seen = self.unreadable = 0  # number of states, and number of unreadable messages
         self.clear()

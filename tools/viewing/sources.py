@@ -25,7 +25,7 @@ from softfinger.tools.terminal.stream_state import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
 _SILENCE_TIME = 2.0  # time without messages before a notice is printed [s]
-_DRAW_PAUSE_MAX = 1.0  # maximum time between pictures if drawing is slow [s]
+_DRAW_PAUSE_MAX = 1.0  # maximum time between pictures when drawing is slow [s]
 _MARK_COUNT_MAX = 2_000  # maximum number of marks shown for a recording
 _SPEED_RANGE = 0.1, 10.0
 # Maximum number of messages queued between reads. The queue is long enough for 2 s of states, truth
@@ -100,13 +100,13 @@ class Playback:
     def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
         self._recording = recording
         self._pictures = pictures
-        self._period = period  # time between pictures [s]
+        self._period = period  # time between two pictures [s]
         self._target: float | None = 0.0  # requested position, set by another thread [s]
         self.playing = True
         self.speed = 1.0
         self.position = 0.0  # time since the first message [s]
         self._messages: Iterator[tuple[bytes, dict[str, Any]]] = iter(())
-        self._ahead: tuple[bytes, dict[str, Any]] | None = None  # next message to be drawn
+        self._ahead: tuple[bytes, dict[str, Any]] | None = None  # next message to draw
         # Read the settings first, because a recording may contain them only once.
         for message in islice(recording.messages([schema.SETTINGS]), 1):
             pictures.take(*message)
@@ -128,8 +128,8 @@ class Playback:
     def run(self, ending: StopCondition) -> None:
         """Play until the end is requested."""
         recording, pictures = self._recording, self._pictures
-        # Search for marks with a separate reader. The search takes seconds for a long recording and
-        # must not delay the first picture.
+        # Search for marks with a separate reader. Searching a long recording takes seconds and must
+        # not delay the first picture.
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)

@@ -50,7 +50,7 @@ from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # maximum delay of the physics [s]
 _REQUESTS = ("report", "forget", "place")  # words on the control socket that do not start a fault
-# Joint goals [rad]. A goal of 6 rad is beyond the joint stops.
+# Joint goals [rad]. A goal of 6 rad lies beyond the joint stops.
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
 _TURN_CURRENT = 0.3  # motor current equivalent to turning a joint by hand [A]
 _TURN_TIME = 1.0  # s
@@ -87,7 +87,7 @@ class EmulatorClock:
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
-        self.held = False  # True if the deadline limited the time returned last
+        self.held = False  # True if the deadline limited the most recently returned time
         self._deadline = deadline
         self._seen = 0.0
         self._bound = math.inf  # time after which the clock waits for the next deadline

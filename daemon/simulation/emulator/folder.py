@@ -135,8 +135,8 @@ class ControlPort:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with contextlib.suppress(FileNotFoundError):
-                # This process holds the folder lock, so a killed emulator has left the socket
-                # behind.
+                # This process holds the folder lock, so the socket was left behind by a killed
+                # emulator.
                 if not stat.S_ISSOCK(os.stat(_CONTROL, dir_fd=self._folder).st_mode):
                     raise FolderError(f"{folder / _CONTROL}: already exists; move it elsewhere")
                 os.unlink(_CONTROL, dir_fd=self._folder)
@@ -197,8 +197,8 @@ def carry_out(folder: Path, text: str) -> str:
         If the emulator rejects the text; the message lists the expected words.
     """
     reply = send_words(folder, text)
-    # The emulated hand's clock times the motion. This clock stops while the emulator is suspended,
-    # so ask again for the remaining time.
+    # The motion follows the emulated hand's clock, which stops while the emulator is suspended.
+    # Therefore, ask for the remaining time again.
     kind = text.partition(" ")[0]
     while kind in _MOTIONS and reply.startswith("{"):
         left = json.loads(reply)["wait"]

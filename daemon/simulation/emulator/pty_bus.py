@@ -23,7 +23,7 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 
 _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control characters, two speeds
 _TERMIOS2 = struct.Struct("=4IB19s2I")
-_BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
+_BITS_PER_BYTE = 10  # one start bit, eight data bits and one stop bit
 _READ_SIZE = 4096
 _READS_PER_TURN = 4  # maximum number of reads per turn; the limit leaves time for other tasks
 # Duration of silence that ends a packet [s]. The duration is longer than 1.5 ms because this
@@ -205,7 +205,7 @@ class PtyServoBus:
             self._write(heapq.heappop(self._due)[2])
 
     def _write(self, data: bytes) -> None:
-        # A client that never reads fills the terminal buffer. A real wire would lose these bytes,
+        # If a client never reads, the terminal buffer fills up. A real line would lose these bytes,
         # too.
         try:
             os.write(self._master, data)

@@ -36,8 +36,8 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
             best = out
             face = k
         if out > 0.0:
-            # Edges run counter-clockwise, so an edge direction is the outward normal rotated by
-            # 90°.
+            # Edges run counter-clockwise, so rotating an outward normal by 90° gives the edge
+            # direction.
             along = (v - edge.y) * edge.normal_x
             along -= (u - edge.x) * edge.normal_y
             if 0.0 <= along <= edge.length:

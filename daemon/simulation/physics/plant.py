@@ -175,8 +175,8 @@ def advance_state(plant: Plant, h: float) -> None:
             continue
         displacement = h * (1.5 * first.position[j] + 0.5 * second.position[j])
         change = h * (1.5 * first.velocity[j] + 0.5 * second.velocity[j])
-        # The step is too long if it would move a tip by more than a quarter of its radius. Limiting
-        # the displacement can only remove energy.
+        # A step is too long if it would move a tip by more than a quarter of the tip radius.
+        # Limiting the displacement can only remove energy.
         limit = 0.25 * p.radius
         if j < 2:
             limit /= p.length + abs(p.offset)
@@ -282,7 +282,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
-    # Pass a single record from here on, because each array argument costs a reference count per
+    # From here on, pass a single record, because each array argument costs a reference count per
     # call.
     data = tables[0]
     h = p.step
@@ -311,7 +311,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             state.position[2] = script_x(plant, plant.step_count * h)
         if relaxing:
             relax_shears(plant)
-        # This evaluation applies slip by limiting the shears, and `settle` then stores them.
+        # This evaluation models slip by limiting the shears, which `settle` then stores.
         evaluate_state(plant, data)
         if scripted:
             open_guard(plant)
@@ -320,7 +320,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             if changed == 2:
                 limit_energy(plant, data)
             elif changed == 1:
-                # The new bristles of the slowed gears are also undeflected.
+                # The bristles of the slowed gears are also undeflected at first.
                 store_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:

@@ -29,7 +29,7 @@ ALONG_THETA = 1
 ALONG_SHEAR = 2
 
 LAYERS = 8  # number of footprint layers that slip successively from the edge inwards
-CORNERS = 8  # maximum number of object corners
+CORNERS = 8  # maximum number of corners of an object
 SHEARS = CORNERS + 2  # palm shear at each corner, followed by the tip-on-tip shear of each tip
 PALM_ROWS = 2 * CORNERS  # height and slip of each corner
 EXTRA_ROWS = PALM_ROWS + 6  # adds d, θ and d_t of each tip on the other tip
@@ -119,7 +119,7 @@ class Parameters(Record):
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
     stribeck: float  # additional friction at standstill [N·m]
-    load_friction: Pair  # ratio of friction to gear torque, and additional ratio at standstill
+    load_friction: Pair  # friction divided by gear torque, and the additional ratio at standstill
     stribeck_speed: float  # speed at which the additional friction has decreased to 1/e [rad/s]
     presliding: float  # bristle deflection at which the gears slip [rad]
     torque_constant: float  # [N·m/A]
@@ -184,7 +184,7 @@ class TipContact(Record):
     sine: float  # sin θ
     cosine: float
     tangent: float  # tan θ, or 0 for bristles and beyond the soft hemisphere
-    gain: float  # ratio of the force to the force on a plane, due to w(θ) and face curvature
+    gain: float  # force divided by the force on a plane; includes w(θ) and face curvature
     curvature: float  # curvature of the touched surface [1/m]
     travel: float  # largest possible increase in d during this step [m]
     rate_d: float  # [m/s]
@@ -238,13 +238,13 @@ class Plant(Record):
     parameters: Parameters
     goals: Goals
     state: Motion
-    # Current contact of each tip. If a tip has two contacts, this is the stronger one.
+    # Current contact of each tip: the stronger contact if a tip has two.
     sensed_contact: Annotated[Records[TipContact], 2]
     on_other_tip: Flags  # 1 if the contact is with the other tip
     step_count: int  # number of completed sub-steps
     sample_count: int  # number of samples taken
     energy: float  # kinetic, elastic and gravitational energy [J]
-    energy_limit: float  # energy limit that results from the work done on the hand [J]
+    energy_limit: float  # maximum energy that the work done on the hand allows [J]
     limited_step_count: int  # number of sub-steps that the energy guard has limited
     last_state: Motion  # state before the step
     stage_state: Motion  # state of the second stage

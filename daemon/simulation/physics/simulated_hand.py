@@ -73,8 +73,8 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius, table.header.deepest)
     c = table(d, 0.0)
-    # The normal stiffness ∂F/∂d and the shear stiffness 2F/d are similar. The factor 2 accounts for
-    # two tips.
+    # The normal stiffness ∂F/∂d and the shear stiffness 2F/d are similar. The result is doubled
+    # because there are two tips.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
     stiffness *= 1.0 + sum(simulation.tip_relaxation)
     shape = shape_of(settings)
@@ -147,7 +147,8 @@ def _object(p: Parameters, settings: Settings) -> None:
     p.table_torque = p.table_force * shape.mean_radius
     p.table_speed = TABLE_SPEED
     p.table_spin = TABLE_SPEED / shape.mean_radius
-    # A single finger cannot hold an object, so the object is then fixed to the test bench.
+    # A single finger cannot hold an object, so a one-finger scene fixes the object to the test
+    # bench.
     p.object_held = (
         shape.kind == NO_OBJECT
         or len(settings.scene.fingers) == 1
@@ -172,7 +173,7 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # This damping makes the joint with its position loop critically damped.
+    # This damping makes the joint and its position loop critically damped.
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
@@ -252,7 +253,7 @@ class SimulatedHand:
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         goals.stiffness[:] = goals.duty[:] = 1.0
-        # The buffer holds all samples that may be in transit to a sensor's reader.
+        # The buffer holds every sample that may be on its way to a sensor's reader.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLE_COUNT
         self._ring = np.zeros(stored, Sample.dtype)

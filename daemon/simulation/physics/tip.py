@@ -223,11 +223,11 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # shear at which T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # Most steps are far from slip, and two comparisons detect these steps.
+        # Most steps are far from slip, which two comparisons can establish.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction
-        # The tolerance prevents a shear that has just been limited from being limited again.
+        # The tolerance ensures that a limited shear is not limited a second time.
         stuck = friction * normal * (1.0 + _FRICTION_TOLERANCE)
         if abs(tangential) > stuck or curvature * (shear - neutral) ** 2 > at_neutral:
             slope_there = n1 + 2.0 * n2 * neutral
@@ -257,8 +257,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         shear = 0.0
 
     # Damping must not make a separating tip pull, and shear damping must not exceed friction. A
-    # stuck tip does not slide, except by the spring model's term tan θ ḋ, which keeps the virtual
-    # work consistent.
+    # stuck tip does not slide. The spring model's term tan θ ḋ is an exception that keeps the
+    # virtual work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
     loss = p.loss
@@ -351,8 +351,8 @@ def touch_object(
     y_rate = now.velocity[3]
     rotation_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
-    # The integrator matrix uses the stiffness at the end of the step, which keeps it correct during
-    # an impact. Damping uses the current stiffness.
+    # The integrator matrix uses the stiffness at the end of the step and therefore remains accurate
+    # during an impact. Damping uses the current stiffness.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
         tip.gain = fade(theta)[0] * p.factor * plant.relaxation_factor[finger]
@@ -363,8 +363,8 @@ def touch_object(
     theta_y = 0.0
     theta_rotation = 1.0
     if curved >= 0.0:
-        # The vector m points to the centre of curvature, which is fixed to the object: the corner
-        # or the disc centre.
+        # The vector m points to the centre of curvature, which is fixed to the object: either a
+        # corner or the centre of a disc.
         inverse = 1.0 / max(distance + curved, _CORNER_DISTANCE_MIN * radius)
         theta_q -= v_t * inverse
         theta_x = -my * inverse

@@ -181,8 +181,7 @@ class SimulatedTactile:
             shear = float(sample.tangential[finger]) * (1.0 - d / self._radius)
             self._model.press(d, theta, 0.0, number * self._period, curvature, factor, shear)
             return True
-        # Remove the effect of curvature from the factor, because the sensor model already includes
-        # this effect.
+        # Divide out the effect of curvature, because the sensor model already includes it.
         factor *= math.sqrt(1.0 + curvature * self._radius)
         # The force is proportional to d². If half the tip is beyond the face edge, the force is
         # halved.
@@ -200,7 +199,7 @@ class Arrivals:
     to ``jitter`` [s]. Frames always arrive in order.
     """
 
-    # Allowance for clock rounding errors, so that a frame that is due now counts as arrived.
+    # Tolerance for clock rounding errors: a frame that is due now counts as arrived.
     _SLACK = 1e-9
 
     def __init__(

@@ -212,12 +212,12 @@ class ServoBus:
         replies = []
         for servo in servos:
             if servo.id == packet.id:
-                # The reply uses the return level, delay and ID from before the instruction.
+                # The reply uses the return level, delay and ID that applied before the instruction.
                 level = servo.table.get(reg.STATUS_RETURN_LEVEL)
                 delay, name = servo.return_delay, servo.id
                 error, data = _execute(servo, instruction, packet.parameters, t)
                 if level >= needed:
-                    # The reply uses the alert bit from after the instruction.
+                    # The reply uses the alert bit that applies after the instruction.
                     status = framing.status(name, error | servo.alert, data)
                     replies.append(TimedReply(delay, status))
             elif servo.shadow == packet.id:
