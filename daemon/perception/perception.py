@@ -142,7 +142,7 @@ class FingerPerception:
             tactile.rate, settings.safety.frame_age_fault, tactile.backend != "replay"
         )
         self.estimate = ContactEstimate()  # estimate from the last valid frame
-        active = getattr(sensor, "live", None)  # Some recordings contain only part of the cells.
+        active = getattr(sensor, "live", None)  # Some recordings contain only some of the cells.
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration
         )

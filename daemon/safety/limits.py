@@ -235,8 +235,8 @@ def _servos_silent(view: View, state: State, _: float) -> str:
 
 
 @Limit("servos.silent",
-    "fraction of servo readings that failed in the last second, with or without torque", "warn",
-    ("servos.reply_timeout",), "servos")  # fmt: skip
+    "fraction of servo readings that failed in the last second, whether torque is on or off",
+    "warn", ("servos.reply_timeout",), "servos")  # fmt: skip
 def _servos_late(view: View, _: State, fraction: float) -> str:
     if view.failed <= fraction * _FAILED_FRACTION_MAX:
         return ""
@@ -430,12 +430,13 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     )
 
 
-_OVERLAP_RATIO = 0.5  # minimum overlap in tip radii; offset errors and frame latency cause less
+# Minimum overlap in tip radii. Offset errors and frame latency cause smaller overlaps.
+_OVERLAP_RATIO = 0.5
 
 
 @Limit("joint.opens",
-    "overlap of the tips (computed from the joint angles) during the approach, although one tip "
-    "has no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
+    "overlap of the tips during the approach according to the joint angles, while one tip "
+    "measures no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 

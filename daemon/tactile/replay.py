@@ -15,7 +15,8 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
-_PITCH_TOLERANCE = 0.01  # relative tolerance between the pitch in the file and in the settings
+# Tolerance for the relative difference between the pitches in the file and in the settings.
+_PITCH_TOLERANCE = 0.01
 
 
 def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:

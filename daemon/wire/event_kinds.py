@@ -55,8 +55,8 @@ KINDS: dict[str, EventKind] = {
     "realtime": EventKind(
         "info, warning",
         "Real-time features were enabled. A warning names a feature that the system denied.",
-        "Run the command in the warning, which permits the feature, or disable the feature in "
-        "`[realtime]`.",
+        "To permit the feature, run the command in the warning; otherwise, disable the "
+        "feature in `[realtime]`.",
     ),
     "late": EventKind(
         "warning", "The machine is busy: ticks were late, or a simulated hand was paused.", _BUSY
@@ -286,7 +286,7 @@ KINDS: dict[str, EventKind] = {
     "tare": EventKind(
         "info, warning",
         "A tare has ended. The message states the median and the largest change in the zero "
-        "offsets. If the level is warning, the sensor was not tared because most cells are "
+        "offsets. At the `warning` level, the sensor was not tared because most cells are "
         "saturated without contact.",
         "If the level is warning, check the board's gain and `tactile.full_count`. If the "
         "change is large at every start, run `softfinger calibrate tare` again.",

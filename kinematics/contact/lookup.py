@@ -44,7 +44,7 @@ _END = H_END * (1.0 - 1e-12)  # limit of h at the end of the domain, with a marg
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
 _ONE = 1023 << _MANTISSA  # bits of 1.0
-_FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bits of the smallest number above H_END
+_FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bit pattern of the smallest number above H_END
 
 
 @inlined_kernel

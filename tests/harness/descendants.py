@@ -34,7 +34,7 @@ def adopt_orphans() -> None:
 
 
 def end_with_this_process() -> None:
-    """When this process ends, even by SIGKILL, kill all processes that it starts from now on."""
+    """Ensure that child processes are killed when this process ends, even by SIGKILL."""
     word = f"TESTS_OF_PROCESS={os.getpid()}"
     _watching.append(
         subprocess.Popen(

@@ -51,7 +51,7 @@ class ReferenceHand(HandGeometry):
         return np.asarray((self.tip_radius - d) * by_theta + along * by_s - np.tan(theta) * by_d)
 
     def inverse(self, pose: ArrayLike, d: ArrayLike, width: float) -> FloatArray:
-        """Return joint angles (2,) that indent each tip by ``d`` (2,) [m] on an object at ``pose``.
+        """Return joint angles (2,) at which an object at ``pose`` indents tips by ``d`` (2,) [m].
 
         The solution is closed-form: O1·n = −B cos φ + L sin θ1 + e cos θ1, and the mirror image for
         the other finger. A negative ``d`` is a gap. Raises ValueError if a finger cannot reach this

@@ -37,7 +37,7 @@ def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: An
 
 
 def put_fault(bus: ServoBus, text: str, t: float) -> None:
-    """Apply a fault in text form, e.g. ``silent=2``."""
+    """Apply a fault given as text, e.g. ``silent=2``."""
     kind, _, value = text.partition("=")
     bus.fault(kind, float(value), t)
 

@@ -1,4 +1,4 @@
-"""Test a short real-time soak: its checks of the bus, memory and lost messages."""
+"""Run a short real-time soak; test that it checks the bus, the memory and lost messages."""
 
 import copy
 import math

@@ -171,7 +171,7 @@ def test_the_last_full_cycle_is_used():
 def test_a_hold_at_the_full_depth_is_excluded():
     d, force = pressed(springs, np.random.default_rng(5), 0.02)
     rng = np.random.default_rng(12)
-    hold = d.max() + 1e-5 * rng.standard_normal(200)  # Add noise of the encoder.
+    hold = d.max() + 1e-5 * rng.standard_normal(200)  # Add encoder noise.
     relaxed = np.linspace(force.max(), 0.7 * force.max(), 200)
     peak = int(np.argmax(d)) + 1
     run = loading(np.insert(d, peak, hold), np.insert(force, peak, relaxed))

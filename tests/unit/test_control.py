@@ -30,7 +30,7 @@ def watched(sections: dict[str, dict[str, Any]], **simulation: float) -> Simulat
 
 
 def grasped(hand: SimulatedDaemon, force: float = 10.0, seconds: float = 2.0) -> Any:
-    """Grasp and return the recorded values from the moment both tips are in contact."""
+    """Grasp the object; return the values recorded from the moment both tips are in contact."""
     hand.grasp(force)
     seen = hand.watch(seconds)
     return seen.since(int(np.flatnonzero((seen.force > 0.3).all(axis=1))[0]))

@@ -69,7 +69,8 @@ def test_quasi_static_steering_gain(degrees, gain):
 def test_load_dependent_friction_equals_the_gear_efficiency():
     # With a friction of a fraction μ of motor and contact torque, the transmitted fraction is (1 −
     # μ)/(1 + μ). When the gears are backdriven, the fraction is the inverse.
-    # Fraction of the torque, and constant friction [N·m] (half only at standstill).
+    # Friction as a fraction of the torque, and a constant term [N·m], half of which acts only at
+    # standstill.
     share, rest = 0.25, 0.02
     simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
     simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}

@@ -79,7 +79,7 @@ def test_a_velocity_without_motion_is_detected():
 
 @pytest.mark.parametrize("seconds", [0.03, 0.06, 0.2])
 def test_a_stall_while_a_joint_moves_is_not_a_jump(seconds):
-    """The stall may occur before the request, or between the reply and its reception."""
+    """The stall may occur before the request is sent, or between the reply and its receipt."""
     for at_answer in (False, True):
         joint = Joint()
         for _ in range(100):

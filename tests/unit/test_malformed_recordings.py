@@ -1,4 +1,4 @@
-"""Test that malformed messages in recordings are reported and omitted without a traceback."""
+"""Test that malformed messages in recordings are reported and skipped, without a traceback."""
 
 import copy
 from pathlib import Path

@@ -61,7 +61,7 @@ def test_each_topic_is_published_on_every_nth_tick_or_frame():
     assert ticks["state"] == list(range(5, 2001, 5))
     assert ticks["stats"] == [3, 503, 1003, 1503]
     assert not set(ticks["state"]) & set(ticks["stats"])
-    # The publisher sends every fourth frame of 100 Hz, which gives 25 Hz.
+    # Frames arrive at 100 Hz, and the publisher sends every fourth frame, that is, 25 per second.
     for frames in listener.frames:
         assert [seq // 4 for seq in frames] == list(range(len(frames)))
         assert len(frames) == pytest.approx(100, abs=1)

@@ -15,10 +15,10 @@ from tests.unit.test_control import grasped
 FORCE = 6.0
 BOTH = {"consistency.left_sensor", "consistency.right_sensor"}
 
-# Each fault has its kind, value, duration [s], fingers, expected events and expected mode
-# afterwards. A falling zero offset hides a light touch completely. The joints then hold their
-# position. If only one tip seems to let go, its frames are rejected instead. A rising zero offset
-# is visible next to the footprint.
+# Each fault has a kind, a value, a duration [s], the affected fingers, the expected events, and the
+# mode expected afterwards. A falling zero offset hides a light touch completely. The joints then
+# hold their position. If only one tip seems to let go, its frames are rejected instead. A rising
+# zero offset is visible next to the footprint.
 LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
     "one zero sinks": ("drift", -0.1, 1.0, (0,), {"consistency.left_sensor"}, "armed"),
     "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, "armed"),

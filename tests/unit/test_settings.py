@@ -160,7 +160,8 @@ def test_wrong_values_do_not_hide_contradictions_between_other_keys(tmp_path):
         "hand.open_angle.1",
         "tip.radius",
         "hand.q_max",
-        "servos.ids",  # safety.d_max is missing here, because it was compared with another radius.
+        "servos.ids",
+        # safety.d_max is missing here because it was compared with a different radius.
     ]
 
 

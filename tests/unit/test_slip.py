@@ -77,7 +77,8 @@ def test_an_object_that_twists_in_the_grip_is_gripped_with_more_force():
         with Hand({"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             start = hand.plant.object_pose[2]
-            # Over the object's width, the friction of both tips resists about 0.25 N·m.
+            # With the object's width as the lever arm, the friction at both tips resists about
+            # 0.25 N·m.
             for k in range(1, 76):
                 hand.plant.apply_load(0.0, 0.0, 0.4 * k / 75)
                 hand.watch(0.02)

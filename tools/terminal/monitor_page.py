@@ -211,7 +211,7 @@ class MonitorPage:
         return [title, *picture, Text.assemble(("0 ", DIM), bar, (end, DIM))]
 
     def _numbers(self, lines: int) -> list[Text]:
-        """Draw the column heads, a row per quantity and the object, centred in ``lines`` lines."""
+        """Draw headings, one row per quantity, and the object, all centred in ``lines`` lines."""
         rows = [self._row(*row) for row in _ROWS]
         between = [Text()] if lines > len(rows) + 3 else []
         block = [self._heads(), *between, *rows, *(each.copy() for each in between), self._object()]

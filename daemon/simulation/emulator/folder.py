@@ -70,7 +70,7 @@ class LinkFolder:
                 os.close(lock)
                 raise FolderError(
                     f"{self.path}: in use by another emulator (process {holder or 'unknown'}); "
-                    "end that emulator or select another --dir"
+                    "stop that emulator or choose a different --dir"
                 ) from None
             # The previous holder may have removed the lock file between open and lock.
             with contextlib.suppress(FileNotFoundError):
