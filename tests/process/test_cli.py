@@ -96,7 +96,7 @@ def test_a_signal_during_start_up_exits_without_a_traceback(profile, number):
     said = first + process.communicate(timeout=300)[1]
     assert process.returncode == 0
     assert "Traceback" not in said
-    assert "ended" in said.splitlines()[-1]
+    assert "exited during startup" in said.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def test_a_crashed_gateway_is_restarted_while_the_loop_continues(ticking, addres
         until(lambda: gateway.process.pid != first)
         # Clients reconnect by themselves and receive the events that they missed.
         with hand.events(timeout=60.0) as told:
-            assert any(f"ended (signal {number})" in event.text for event in told)
+            assert any(f"exited (signal {number})" in event.text for event in told)
         stream.skip()
         state = next(stream)
         assert state.mode == "armed"

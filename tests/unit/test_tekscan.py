@@ -89,7 +89,7 @@ def test_a_single_frame_needs_no_frame_line():
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("ASCII_DATA @@", "", "does not contain a line ASCII_DATA"),
+        ("ASCII_DATA @@", "", "does not contain an ASCII_DATA line"),
         ("ROWS 2\n", "", "ROWS is missing"),
         ("ROWS 2", "ROWS two", "ROWS: found 'two'"),
         ("ROWS 2", "ROWS 99999", "ROWS: found"),
