@@ -70,6 +70,11 @@ class JointMotion:
         self._q = [0.0, 0.0]
         self._drift = [0.0, 0.0]  # angle minus integrated velocity [rad]
 
+    def restart(self) -> None:
+        """Forget all readings; the next reading has no predecessor to be compared with."""
+        self.jumped = 0
+        self._request_time = self._t = -math.inf
+
     def update(self, requested: float, reading: Reading) -> None:
         """Check a reading requested at time ``requested``."""
         self.jumped = 0
@@ -113,6 +118,7 @@ class View:
         self.failed = 0.0  # fraction of failed readings in about the last second
         self._t = math.nan  # time of the previous state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
+        self._torque = False  # True if torque was on when the latest reading was requested
         servos = settings.servos  # In current mode, the stiffness limits `pull`.
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
@@ -131,7 +137,14 @@ class View:
 
     def update(self, state: State) -> None:
         """Store the parts of this tick's state that later checks compare."""
-        self.motion.update(state.t, state.reading)
+        # Readings without torque are not compared. An emulated hand's clock does not wait for this
+        # daemon while torque is off, so its joints may move further than the time between two
+        # readings allows.
+        if self._torque:
+            self.motion.update(state.t, state.reading)
+        else:
+            self.motion.restart()
+        self._torque = state.torque
         self.wiring.update(state)
         passed, self._t = state.t - self._t, state.t
         if passed > 0.0:

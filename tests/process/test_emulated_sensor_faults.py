@@ -5,6 +5,7 @@ The emulated hand's true force is the reference.
 
 import contextlib
 import select
+import signal
 from collections.abc import Iterator, Sequence
 from statistics import fmean
 from typing import Any
@@ -84,6 +85,22 @@ def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
         if report["t"] > begin + seconds or not driven:
             return
         select.select([], [], [], 0.005)  # Leave the processor to the hand and the daemon.
+
+
+def test_arming_while_the_joints_spring_back_on_a_busy_machine_is_no_fault(rig):
+    """After ``disarm``, the daemon does not run while the hand moves for 0.05 s of its own time."""
+    gripped(rig)
+    assert rig.ask({"command": "disarm"}, 60.0)["ok"]
+    rig.daemon.send_signal(signal.SIGSTOP)
+    begin = rig.report()["t"]
+    try:
+        until(lambda: rig.report()["t"] > begin + 0.05)
+    finally:
+        rig.daemon.send_signal(signal.SIGCONT)
+    assert rig.ask({"command": "arm"}, 60.0)["ok"]
+    begin = rig.report()["t"]
+    until(lambda: rig.report()["t"] > begin + 0.1)
+    assert mode(rig) == "armed", rig.log()[-5:]
 
 
 @pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])

@@ -144,6 +144,21 @@ def test_a_joint_fault_ends_a_grip(make, how, name, within):
     assert daemon.loop.state.fault_name == name
 
 
+@pytest.mark.parametrize(("ticks_with_torque", "fault"), [(0, ""), (3, "joint.jump")])
+def test_only_readings_with_torque_on_are_compared(make, ticks_with_torque, fault):
+    """While torque is off, the clock of an emulated hand does not wait for the daemon."""
+    daemon = make()
+    daemon.loop.advance(0.1)
+    if ticks_with_torque:
+        command(daemon, "arm")
+        daemon.loop.advance(ticks_with_torque * TICK)
+    spoil(daemon, jumped)
+    if not ticks_with_torque:
+        command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert daemon.loop.state.fault_name == fault
+
+
 @pytest.mark.parametrize(
     "mode", ["current-based position", pytest.param("current", marks=pytest.mark.extended)]
 )
