@@ -1,8 +1,10 @@
 """Detect swapped servo IDs: each finger then receives the other finger's commands.
 
 Joint angles and currents remain consistent, because each servo reports its own values. Only the
-tactile sensors show the error. When one joint is stationary and the other joint moves, the wrong
-tip tilts or is loaded, and the object rotates opposite to the command.
+tactile sensors show the error. A tip tilts by about the angle through which its finger rotates, so
+the tilt shows which joint's reported angle belongs to this finger. If the object does not yield,
+the tip force rises although the finger's joint is reported as stationary. Later, the object rotates
+opposite to the command.
 """
 
 from __future__ import annotations
@@ -14,12 +16,8 @@ from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.types import FINGERS, State
 
 _STANDING_MAX = 0.02  # maximum motion of the stationary joint [rad]
-_CLOSING_MIN = 0.05  # minimum closing motion of the other joint [rad]
-# Minimum tip tilt as a fraction of the closing motion. If the IDs are swapped, a tip tilts by about
-# the angle through which its finger rotates. In simulation, a tip on a sliding object tilts by 0.9
-# of that angle. With correct wiring, the fraction is 0.25.
-_TILT_RATIO = 0.5
-_TILT_SIGMA = 2.0  # number of tilt standard deviations added to the threshold
+_CLOSING_MIN = 0.05  # minimum difference between the two joints' closing motions [rad]
+_TILT_SIGMA = 2.0  # number of tilt standard deviations added to the tilt threshold
 _FORCE_RISE_MIN = 1.0  # minimum tip force increase [N]
 _SETTLING_TIME = 0.07  # settling time after a touch [s], including frame latency and stopping time
 _WRONG_ROTATION = math.radians(4.0)  # minimum rotation opposite to the command [rad]
@@ -32,7 +30,7 @@ class WiringWatch:
     def __init__(self, fingers: Sequence[int]) -> None:
         self.swapped = ""  # description of a detected swap, or an empty string
         self._has_two_fingers = len(fingers) == len(FINGERS)
-        self._touching = -1  # finger in contact, or -1 for none or both
+        self._touching = -1  # finger that touched the object alone, or -1
         self._since = 0.0  # start of the single-finger contact [s]
         self._q = [0.0, 0.0]  # joint angles after the touch [rad]
         self._tilt = math.nan  # tilt after the touch [rad]
@@ -57,7 +55,9 @@ class WiringWatch:
 
     def _check_approach(self, state: State) -> None:
         left, right = (each.valid and each.contact for each in state.contacts)
-        finger = -1 if left == right else 0 if left else 1
+        if not (left or right):
+            return  # A light contact may be lost for a few frames; its reference is kept.
+        finger = -1 if left and right else 0 if left else 1
         if finger != self._touching or finger < 0:
             self._touching, self._since, self._tilt = finger, state.t, math.nan
             return
@@ -66,18 +66,16 @@ class WiringWatch:
             self._q[:], self._tilt, self._force = q, contact.theta, contact.force
             return
         other = 1 - finger
-        closed = q[other] - self._q[other]
-        if abs(q[finger] - self._q[finger]) > _STANDING_MAX:
-            return
+        closed, other_closed = q[finger] - self._q[finger], q[other] - self._q[other]
         tilted = _TILT_SIGNS[finger] * (contact.theta - self._tilt)
-        sure = _TILT_SIGMA * contact.theta_std
-        turned = closed > _CLOSING_MIN and tilted > _TILT_RATIO * closed + sure
+        # The tilt is nearer to the motion of the other joint than to that of this joint.
+        threshold = 0.5 * (closed + other_closed) + _TILT_SIGMA * contact.theta_std
+        follows_other = other_closed - closed > _CLOSING_MIN and tilted > threshold
         pressed = contact.force - self._force > _FORCE_RISE_MIN
-        if turned or pressed:
+        if follows_other or (pressed and abs(closed) < _STANDING_MAX):
             self.swapped = (
-                f"the {FINGERS[finger]} tip moves with the {FINGERS[other]} joint while the "
-                f"{FINGERS[finger]} joint is stationary: check whether the servo IDs are swapped "
-                "(servos.ids)"
+                f"the {FINGERS[finger]} tip moves with the {FINGERS[other]} joint instead of the "
+                f"{FINGERS[finger]} joint: check whether the servo IDs are swapped (servos.ids)"
             )
 
     def _check_turn(self, state: State) -> None:

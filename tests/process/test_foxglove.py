@@ -89,10 +89,10 @@ def connected(address: str, **more: Any) -> ClientConnection:
 
 
 def test_a_client_reads_every_channel_of_the_running_hand() -> None:
-    with FakeDaemon() as fake, served(fake) as (address, layout):
-        assert used_topics(json.loads(layout.read_text())) <= set(TOPICS)
+    with FakeDaemon() as fake:
         fake.changes = {"goal_force": float("nan")}
-        with connected(address) as line:
+        with served(fake) as (address, layout), connected(address) as line:
+            assert used_topics(json.loads(layout.read_text())) <= set(TOPICS)
             assert line.subprotocol == PROTOCOLS[0]
             client = Client(line)
             client.subscribe(*(topic for topic in TOPICS if topic != "hand/event"))

@@ -286,11 +286,14 @@ def test_lost_packets_do_not_keep_torque_on(rig):
 @pytest.mark.extended
 def test_swapped_ids_are_a_fault_during_the_approach(tmp_path, addresses):
     """Use the zero offset and direction that `calibrate joints` would find for each servo."""
-    hand, off = tmp_path / "hand", "simulation.object_position=[0.004, 0.08]"
+    hand = tmp_path / "hand"
+    # The tip force clearly rises at a heavy object. A light object slides away from the tip.
+    heavy = ("object_position=[0.006, 0.08]", "object_mass=0.5", "table_friction=0.5")
+    words = [word for each in heavy for word in ("--set", f"simulation.{each}")]
     config = tmp_path / "hil.toml"
     head = f'stream.address = "{addresses[0]}"\ncommands.address = "{addresses[1]}"\n'
     config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
-    with EmulatorProcess("--dir", hand, "--config", HIL, "--set", off).ready() as emulator:
+    with EmulatorProcess("--dir", hand, "--config", HIL, *words).ready() as emulator:
         swapped = ("--set", "servos.ids=[2, 1]", "--set", "servos.direction=[-1, 1]")
         daemon = Running("--config", str(config), "--dir", str(hand), *swapped, *WAITING)
         for command, numbers in (("arm", {}), ("grasp", {"force": 6.0})):

@@ -7,10 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.loop import build
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.simulated import SimulatedServos
+from softfinger.daemon.types import State
+from softfinger.kinematics.estimation.invalid import Invalid
 from tests.harness.loop import command, heard
 
 # Sign and offset [rad] of each joint's readings.
@@ -99,11 +103,25 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
     command(daemon, "grasp", force=6.0)
     assert greatest_force(daemon, 3.0) < 4.0
     assert daemon.loop.state.fault_name == "joint.swapped"
-    assert (
-        "is stationary: check whether the servo IDs are swapped (servos.ids)"
-        in daemon.loop.state.fault
-    )
+    assert "joint: check whether the servo IDs are swapped (servos.ids)" in daemon.loop.state.fault
     assert not daemon.hand.torque_on.any()
+
+
+@pytest.mark.parametrize(("follows", "swapped"), [(0, True), (1, False)])
+def test_the_tilt_shows_whose_motion_a_tip_follows_despite_a_light_contact(follows, swapped):
+    """The right tip's contact is lost every 50 ms, and its tilt follows one joint's angle."""
+    watch, state = WiringWatch((0, 1)), State(mode=Mode.GRASPING)
+    state.reading.valid = True
+    state.contacts[0].invalid = state.contacts[1].invalid = Invalid.NONE
+    for k in range(250):
+        state.t = 0.002 * k
+        state.reading.q[:] = 0.3 * state.t, 0.05 * state.t
+        state.contacts[1].contact = k % 25 != 24
+        state.contacts[1].theta = -0.9 * state.reading.q[follows]
+        watch.update(state)
+        if watch.swapped:
+            break
+    assert bool(watch.swapped) == swapped
 
 
 def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
