@@ -57,12 +57,12 @@ _FORCE_TOLERANCE = 0.03
 # default finger, a friction of 0.05 N·m corresponds to 10 % of 6 N. The integral term removes this
 # error within seconds.
 _FRICTION_TOLERANCE = 0.1
-# Waiting time [s]: a joint that has not reached its goal by then is held by friction, and so is a
-# force that is still within _FRICTION_TOLERANCE. The value is ten times the settling time of the
+# Time after which friction is assumed to hold a joint that is short of its goal, or a force that is
+# within _FRICTION_TOLERANCE of its target [s]. The value is ten times the settling time of the
 # force without friction.
 _STUCK_TIME = 2.0
-# Time for which the tips must appear to touch each other before the grip counts as empty [s]. The
-# value is longer than one frame period at 25 Hz.
+# The grip counts as empty if the tips appear to touch each other for this time [s]. The value is
+# longer than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
@@ -70,8 +70,8 @@ _ANGLE_TOLERANCE = math.radians(0.5)
 # continuously, so a grip also counts as settled when the force follows a setpoint within this
 # tolerance.
 _STREAM_TOLERANCE = 0.25
-# Smaller changes in a streamed setpoint or in the force increase are treated as noise. The first
-# value is a fraction of the force. The second value is the standard deviation of the angle [rad].
+# Smaller changes in a streamed setpoint or in the force increase are treated as noise. The force
+# value is a fraction of the force. The angle value is a standard deviation [rad].
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
 
 
@@ -122,7 +122,7 @@ class Approaching(ControlState):
     command: GraspCommand
     touching: set[int] = field(default_factory=set)  # indices of the fingers in contact
     arrived_for: float = 0.0  # time since the setpoints reached the joint limits [s]
-    empty_for: float = 0.0  # time for which the tips have appeared to touch each other [s]
+    empty_for: float = 0.0  # duration of apparent contact between the tips [s]
 
 
 @dataclass
@@ -131,7 +131,7 @@ class GripHistory:
 
     lost_for: float = 0.0  # [s]
     lost_current: float = 0.0  # current limit while a contact is missing [A]
-    empty_for: float = 0.0  # time for which the tips have appeared to touch each other [s]
+    empty_for: float = 0.0  # duration of apparent contact between the tips [s]
     settled_force: float = math.nan  # commanded force when the grip last settled [N]
     settled_angle: float = math.nan  # commanded angle when the grip last settled [rad]
     increase_reported: bool = False
@@ -143,8 +143,8 @@ class Gripping(ControlState):
     """Base class of the states in which the grip controller computes joint torques."""
 
     history: GripHistory
-    reached_for: float = 0.0  # time for which force and angle have been at their targets [s]
-    near_for: float = 0.0  # time for which the force error has been within _FRICTION_TOLERANCE [s]
+    reached_for: float = 0.0  # time since force and angle reached their targets [s]
+    near_for: float = 0.0  # time since the force error fell below _FRICTION_TOLERANCE [s]
 
 
 @dataclass(kw_only=True)
@@ -183,7 +183,7 @@ class Control:
         self.grip = Grip(settings, self.fingers.indices, grasp)
         self.state: ControlState = Off()
         self.events: list[Event] = []
-        # The contact may be lost for as long as frames may be missing [s].
+        # Maximum duration of a contact loss [s], equal to the maximum time without frames.
         self._contact_loss_time = settings.safety.frame_age_fault / settings.tactile.rate
         # Force and angle count as settled when they have stayed at their targets for the averaging
         # time of their setpoints. The setpoints are averaged twice [s].

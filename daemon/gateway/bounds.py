@@ -26,16 +26,16 @@ SOCKET_QUEUE_LENGTH = 64  # number of requests, replies or subscriptions queued 
 PART_SIZE_RATIO = 4  # size limit of one message part, as a multiple of commands.max_bytes
 PART_COUNT_MAX = 16  # maximum number of parts in a request, including routing frame and envelope
 ENVELOPE_SIZE_MAX = 1024  # maximum combined size of routing frame and envelope [bytes]
-HANDSHAKES_PER_TURN = 64  # handshakes completed before the loop and the stream are served
+HANDSHAKES_PER_TURN = 64  # maximum number of handshakes before the loop and the stream are served
 SUBSCRIPTION_SIZE_MAX = 1024  # maximum size [bytes]; handshake messages are longer than topics
 SUBSCRIPTIONS_PER_TURN = 64
 REPEAT_INTERVAL = 0.1  # minimum interval between message repetitions for late subscribers [s]
 KEY_CHECK_INTERVAL = 0.5  # interval between key folder checks [s]
 
-# Time after a stop during which all requests except status are refused [s]. A flood of requests
-# extends this time.
+# After a stop, all requests except status are refused for this time [s]. A flood of requests
+# extends the time.
 REFUSAL_TIME = 0.02
-ANSWER_DELAY_MAX = 0.25  # maximum time for which replies are held back after a stop [s]
+ANSWER_DELAY_MAX = 0.25  # maximum delay of replies after a stop [s]
 
 # Requests
 UNANSWERED_MAX = 16  # maximum number of requests that await the loop's reply

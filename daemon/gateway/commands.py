@@ -81,15 +81,15 @@ class CommandEndpoint:
         self.stops = 0  # stop count stamped on new requests
         self._fence = 0  # current stop count
         self._last_poll = clock()
-        # Time of the last poll before a gap, or infinity once all requests from the gap have been
-        # read.
+        # Time of the last poll before a gap between polls. Infinity once all requests that arrived
+        # in the gap have been read.
         self._dated = math.inf
         self._unread_max = 0  # maximum number of requests from the gap that are still unread
         self._since = 0.0  # time of the last stop, gap or check for older requests
         self._arrived = 0  # number of requests since `_since`, except status
         self._replies: deque[list[bytes]] = deque()  # replies that have not been sent yet
-        # Time for which replies have been held back [s]. One step adds at most REFUSAL_TIME, so a
-        # stall of the process has little effect.
+        # Current delay of the replies [s]. One step adds at most REFUSAL_TIME, so a stall of the
+        # process has little effect.
         self._held_for = 0.0
         # Clients that sent a request in the last second, in the order of their last requests.
         self._clients: dict[bytes, Client] = {}
@@ -122,8 +122,8 @@ class CommandEndpoint:
             if parts:
                 self._take([part.bytes for part in parts], self._sockets.name(parts[-1]), now)
                 continue
-            # The socket is empty, but the libzmq thread may still deliver older requests. They
-            # count as read only after a period with few new requests.
+            # The socket is empty, but the libzmq thread may still deliver older requests. These
+            # requests count as read only after a period with few new requests.
             if now - self._since > bounds.REFUSAL_TIME:
                 if self._arrived <= bounds.TOTAL_RATE * bounds.REFUSAL_TIME:
                     self.stops, self._dated = self._fence, math.inf

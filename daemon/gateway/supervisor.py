@@ -110,7 +110,7 @@ class Gateway:
 
     def _kill(self) -> None:
         self._channel.close()
-        with self.process as process:  # waits for the end and closes the pipe
+        with self.process as process:  # Waits until the process has exited, then closes the pipe.
             process.kill()
 
     def close(self) -> None:

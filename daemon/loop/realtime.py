@@ -63,7 +63,7 @@ class RealTime:
 
     def __init__(self, settings: Settings) -> None:
         self.granted: list[str] = []
-        self.refused: list[str] = []  # rejected measures, each with its consequence and remedy
+        self.refused: list[str] = []  # rejected settings, each with its consequence and remedy
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)

@@ -344,8 +344,8 @@ class Requests:
         if self._torque.servos is None or not silent:
             return
         if self._torque.pending and not state.read_error:
-            # The port works. A connection attempt would break the bus silence that makes the servos
-            # stop.
+            # The port works, so do not reconnect. Sending packets would end the bus silence that
+            # makes the servo watchdogs stop the servos.
             return
         try:
             self._torque.reconnect()

@@ -26,7 +26,7 @@ from softfinger.kinematics.estimation.estimator import ContactEstimate
 _TARE_FRAME_COUNT = 16
 _ZERO_INTERVAL = 8  # frames between zero updates; thermal drift takes seconds
 _PRESSURE_STEPS = np.iinfo(np.uint16).max  # number of quantisation steps in a published pressure
-_STORED_TIME = 2.0  # time for which frame digests are stored [s]
+_STORED_TIME = 2.0  # storage time of frame digests [s]
 _CHANGED_CELLS_MIN = 4  # minimum number of changed cells; a few noisy cells may repeat by chance
 
 
@@ -124,7 +124,7 @@ class FingerPerception:
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
         """Create the perception for one finger; each tare appends an event to ``events``."""
-        full = getattr(sensor, "full_count", None)  # Some recordings specify their own value.
+        full = getattr(sensor, "full_count", None)  # Some recordings specify their own limit.
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
             settings = settings.model_copy(update={"tactile": own})
@@ -224,7 +224,7 @@ class FingerPerception:
             return self.frame.data
         if self._converter is None:
             return self._readings
-        # A zero offset below its calibrated value may push a reading beyond the scale.
+        # If the zero offset is below its calibrated value, a reading may exceed the scale.
         steps = np.minimum(self._readings * (1.0 / self.info.scale), _PRESSURE_STEPS)
         return np.rint(steps).astype(np.uint16)
 

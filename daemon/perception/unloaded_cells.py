@@ -19,7 +19,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 _RIM_DISTANCE = 2.0  # distance from the tip rim beyond which a cell is unloaded, in pitches
 _CELL_COUNT_MIN = 50  # number of cells required to estimate the zero shift and the noise
 _AVERAGED_FRAME_COUNT = 8  # time constant of the noise average, in calls of `update`
-_CLIPPED_FRACTION = 0.25  # fraction of cells reading 0 above which the noise counts as clipped
+_CLIPPED_FRACTION = 0.25  # noise counts as clipped if more than this fraction of the cells read 0
 _CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping at 0
 
 

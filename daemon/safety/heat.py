@@ -31,8 +31,8 @@ from softfinger.kinematics.hand.servo_heat import (
 
 _UPDATE_INTERVAL = 0.5  # time between thermal model updates [s]
 _AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
-# Half the thermometer's resolution [°C]. Because readings are rounded, a reading may reach the
-# limit too early by this amount.
+# Half the thermometer's resolution [°C]. The thermometer rounds its readings, so a reading may
+# reach the limit when the actual temperature is still this much lower.
 _HALF_STEP = 0.5
 _TARGET_MARGIN = 3.0  # margin below the limit for the target temperature after a reduction [°C]
 _FRACTION_MAX = 0.97  # largest ratio of new to old force that is worth a reduction
@@ -133,7 +133,7 @@ class HeatWatch:
         hot = self._limits.temperature_max
         who = f"the {FINGERS[i]} servo will reach {hot:g} °C in {left:.0f} s"
         if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
-            return ""  # The last reduction has not had its effect yet.
+            return ""  # The last reduction has not taken effect yet.
         now = state.goal.force
         square = sustained_square(
             self._states[i].array, self._limits.temperature_max - _TARGET_MARGIN

@@ -170,7 +170,7 @@ class Safety:
         goal = state.goal
         q, current = goal.q, goal.current
         present = state.reading.q
-        if state.seq - self._sent_seq != 1:  # Torque was off, so start here with zero current.
+        if state.seq - self._sent_seq != 1:  # Torque was off, so start with zero current.
             self._sent_q[:] = present
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq

@@ -54,7 +54,7 @@ class Register(NamedTuple):
 
 
 # Registers that `doctor --save` stores so that they can be restored later. ID, baud rate and
-# protocol are excluded, because a servo stops replying at its old address once they change.
+# protocol are excluded, because after such a change a servo no longer replies at its old address.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),
@@ -94,7 +94,7 @@ class Requirement(NamedTuple):
 
     register: Register
     holds: Callable[[int], bool]
-    mended: Callable[[int], int]  # function that returns the correct value for a wrong one
+    mended: Callable[[int], int]  # function that maps a wrong value to the correct value
     told: Callable[[int], str]  # function that describes the wrong value and the expected value
     status: Status
     armed: bool = False  # True for RAM that `arm` writes

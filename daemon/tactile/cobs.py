@@ -145,10 +145,11 @@ class CobsDecoder(DelimitedDecoder):
             steps = 1
         self._missed += steps - 1
         self._seq = seq
-        # The clock has wrapped around, or the board has restarted, which SensorClock detects.
+        # A smaller tick count means that the clock has wrapped around or that the board has
+        # restarted. SensorClock detects restarts.
         self._wraps += ticks < self._ticks
         self._ticks = ticks
-        # Two-byte counts are not copied, because the buffer belongs to this frame alone.
+        # Two-byte counts are not copied, because no other frame uses this buffer.
         cells = message[_HEADER.size : size].view(f"<u{kind}")
         counts = cells.astype(np.uint16, copy=False)
         t_sensor = (self._wraps * 2.0**32 + ticks) * _TICK

@@ -201,7 +201,7 @@ class TactileBoard:
             counts = counts if self._frozen is None else self._frozen
         self._frozen = counts
         if "saturated" in faults:
-            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # The encoder clips these.
+            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # The encoder clips them.
         elif "zero" in faults:
             counts = np.zeros_like(counts)
         if "wrong-size" in faults:

@@ -125,7 +125,7 @@ class SimulatedTactile:
 
     def _read(self, number: int, arrival: float) -> None:
         """Compute the newest frame from a sample that the plant still stores."""
-        # If readings depend on earlier contacts, samples without a computed frame also matter.
+        # If readings depend on earlier contacts, also apply the samples without a computed frame.
         first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
             self._press(each)

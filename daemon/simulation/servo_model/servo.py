@@ -80,7 +80,7 @@ class EmulatedServo:
         self._boot_at = -math.inf  # end of a reboot
         self._next_step = math.inf
         self._next_sense = t
-        # Write that is waiting for an action instruction.
+        # Registered write that is waiting for an action instruction.
         self._registered: tuple[int, bytes] | None = None
         for address, value in eeprom.items():
             self.table.set(address, value)
