@@ -61,7 +61,7 @@ class Record(metaclass=_Slotted):
     __slots__ = ("_fields", "array")
 
     dtype: np.dtype[np.void]
-    array: Records[Self]  # array of one record, which is passed to kernels
+    array: Records[Self]  # array with a single record, which is passed to kernels
 
     def __init_subclass__(cls) -> None:
         hints = get_type_hints(cls, include_extras=True)

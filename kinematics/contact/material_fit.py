@@ -110,8 +110,8 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Extend the points to strain 1 using their slope at the end."""
     if x[-1] > 0.95:
         return x, y
-    # Fit a parabola to the last third of the points. Limit the slope at its end to 0.5 to 2 times
-    # the mean slope of the last quarter.
+    # Fit a parabola to the last third of the points. Limit the final slope of the parabola to 0.5
+    # to 2 times the mean slope of the last quarter.
     last = max(3, x.size // 3)
     back = x[-last:] - x[-1]
     slope = float(np.polyfit(back, y[-last:], 2)[1])

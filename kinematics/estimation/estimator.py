@@ -314,8 +314,7 @@ class ContactEstimator:
         state = self.state = EstimatorState()
         options = self._options = state.options
         self.noise = noise
-        # Counts are rounded, so the smallest count covers readings down to half a count below
-        # itself.
+        # Counts are rounded, so the smallest count represents readings from half a count below it.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.patch_level = _TOLERANCE, PATCH_LEVEL
@@ -465,8 +464,8 @@ class ContactEstimator:
         if not 0.0 < pascal_per_count < math.inf:
             raise ValueError(f"pascal_per_count must be positive, got {pascal_per_count}")
         saturation = full if self.saturation is None else self.saturation
-        # Copy the frame, so that the compiled code accepts any type, memory layout and write
-        # protection.
+        # Copy the frame. The compiled code requires a fixed type and memory layout, and a writable
+        # array.
         self._frame[...] = frame[self._window]
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(

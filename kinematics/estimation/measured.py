@@ -21,10 +21,10 @@ from softfinger.kinematics.estimation.frame_pipeline import ABOVE_FRACTION, ABOV
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_CONTACT_SIGMA = 5.0  # contact threshold of the sum of readings, in standard deviations
+_CONTACT_SIGMA = 5.0  # contact threshold for the sum of readings, in standard deviations
 _EXTRAPOLATION_MAX = 1.02  # extrapolation limit, relative to the measured depth and tilt
 _EXTENT_ERROR_MAX = 0.08  # maximum relative difference between the measured and the expected extent
-_ITERATIONS_MAX = 20  # maximum number of iterations that solve for d and θ in turn
+_ITERATIONS_MAX = 20  # maximum number of iterations that solve for d and θ alternately
 _TOLERANCE = 1e-7  # convergence tolerance, relative to the range
 
 

@@ -35,7 +35,7 @@ _BLUR_MARGIN = 2.0  # additional margin around the footprint, in standard deviat
 # Tilt at which the centroid's moment arm is computed [rad]. The arm is nearly independent of the
 # tilt.
 _TILT = 0.2
-_WEAK_PEAK = 15.0  # peak below which neighbourhood sums are used, in noise standard deviations
+_WEAK_PEAK = 15.0  # neighbourhood sums are used below this peak, in noise standard deviations
 _SINE_MAX = 0.95
 
 
