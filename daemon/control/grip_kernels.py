@@ -22,7 +22,7 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_ERROR_SIGMA = 2.0  # number of torque constant standard deviations added to the force limit
+_TORQUE_ERROR_SIGMA = 2.0  # force limit margin, in standard deviations of the torque constant
 _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
 _DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to this controller [rad]
@@ -70,7 +70,7 @@ class GripState(Record):
     integral: float  # [N]
     grip_force: float  # sum of feed-forward and feedback [N]
     offset_rate: float  # rate of change of the offset that rotates the object [rad/s]
-    offset: float  # goal of (q1 − q2)/2 [rad]
+    offset: float  # goal for (q1 − q2)/2 [rad]
     dither_elapsed: float  # time since the dither began [s]
     last_time: float  # start time, or time of the last tick with equal torques for both joints [s]
     balance_offset: float  # part of the offset that equalises the tip forces [rad]

@@ -57,7 +57,7 @@ _ROTATION_MARGIN = 1.5  # minimum significant rotation, relative to the rotation
 _SHEAR_JUMP = 0.6  # minimum shear jump measured by solid tips [N], equal to six standard deviations
 _AGREEMENT = 0.25  # minimum change at each joint or tip, as a fraction of the mean change
 _UNCONFIRMED_SHARE = 0.3  # highest unconfirmed force increase, as a fraction of the force
-_RELAXATION_SHARE = 0.2  # maximum force loss by relaxation during a hold, as a fraction
+_RELAXATION_SHARE = 0.2  # maximum relative force loss due to relaxation during a hold
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
 _SPARE_MIN = 0.3  # minimum usable fraction of the friction coefficient
 

@@ -54,12 +54,12 @@ _ARRIVAL_DISTANCE = 0.03
 # % (1 σ).
 _FORCE_TOLERANCE = 0.03
 # Maximum force error due to joint or gear friction, as a fraction of the force target. With the
-# default finger, a friction of 0.05 N·m corresponds to 10 % of 6 N. The integral term removes this
-# error within seconds.
+# default finger, a friction torque of 0.05 N·m causes an error of 10 % at a force of 6 N. The
+# integral term removes this error within seconds.
 _FRICTION_TOLERANCE = 0.1
 # Time after which friction is assumed to hold a joint that is short of its goal, or a force that is
 # within _FRICTION_TOLERANCE of its target [s]. The value is ten times the settling time of the
-# force without friction.
+# force in a hand without friction.
 _STUCK_TIME = 2.0
 # The grip counts as empty if the tips appear to touch each other for this time [s]. The value is
 # longer than one frame period at 25 Hz.
@@ -70,8 +70,8 @@ _ANGLE_TOLERANCE = math.radians(0.5)
 # continuously, so a grip also counts as settled when the force follows a setpoint within this
 # tolerance.
 _STREAM_TOLERANCE = 0.25
-# Smaller changes in a streamed setpoint or in the force increase are treated as noise. The force
-# value is a fraction of the force. The angle value is a standard deviation [rad].
+# Smaller changes in a streamed setpoint or in the force increase are treated as noise. _FORCE_NOISE
+# is a fraction of the force. _ANGLE_NOISE is the standard deviation of the angle [rad].
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
 
 
@@ -185,8 +185,8 @@ class Control:
         self.events: list[Event] = []
         # Maximum duration of a contact loss [s], equal to the maximum time without frames.
         self._contact_loss_time = settings.safety.frame_age_fault / settings.tactile.rate
-        # Force and angle count as settled when they have stayed at their targets for the averaging
-        # time of their setpoints. The setpoints are averaged twice [s].
+        # Settling time [s]. Force and angle count as settled when they have stayed at their targets
+        # for the averaging time of their setpoints. The setpoints are averaged twice.
         self._settling_time = 2.0 * settings.control.smooth_time
 
     @property

@@ -97,7 +97,7 @@ class Gateway:
         A suspended process is killed, because its timers don't run.
         """
         process = self.process
-        with contextlib.suppress(ChildProcessError):  # `close` has waited for the process.
+        with contextlib.suppress(ChildProcessError):  # `close` has already waited for the process.
             while _is_suspended(process.pid):
                 self._closing.wait(_SUSPENSION_TIME_MAX)
                 if _is_suspended(process.pid, os.WNOHANG):
@@ -110,7 +110,7 @@ class Gateway:
 
     def _kill(self) -> None:
         self._channel.close()
-        with self.process as process:  # Waits until the process has exited, then closes the pipe.
+        with self.process as process:  # `Popen.__exit__` closes the pipe and waits for the process.
             process.kill()
 
     def close(self) -> None:

@@ -190,7 +190,7 @@ class Requests:
             If the request is rejected. The message gives the reason.
         """
         state, control = self._state, self._control
-        # A stop is accepted in every mode, from any client, with any fields.
+        # A stop command is accepted in every mode and from every client, even with unknown fields.
         if request["command"] == "stop":
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}

@@ -64,9 +64,9 @@ IMAGE_SHIFT_MIN = 0.06
 _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
 _NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; an object held with less force may rock
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
-# A footprint that grows within the response time of the cells appears wider and flatter. The first
-# two values are the relative changes divided by var(d)/d². They result from fitting a paraboloid to
-# the mean of several paraboloids.
+# A footprint that grows within the response time of the cells appears wider and flatter. _WIDENING
+# and _FLATTENING are the relative changes divided by var(d)/d². These values result from fitting a
+# paraboloid to the mean of several paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
 _SLOPE_SMOOTHING = 0.9  # low-pass coefficient for ∂ ln F/∂d, applied on every frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
@@ -340,7 +340,7 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
         if measured > 0.0:
             h.mean[FRICTION] += 0.5 * (measured - h.prior_mean[FRICTION])
             h.covariance[FRICTION, FRICTION] *= 0.5
-    # A load may already be acting on the object.
+    # A load may already be acting on the object, so increase the friction variance.
     h.covariance[FRICTION, FRICTION] += TORQUE_NOISE * TORQUE_NOISE
 
 

@@ -41,15 +41,15 @@ ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 # Measurement channels in the order of `grasp.CHANNELS`; the first four exist once per tip.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-# Time span of the stored joint motion [s]. A frame that is older than this is treated as if it had
-# this age.
+# Time span of the stored joint motion [s]. Older frames are treated as if their age were equal to
+# this time span.
 HISTORY_TIME = 0.5
-LAW_POINTS = 17  # nodes in d from 0 to the radius
+LAW_POINTS = 17  # number of nodes in d, from 0 to the radius
 
 GATE = 3.0  # Innovations beyond this number of standard deviations have a reduced effect.
 OUTLIER_GATE = 5.0  # Deviations beyond this number of standard deviations count as faults.
 MODEL_ERROR = 0.05  # relative error of predicted motion and of normal forces
-MODEL_ERROR_TIME = 0.1  # correlation time of these errors [s]
+MODEL_ERROR_TIME = 0.1  # correlation time of motion and normal-force errors [s]
 TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with position and time
 
 # Random walks during a grip (per √s)
@@ -66,7 +66,7 @@ _WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times ga
 _VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
 _VARIANCE_MIN = 1e-6  # minimum ratio of measurement variance to predicted variance
 _CURRENT_ERROR = 0.25  # tolerated deviation of a current from its goal, as a fraction of the goal
-_CURRENT_NOISE = 0.02  # additional tolerance for this deviation [A]
+_CURRENT_NOISE = 0.02  # additional tolerance due to current noise [A]
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
 
 
@@ -187,7 +187,7 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
             h.mean[i] += gain * innovation
             for j in range(STATES):
                 h.covariance[i, j] -= gain * h.scratch[j]
-        for k in (TORQUE, TORQUE + 1, LATENCY):  # These states are barely observable.
+        for k in (TORQUE, TORQUE + 1, LATENCY):  # barely observable states
             bound = OUTLIER_GATE * math.sqrt(h.prior_variance[k])
             error = h.mean[k] - h.prior_mean[k]
             h.mean[k] = h.prior_mean[k] + min(max(error, -bound), bound)
@@ -339,7 +339,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left.travel[1] += step1
     right.travel[1] += step2
     # An impossible step would corrupt the state permanently. A taper of 180°, for example, leads to
-    # such steps.
+    # impossible steps.
     if not abs(d_step1) + abs(d_step2) + abs(rotation) * h.radius < h.radius:
         return
     left.travel[0] += d_step1

@@ -124,7 +124,8 @@ class FingerPerception:
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
         """Create the perception for one finger; each tare appends an event to ``events``."""
-        full = getattr(sensor, "full_count", None)  # Some recordings specify their own limit.
+        # Some recordings specify the count at which their cells saturated.
+        full = getattr(sensor, "full_count", None)
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
             settings = settings.model_copy(update={"tactile": own})

@@ -46,7 +46,7 @@ _DRIFT_TIME = 0.1  # time window of the drift check [s], which allows for veloci
 # 3 ticks.
 _LATE_TIME = 0.02
 _FAILURE_TIME = 0.72  # time constant for averaging the fraction of failed readings [s]
-_FAILED_FRACTION_MAX = 0.75  # reached after 1 s without a valid reading
+_FAILED_FRACTION_MAX = 0.75  # This fraction is reached after 1 s without a valid reading.
 _GAP_TIME = 0.1  # interval between readings above which position steps are not checked [s]
 
 

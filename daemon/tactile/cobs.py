@@ -53,7 +53,7 @@ from softfinger.kinematics.compiled.kernel import kernel
 _HEADER = struct.Struct("<BBHIHH")
 _CRC = struct.Struct("<H")
 _CRC_START = 0xFFFF
-_TICK = 1e-6  # s per tick of the board clock
+_TICK = 1e-6  # duration of one tick of the board clock [s]
 _BLOCK = 254  # maximum length of a COBS block [bytes]
 
 

@@ -198,7 +198,7 @@ def carry_out(folder: Path, text: str) -> str:
     """
     reply = send_words(folder, text)
     # The motion follows the emulated hand's clock, which stops while the emulator is suspended.
-    # Therefore, ask for the remaining time again.
+    # Therefore, query the remaining time again after each wait.
     kind = text.partition(" ")[0]
     while kind in _MOTIONS and reply.startswith("{"):
         left = json.loads(reply)["wait"]

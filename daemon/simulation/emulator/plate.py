@@ -142,7 +142,7 @@ class Plate:
         self._d = [-_CLEARANCE]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
-        ]  # per interval between knots: press, and True if the plate stands still
+        ]  # for each interval between knots: the press, and True if the plate stands still
         self._reported = -1
         self.arrives = 0.0  # arrival time of the last press in the sequence
 

@@ -43,7 +43,7 @@ class Motion(Record):
     The bristles change at the joint velocities.
     """
 
-    position: FloatFive  # [rad], [rad], [m], [m], [rad]
+    position: FloatFive  # joint angles [rad], object x and y [m], object angle [rad]
     velocity: FloatFive
     shear: Pair  # d_t of each tip on the object [m]
     extra_shear: Shears  # [m]

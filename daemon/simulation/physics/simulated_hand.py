@@ -274,8 +274,8 @@ class SimulatedHand:
         self.normal = felt.array["normal"]  # N [N]
         self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
-        # Penetration depth of the backing plate's rim. If it is above 0, the tip is beyond its
-        # limit.
+        # Penetration depth of the backing plate's rim. If this depth is above 0, the tip is
+        # compressed beyond its limit.
         self.rim = felt.array["rim"]  # m
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
         self.torque_on = goals.torque_on  # 1 if the servo's torque is on
