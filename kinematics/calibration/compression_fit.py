@@ -25,7 +25,7 @@ from softfinger.kinematics.contact.table import ContactTable
 FloatArray = NDArray[np.float64]
 
 _UNIT = Material.constant(1.0)
-_SLACK = 0.02  # maximum reversal of d that counts as encoder noise, as a fraction of its range
+_SLACK = 0.02  # maximum reversal of d due to encoder noise, relative to the range of d
 _TURNS = 5  # minimum number of rows per reversal of d; fewer rows mean a wrong row order
 _DEEP = 0.9  # minimum peak of a full-depth branch, as a fraction of the range of d
 TOE = 0.1  # half width of the toe around the first contact, as a fraction of the depth

@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 
 DURATION_MAX = 3600.0  # maximum recording time [s], which limits the memory use
 _STEP = 0.01  # step of the time grid for motion and torque [s]
-_WINDOW = 6  # number of steps before and after each fit of velocity and acceleration
+_WINDOW = 6  # half width of the window that fits velocity and acceleration, in steps
 _GAP_MAX = 0.035  # maximum gap in the data across which values are interpolated [s]
 # Above this speed, static friction has mostly vanished [rad/s]. For the XL330, 0.12 rad/s is
 # sufficient.

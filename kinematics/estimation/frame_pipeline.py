@@ -43,15 +43,15 @@ GAIN_MIN, GAIN_MAX = 0.05, 20.0  # range of the gain for a contact of this tip o
 D_MAX = 0.75  # maximum valid d, relative to the radius
 R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
 # Maximum relative error of d that a smooth misfit may cause. The curved face of a disc causes an
-# error of this size, which the covariance includes. A smaller limit applies if the gain is far from
-# 1. Such a gain together with a smooth misfit indicates a different tip, which the covariance does
-# not cover.
+# error of this size. The covariance includes this error. A smaller limit applies if the gain is far
+# from 1, because such a gain together with a smooth misfit indicates a different tip. The
+# covariance does not cover a different tip.
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
 # The sensor needs a tare if at least ABOVE_FRACTION of the cells under the tip exceed both levels.
-# One level is relative to the noise, the other to the peak. A solid tip loads all cells, but 5 % of
-# them read less than 0.32 of the peak.
+# The first level is relative to the noise. The second level is relative to the peak. A solid tip
+# loads all cells, but 5 % of these cells read less than 0.32 of the peak.
 ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among the cells above half the peak
 ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for linear error propagation

@@ -241,7 +241,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
         scale[i] = 1.0 / math.sqrt(normal[i, i])
         for j in range(first, i + 1):
             inverse[i, j] = inverse[j, i] = normal[i, j] * scale[i] * scale[j]
-    # Sweeping the matrix on each diagonal element in turn replaces it by its negative inverse.
+    # Sweeping the matrix on each diagonal element replaces the matrix by its negative inverse.
     for k in range(first, last):
         pivot = inverse[k, k]
         if not pivot > _PIVOT_MIN:

@@ -115,7 +115,7 @@ class MeasuredEstimator:
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
         sum_std = math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
         self._contact_threshold = _CONTACT_SIGMA * sum_std
-        # Maximum d that is not detected. Its force equals the contact threshold.
+        # Maximum d that is not detected. At this d, the force equals the contact threshold.
         root = self._root_of(self._contact_threshold, 0.0, self._root_max)
         self._undetected_d = tip.radius * root**2
         self._seq: int | None = None
@@ -232,7 +232,7 @@ class MeasuredEstimator:
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         moment, moment_q = shown * lever, shown_q * lever + shown * lever_q
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        partials = np.zeros((3, 3))  # of the sum and both moments in (d, n_x, n_y)
+        partials = np.zeros((3, 3))  # of the sum and both moments with respect to (d, n_x, n_y)
         partials[0] = shown_t * per_d, *(2.0 * shown_q * n)
         partials[1:, 0] = (shown_t * lever + shown * lever_t) * per_d * n
         partials[1:, 1:] = moment * np.eye(2) + 2.0 * moment_q * np.outer(n, n)

@@ -10,7 +10,7 @@ from softfinger.kinematics.sensing.footprint import Face, Grid
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-# Fit parameters. The last two apply only to solid tips.
+# Fit parameters. The last two parameters apply only to solid tips.
 GAIN, DEPTH, TILT_X, TILT_Y, SHEAR_X, SHEAR_Y = range(6)
 PARAMETERS = 6
 START_POINTS = 17  # number of depths in the table for the initial estimate
@@ -144,7 +144,7 @@ class Budget(Record):
     is_correlated: bool
     # Factors for the four standard deviations, and number of degrees of freedom used.
     widening: Annotated[FloatArray, DEPTHS, 5]
-    response: Column  # Jᵀq of one pattern q, times its size
+    response: Column  # Jᵀq, multiplied by the size of the pattern q
     displacement: Column  # change in the fit parameters due to one pattern
     shared: Normal  # covariance of the fit parameters due to common errors and a smooth misfit
 

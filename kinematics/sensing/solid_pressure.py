@@ -27,7 +27,8 @@ from softfinger.kinematics.sensing.footprint import Grid, axes
 
 MODES = 32
 IMAGES = 2 * MODES
-_LANES = 8  # number of images is padded to a multiple of this divisor of IMAGES
+# The number of images is padded to a multiple of this value. IMAGES must also be a multiple.
+_LANES = 8
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
 # Number of sample points per cell side: for cells inside the rim, for cells cut by the rim, and for
