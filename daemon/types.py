@@ -65,8 +65,8 @@ class Contact:
     """Contact of one fingertip: the newest frame estimate, extrapolated with later joint angles."""
 
     seq: int = 0  # sequence number of the frame
-    t: float = 0.0  # sample time of that frame [s]
-    t_arrival: float = 0.0  # arrival time of that frame [s]
+    t: float = 0.0  # sample time of the frame [s]
+    t_arrival: float = 0.0  # arrival time of the frame [s]
     t_valid: float = 0.0  # arrival time of the last frame with a valid estimate [s]
     invalid: Invalid = Invalid.NO_FRAME  # reason why the estimate is invalid
     contact: bool = False  # True if the tip is in contact

@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 _TORQUE_ERROR_SIGMA = 2.0  # force limit margin, in standard deviations of the torque constant
 _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
-_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to this controller [rad]
+_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to equalising the tip forces [rad]
 _DITHER_STEP_MAX = 0.05  # maximum time step of the dither, even after a late tick [s]
 _STIFFNESS_MIN = 100.0  # lower bound of the stiffness [N/m]; gains are divided by the stiffness
 ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
@@ -366,8 +366,8 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     phase = law.dither_rate * g.dither_elapsed
     amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
     if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-        # Use the clock instead of counting ticks. Otherwise, late ticks could reduce the dither
-        # frequency to the resonance frequency of the fingers on the soft tips (1 to 2 Hz).
+        # Use the clock instead of counting ticks, because late ticks would reduce the frequency of
+        # a dither that counts ticks. The fingers resonate on the soft tips at 1 to 2 Hz.
         g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
     return torque

@@ -55,19 +55,19 @@ _ARRIVAL_DISTANCE = 0.03
 _FORCE_TOLERANCE = 0.03
 # Maximum force error due to joint or gear friction, as a fraction of the force target. With the
 # default finger, a friction torque of 0.05 N·m causes an error of 10 % at a force of 6 N. The
-# integral term removes this error within seconds.
+# integral term removes the friction error within seconds.
 _FRICTION_TOLERANCE = 0.1
 # Time after which friction is assumed to hold a joint that is short of its goal, or a force that is
 # within _FRICTION_TOLERANCE of its target [s]. The value is ten times the settling time of the
 # force in a hand without friction.
 _STUCK_TIME = 2.0
-# The grip counts as empty if the tips appear to touch each other for this time [s]. The value is
-# longer than one frame period at 25 Hz.
+# Minimum duration of apparent contact between the tips in an empty grip [s]. The duration is longer
+# than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
 # Tolerance for a streamed force target, as a fraction of the target. A streamed target may change
-# continuously, so a grip also counts as settled when the force follows a setpoint within this
+# continuously, so a grip also counts as settled when the force follows a setpoint within the
 # tolerance.
 _STREAM_TOLERANCE = 0.25
 # Smaller changes in a streamed setpoint or in the force increase are treated as noise. _FORCE_NOISE
@@ -374,8 +374,9 @@ class Control:
         # The tip may reach the object before the sensor detects contact. Limit the current so that
         # the tip force can't exceed the commanded force.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
-        # If the joint does not move under this torque, the joint friction is larger than the
-        # setting. Therefore also use `free_torque`, the friction torque measured in free motion.
+        # The joint friction may be larger than the setting, so also use `free_torque`, the friction
+        # torque measured in free motion. Otherwise, the joint might not move at the limited
+        # current.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 

@@ -13,8 +13,8 @@ MEMORY_MAX = 128 << 20  # data segment limit [bytes]; Python and libzmq use a th
 DESCRIPTOR_COUNT = 64  # number of file descriptors in addition to those of clients
 CLIENT_COUNT_MAX = 256  # maximum number of connections, commands and stream combined
 STEP_CPU_TIME_MAX = 3.0  # CPU time limit of one step [s], after which the kernel ends the process
-# Elapsed time limit of one step [s]. This limit is higher than the CPU limit, because the process
-# may have to wait on a busy machine.
+# Limit on the elapsed time of one step [s]. The elapsed time may exceed the CPU time, because the
+# process may have to wait on a busy machine.
 STEP_TIME_MAX = 30.0
 # Longest poll interval [s]. After a longer interval, the gateway stamps new requests with the time
 # of the previous poll.
@@ -32,8 +32,8 @@ SUBSCRIPTIONS_PER_TURN = 64
 REPEAT_INTERVAL = 0.1  # minimum interval between message repetitions for late subscribers [s]
 KEY_CHECK_INTERVAL = 0.5  # interval between key folder checks [s]
 
-# After a stop, all requests except status are refused for this time [s]. A flood of requests
-# extends the time.
+# Time after a stop during which only status requests are accepted [s]. A flood of requests extends
+# the time.
 REFUSAL_TIME = 0.02
 ANSWER_DELAY_MAX = 0.25  # maximum delay of replies after a stop [s]
 

@@ -29,7 +29,7 @@ from softfinger.daemon.gateway.endpoints import NO_WAIT, ClientSockets, read_par
 from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask, Channel
 
-# This byte sequence cannot occur inside a string.
+# Packed strings cannot contain the byte sequence of a packed stop command.
 _PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")
 _MALFORMED_REFUSAL = refusal(
     "envelope: expected a single frame with the command; an envelope may precede this frame if "
@@ -122,7 +122,7 @@ class CommandEndpoint:
             if parts:
                 self._take([part.bytes for part in parts], self._sockets.name(parts[-1]), now)
                 continue
-            # The socket is empty, but the libzmq thread may still deliver older requests. These
+            # The socket is empty, but the libzmq thread may still deliver older requests. All older
             # requests count as read only after a period with few new requests.
             if now - self._since > bounds.REFUSAL_TIME:
                 if self._arrived <= bounds.TOTAL_RATE * bounds.REFUSAL_TIME:

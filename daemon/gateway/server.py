@@ -127,7 +127,7 @@ def _limit_resources() -> None:
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = min(bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT, most)
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
-    with contextlib.suppress(OSError):  # The process also works without these two settings.
+    with contextlib.suppress(OSError):  # The OOM score and the scheduling policy are optional.
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

@@ -56,8 +56,8 @@ class Gateway:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
-                # The process runs in its own session. Otherwise, Ctrl-C would end the process
-                # before it has sent the daemon's last messages.
+                # The process runs in its own session, because Ctrl-C must not end the process
+                # before the daemon's last messages have been sent.
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )

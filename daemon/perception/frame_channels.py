@@ -65,8 +65,8 @@ _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confir
 _NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; an object held with less force may rock
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
 # A footprint that grows within the response time of the cells appears wider and flatter. _WIDENING
-# and _FLATTENING are the relative changes divided by var(d)/d². These values result from fitting a
-# paraboloid to the mean of several paraboloids.
+# and _FLATTENING are the relative changes divided by var(d)/d², determined by fitting a paraboloid
+# to the mean of several paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
 _SLOPE_SMOOTHING = 0.9  # low-pass coefficient for ∂ ln F/∂d, applied on every frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
@@ -113,7 +113,7 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
     fraction = 0.0
     for back in range(size):
         row = (newest - back) % size
-        if history[row].t == -math.inf:  # No joint reading is as old as the frame.
+        if history[row].t == -math.inf:  # The frame is older than all joint readings.
             before = after
             break
         before = row

@@ -41,13 +41,12 @@ ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 # Measurement channels in the order of `grasp.CHANNELS`; the first four exist once per tip.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-# Time span of the stored joint motion [s]. Older frames are treated as if their age were equal to
-# this time span.
+# Time span of the stored joint motion [s], which limits the assumed age of a frame.
 HISTORY_TIME = 0.5
 LAW_POINTS = 17  # number of nodes in d, from 0 to the radius
 
-GATE = 3.0  # Innovations beyond this number of standard deviations have a reduced effect.
-OUTLIER_GATE = 5.0  # Deviations beyond this number of standard deviations count as faults.
+GATE = 3.0  # maximum innovation with full effect, in standard deviations
+OUTLIER_GATE = 5.0  # minimum deviation that counts as a fault, in standard deviations
 MODEL_ERROR = 0.05  # relative error of predicted motion and of normal forces
 MODEL_ERROR_TIME = 0.1  # correlation time of motion and normal-force errors [s]
 TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with position and time

@@ -24,7 +24,7 @@ from softfinger.daemon.types import FINGERS, Event, Frame, SensorInfo, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAME_COUNT = 16
-_ZERO_INTERVAL = 8  # frames between zero updates; thermal drift takes seconds
+_ZERO_INTERVAL = 8  # number of frames between zero updates; thermal drift takes seconds
 _PRESSURE_STEPS = np.iinfo(np.uint16).max  # number of quantisation steps in a published pressure
 _STORED_TIME = 2.0  # storage time of frame digests [s]
 _CHANGED_CELLS_MIN = 4  # minimum number of changed cells; a few noisy cells may repeat by chance
@@ -255,7 +255,7 @@ class FingerPerception:
             return
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
-        if not np.median(ends) > 0.0:  # No contact could be measured with this zero offset.
+        if not np.median(ends) > 0.0:  # The zero offset leaves most cells without a range.
             text = f"the {side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))
             return

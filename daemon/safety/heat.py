@@ -32,7 +32,7 @@ from softfinger.kinematics.hand.servo_heat import (
 _UPDATE_INTERVAL = 0.5  # time between thermal model updates [s]
 _AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
 # Half the thermometer's resolution [°C]. The thermometer rounds its readings, so a reading may
-# reach the limit while the actual temperature is lower by this amount.
+# reach the limit while the actual temperature is lower by half the resolution.
 _HALF_STEP = 0.5
 _TARGET_MARGIN = 3.0  # margin below the limit for the target temperature after a reduction [°C]
 _FRACTION_MAX = 0.97  # maximum ratio of new to old force; a smaller reduction is not worthwhile

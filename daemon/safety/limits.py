@@ -46,7 +46,7 @@ _DRIFT_TIME = 0.1  # time window of the drift check [s], which allows for veloci
 # 3 ticks.
 _LATE_TIME = 0.02
 _FAILURE_TIME = 0.72  # time constant for averaging the fraction of failed readings [s]
-_FAILED_FRACTION_MAX = 0.75  # This fraction is reached after 1 s without a valid reading.
+_FAILED_FRACTION_MAX = 0.75  # maximum failed fraction, reached after 1 s without a valid reading
 _GAP_TIME = 0.1  # interval between readings above which position steps are not checked [s]
 
 
@@ -204,7 +204,7 @@ class Limit:
     check: Check | None = None
     lasts: float | str = 0.0  # minimum duration of a violation [s], or the name of a setting
     fraction: float = 1.0  # fraction of the bound to apply
-    in_turn: bool = False  # True if only one of these rows is checked per tick
+    in_turn: bool = False  # True if the row is checked in turn with others, one per tick
     gripping: bool = False  # True if the limit applies only while gripping
 
     def __call__(self, check: Check) -> Check:

@@ -24,7 +24,7 @@ _REPEAT_TIME = 1.0  # time without a violation after which a warning may be repe
 _HYSTERESIS = 0.95  # fraction of the bound below which a reported warning clears
 
 BUS = "servos.bus"  # name of the limit for errors of the servo backend
-TORQUE_OFF = "torque.off"  # limit for an unconfirmed torque off, see `safety.torque_state`
+TORQUE_OFF = "torque.off"  # limit name for a torque off that the servos have not confirmed
 
 
 class Breach(NamedTuple):

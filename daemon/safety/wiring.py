@@ -15,9 +15,9 @@ from softfinger.daemon.types import FINGERS, State
 
 _STANDING_MAX = 0.02  # maximum motion of the stationary joint [rad]
 _CLOSING_MIN = 0.05  # minimum closing motion of the other joint [rad]
-# Minimum tip tilt as a fraction of the closing motion. If the IDs are swapped, a tip tilts by about
-# the angle through which its finger rotates. In simulation, a tip on a sliding object tilts by 0.9
-# of that angle. With correct wiring, a tip tilts by only 0.25 of that angle.
+# Minimum tip tilt as a fraction of the closing motion. If the IDs are swapped, the tip tilt is
+# about equal to the rotation of the finger. For a tip on a sliding object, the simulated tilt is
+# 0.9 times the rotation. With correct wiring, the tilt is 0.25 times the rotation.
 _TILT_RATIO = 0.5
 _TILT_SIGMA = 2.0  # number of tilt standard deviations added to the threshold
 _FORCE_RISE_MIN = 1.0  # minimum tip force increase [N]

@@ -137,7 +137,7 @@ class ServoModel:
     number: int
     firmware: int  # firmware version that the emulated servo reports
     highest_baud: int  # index into BAUD_RATES
-    current_unit: float  # A per count, or 0 without a current sensor
+    current_unit: float  # current per count [A], or 0 without a current sensor
     current_limit: int  # default and upper bound
     velocity_limit: int  # default
     velocity_max: int  # upper bound of the velocity limit
@@ -231,7 +231,7 @@ _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MO
 # apply to firmware before version 42. For the XW430-T200, the e-Manual lists the stall torque of
 # the XW540-T140, 6.9 N·m at 4.9 A. The row of the XW430-T200 therefore contains the data of the
 # XH430-W210, with the stall torque scaled by the gear ratio, 200 : 213. For the XW430-T333, the
-# same scaling gives 3.2 N·m, close to the 3.1 N·m at 1.3 A in the e-Manual.
+# same kind of scaling gives 3.2 N·m, close to the 3.1 N·m at 1.3 A in the e-Manual.
 _430 = 82, (28.5, 46.5, 34.0)  # mass [g], size [mm]
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)

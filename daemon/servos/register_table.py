@@ -27,8 +27,8 @@ from softfinger.daemon.servos.joint import JointScale
 # The duration of a read includes the return delays of both servos. With delays above 50 µs, a read
 # would take longer than a tick at 500 Hz.
 RETURN_DELAY_MAX: Final = 25
-# Drive mode bits that must be clear. These bits make a servo follow another servo, or switch torque
-# on when a goal is written.
+# Drive mode bits that must be clear, because they make a servo follow another servo, or switch
+# torque on when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
 _STARTUP_FIRMWARE = 45
@@ -54,7 +54,8 @@ class Register(NamedTuple):
 
 
 # Registers that `doctor --save` stores so that they can be restored later. ID, baud rate and
-# protocol are excluded, because after such a change a servo no longer replies at its old address.
+# protocol are excluded, because a servo with a new ID, baud rate or protocol no longer replies to
+# requests at the old ones.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),

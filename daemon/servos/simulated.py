@@ -161,7 +161,7 @@ class SimulatedServos:
             limit = self._settings.current_limit[joint]
             bound = scale.bound_counts(min(abs(goal.current[joint]), limit))
             current = bound * scale.current_unit
-            if self._mode == reg.CURRENT_MODE:  # In this mode, the daemon controls the position.
+            if self._mode == reg.CURRENT_MODE:  # The daemon controls the position.
                 q, dq = self._q[joint], self._dq[joint]
                 current = current_toward(self._settings, goal.q[joint], current, q, dq)
                 counts = min(max(scale.current_counts(current), -bound), bound)

@@ -198,7 +198,7 @@ class FlexiTacDecoder(Decoder):
     def _lose(self) -> None:
         self.locked = False
         self._resyncs += 1
-        if self._buffer.startswith(MARKER):  # This marker belongs to an incomplete frame.
+        if self._buffer.startswith(MARKER):  # The marker belongs to an incomplete frame.
             self._note(0)
             self._skip(len(MARKER))
 

@@ -183,8 +183,8 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
 
 def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     part = archive.getinfo(f"{name}.npy")
-    # NumPy uses only these compression methods. With other methods, the unpacked data may exceed
-    # the stated size.
+    # NumPy uses only stored and deflated parts. With other compression methods, the unpacked data
+    # may exceed the stated size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name}: found an unsupported compression method, expected deflate")
     return part

@@ -29,7 +29,7 @@ Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: reques
 
 _ANSWER_TIMEOUT = 0.4  # maximum time to wait for the gateway before confirming a local stop [s]
 _COMMANDS_PER_TICK = 2  # maximum number of commands per tick, not counting stops
-_UNPACKED_SIZE_MAX = 4096  # after this many bytes, unpacking continues on the next tick
+_UNPACKED_SIZE_MAX = 4096  # number of bytes after which unpacking pauses until the next tick
 _OUTCOME_COUNT_MAX = 256  # maximum number of stored outcomes of requests with a key
 _KEY_LENGTH_MAX = 64
 _VALUE_TYPES = (str, int, float, type(None))  # bool is a subclass of int
@@ -77,7 +77,7 @@ class CommandServer:
 
     def _stop(self, handler: Handler, client: str) -> bytes:
         reply = accepted(handler({"command": "stop", "client": client}, 0.0))
-        self.link.fence()  # The client may continue after the reply, so raise the fence first.
+        self.link.fence()  # The client may continue after the reply, so update the fence first.
         return reply
 
     def _unpack(self, handler: Handler) -> None:

@@ -130,7 +130,7 @@ class EmulatedServos:
 
     baud: int = 0  # 0 for an immediate reply at any baud rate
     factory: bool = False  # factory defaults except for IDs and baud rate
-    ids: tuple[int, ...] | None = None  # IDs that replace those in the settings; may be equal
+    ids: tuple[int, ...] | None = None  # replacements for the configured IDs; may be duplicates
 
 
 class Emulator:

@@ -47,8 +47,8 @@ from softfinger.kinematics.contact.table_record import Table
 
 STIFFNESS = 1e5  # normal and tangential contact stiffness of a corner on the palm [N/m]
 LOSS = 1e-3  # ratio of damping to stiffness [s]
-# The tip-to-tip contact is evaluated if half the distance between the tip centres is less than this
-# many tip radii.
+# Maximum distance for evaluating the tip-to-tip contact: half the distance between the tip centres,
+# in tip radii.
 _DISTANCE_MAX = 1.5
 
 

@@ -311,7 +311,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             state.position[2] = script_x(plant, plant.step_count * h)
         if relaxing:
             relax_shears(plant)
-        # This evaluation models slip by limiting the shears. `settle` then stores the shears.
+        # The evaluation models slip by limiting the shears. `settle` then stores the limited
+        # values.
         evaluate_state(plant, data)
         if scripted:
             open_guard(plant)
@@ -320,8 +321,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             if changed == 2:
                 limit_energy(plant, data)
             elif changed == 1:
-                # Friction is higher at the reduced speed, so the gears have additional bristles.
-                # New bristles are undeflected.
+                # Slowing the gears increases their friction and therefore adds bristles. New
+                # bristles are undeflected.
                 store_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:

@@ -173,7 +173,7 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # This damping makes the joint and its position loop critically damped.
+    # Make the joint and its position loop critically damped.
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
@@ -274,7 +274,7 @@ class SimulatedHand:
         self.normal = felt.array["normal"]  # N [N]
         self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
-        # Penetration depth of the backing plate's rim. If this depth is above 0, the tip is
+        # Penetration depth of the backing plate's rim. If the rim penetrates the object, the tip is
         # compressed beyond its limit.
         self.rim = felt.array["rim"]  # m
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip

@@ -223,7 +223,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # shear at which T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # In most steps, the contact is far from slipping. Two comparisons detect these steps.
+        # Two comparisons show whether the contact is far from slipping, as it is in most steps.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction

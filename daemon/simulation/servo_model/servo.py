@@ -355,7 +355,7 @@ class EmulatedServo:
         self._joint.forget_turns()
         self._registered = None
         self._reset_goals()
-        # The value is 0 if the firmware lacks this register.
+        # The value is 0 if the firmware lacks the register.
         if self._memory[reg.STARTUP_CONFIGURATION] & 1:
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.hold()

@@ -205,7 +205,7 @@ class ServoBus:
         if packet.id == BROADCAST:
             return self._broadcast(packet, servos, t)
         if instruction == framing.STATUS:
-            return []  # This packet is the reply of another servo, or an echo.
+            return []  # The packet is a reply from another servo, or an echo.
         # Status return level 0 allows replies only to pings, level 1 also to reads, and level 2 to
         # all instructions.
         needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)

@@ -215,7 +215,7 @@ ROOM_TEMPERATURE = 25.0  # °C
 _THERMOMETER_LAG = 4.0  # s
 _CONVECTION = 0.006  # relative increase in cooling per kelvin of temperature difference [1/K]
 _STEP_MAX = 1.0  # maximum step [s]
-# Arrival tolerance in counts. Without this tolerance, rounding of the square root would prevent
+# Arrival tolerance in counts. Without a tolerance, rounding of the square root would prevent
 # arrival.
 _ARRIVAL_TOLERANCE = 1e-6
 
