@@ -44,7 +44,7 @@ _EDGE = 1.0 - 1e-4  # usable fraction of a table's range; the remainder is for t
 _TOO_DEEP = "the run exceeds the depth or tilt range of the model's data"
 _NO_BEGINNING = "no zero offset of d fits the run: the run must include the onset of contact"
 # Higher-order coefficients of three material laws. The forces for σ = c_1 ε + c_2 ε² + c_3 ε³ are
-# linear combinations of the forces for these laws.
+# linear combinations of the forces for the three laws.
 _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
 
 

@@ -66,7 +66,7 @@ class Record(metaclass=_Slotted):
     def __init_subclass__(cls) -> None:
         hints = get_type_hints(cls, include_extras=True)
         kinds = {name: _kind(hints[name]) for name in cls.__annotations__}
-        # Align fields as in C. Otherwise, Numba uses slow unaligned access for each field.
+        # Align fields as in C, because Numba accesses unaligned fields slowly.
         cls.dtype = np.dtype([(name, *kind) for name, (_, *kind) in kinds.items()], align=True)
         for name, (inner, _, shape) in kinds.items():
             setattr(cls, name, _field(name, inner, shape))

@@ -58,9 +58,9 @@ _CELL_COUNT_MIN = 48.0  # minimum number of cells for separating smooth and roug
 # Fractions of a smooth error's energy that appear in d (and in the gain), in each tilt, and in the
 # residuals. Curve errors, hysteresis and crosstalk are nearly as symmetric as the pressure.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_IN_RESIDUALS = 0.15, 0.06, 0.2
-# Relative tilt error of the solid model, divided by d/a. The error was determined by comparison
-# with frames from independent finite-element models up to 20° and 7 mm. In this range, the error is
-# 4 % for a bonded tip and negligible for a tip that lies on its sensor.
+# Relative tilt error of the solid model, divided by d/a. A comparison with frames from independent
+# finite-element models up to 20° and 7 mm gave an error of 4 % for a bonded tip and a negligible
+# error for a tip that lies on its sensor.
 _SOLID_TILT_ERROR = 0.1
 # Threshold for products of neighbouring residuals, in noise standard deviations.
 _PRODUCT_SIGMA = 6.0

@@ -377,7 +377,7 @@ class ContactEstimator:
             options.sine_max = options.step_sine = _SINE_MAX
         fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
         points = points_of(cells, material, grid.blur, count_for(cells, fineness))
-        # These are all arguments of the kernel except the state and the frame.
+        # Arguments of the kernel, except the state and the frame.
         self._arrays = self._rows, pixels, weights.array, *points
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:

@@ -214,7 +214,7 @@ class MeasuredEstimator:
         result.covariance[:3, :3] = covariance * np.outer(per_tilt, per_tilt)
         result.systematic[:3, :3] = systematic * np.outer(per_tilt, per_tilt)
         extent = force * _curve(self._law.extent, t, square_n)[0]
-        # A second contact would change the mean squared radius by more than this tolerance.
+        # A second contact would change the mean squared radius by more than the tolerance.
         tolerance = _EXTENT_ERROR_MAX * extent + _CONTACT_SIGMA * math.sqrt(self._noise[3, 3])
         agrees = abs(square - extent) < tolerance
         t_max = _EXTRAPOLATION_MAX * self._root_max * (1.0 - 1e-9)

@@ -27,7 +27,7 @@ from softfinger.kinematics.sensing.footprint import Grid, axes
 
 MODES = 32
 IMAGES = 2 * MODES
-# The number of images is padded to a multiple of this value. IMAGES must also be a multiple.
+# The number of images is padded to a multiple of _LANES. IMAGES must also be a multiple of _LANES.
 _LANES = 8
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
