@@ -132,7 +132,7 @@ class Lateness:
             timing.busy_s, self._busy_until = gap, t + ATTRIBUTION_TIME
         elif t > self._busy_until:
             timing.busy_s = 0.0
-        if self._waits:  # The hand will also wait for the delay of this tick.
+        if self._waits:  # `behind_s` does not yet include the delay of this tick.
             self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
         elif gap > LATENESS_MIN:
             self._sum += gap

@@ -318,7 +318,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
-    # Before contact, the gap shrinks at the rate at which d would grow in contact.
+    # Before contact, the gap shrinks at the same rate as d would grow during contact.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:

@@ -42,7 +42,7 @@ class _Watch:
         self.check = check
         lasts = limit.lasts
         self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
-        self.since = math.inf  # start of the violation [s], or inf if there is none
+        self.since = math.inf  # start of the violation [s], or inf without a violation
         self.reported = False
         self._ended = -math.inf
 

@@ -21,7 +21,7 @@ MARKER = b"\xaa\x55"
 _SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest frame
 _MARKER_COUNT_MAX = 96  # maximum number of stored markers, used to detect a different grid size
 _GAP_TIME = 1e-3  # minimum gap between frames [s]
-_CELL_COUNT_MIN = 16  # minimum number of cells between markers; a closer ``AA 55`` is image content
+_CELL_COUNT_MIN = 16  # minimum number of cells between markers; a closer ``AA 55`` is image data
 
 
 class FlexiTacDecoder(Decoder):

@@ -32,8 +32,8 @@ _GAP_TIME = 0.02
 # Typical pseudo-terminal latency from a write to the reader's wake-up [s]. A paced bus subtracts
 # the latency in both directions, because the simulated wire has its own transmission time.
 PASSAGE_TIME = 15e-6
-# Maximum age of a reading when its reply is sent [s]. Real servos also measure at their own
-# intervals. Because readings may be older, the physics can be computed outside the exchange.
+# Maximum age of a reading when its reply is sent [s], which allows computing the physics outside
+# the exchange. Real servos also measure at their own intervals.
 _LAG_TIME = 0.0005
 
 

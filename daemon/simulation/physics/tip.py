@@ -352,7 +352,7 @@ def touch_object(
     rotation_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
     # The integrator matrix uses the stiffness at the end of the step and therefore remains accurate
-    # during an impact. Damping uses the current stiffness.
+    # during an impact. Damping uses the stiffness at the present position.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
         tip.gain = fade(theta)[0] * p.factor * plant.relaxation_factor[finger]
