@@ -17,7 +17,7 @@ _STEP = 1e-3  # step of the time grid and of the initial delays [s]
 _DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # range of latencies to search [s]
 # Minimum closing speed in a ramp [m/s], and averaging time of the speed [s].
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
-_RAMP_MARGIN = 0.2  # time before and after a ramp that is included in the ramp [s]
+_RAMP_MARGIN = 0.2  # extension of a ramp at both ends [s]
 _CLOSING_MIN = 8e-4  # minimum closing distance in a ramp [m], seven encoder counts
 _FRAME_COUNT_MIN = 8  # minimum number of frames
 _TIME_ERROR = 1e-3  # standard deviation of the times of ticks, readings and frames [s]

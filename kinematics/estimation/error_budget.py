@@ -160,7 +160,7 @@ def set_budget(
         (variance, with_centre), _ = quadratic(np.stack([weights, centre], axis=2), rho)
         variance -= with_centre**2
         level = (level * math.sqrt(max(variance, 0.0)) + _NOISE_PEAK * max(with_centre, 0.0)) / norm
-    # A zero shift of twice the standard deviation ``baseline`` must not be detected as a contact.
+    # A zero shift of two standard deviations (``baseline``) must not be detected as a contact.
     shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
     options.patch_level = level + max(shift, 0.0)
 

@@ -314,7 +314,8 @@ class ContactEstimator:
         state = self.state = EstimatorState()
         options = self._options = state.options
         self.noise = noise
-        # Counts are rounded, so the smallest count represents readings from half a count below it.
+        # Counts are rounded, so readings down to half a count below the smallest count are
+        # included.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.patch_level = _TOLERANCE, PATCH_LEVEL

@@ -189,7 +189,7 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
     reason = _fit_frame(state, model, frame, cells)
     _set_results(state)
     if state.options.is_solid and reason == Invalid.NOT_CONVERGED:
-        # If the tip is in contact, the fit either converges within the data range or explains the
+        # If the tip is in contact, the fit either converges within the data range or matches the
         # frame at the limit of the range.
         unexplained = fit.misfit > (1.0 - R_SQUARED_MIN) * fit.readings
         reason = Invalid.MODEL_MISMATCH if unexplained or not fit.is_limited else reason

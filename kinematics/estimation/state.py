@@ -54,7 +54,7 @@ class Signal(Record):
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf without a floor
     number: int  # number of cells that a contact can load, excluding outliers
-    peak: float  # largest reading [counts]; if it is below the level, row and col are −1
+    peak: float  # largest reading [counts]; row and col are −1 if the peak is below the level
     row: int
     col: int
     mean: float  # [counts]
