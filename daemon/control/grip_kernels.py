@@ -366,8 +366,9 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     phase = law.dither_rate * g.dither_elapsed
     amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
     if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-        # Use the clock instead of counting ticks, because late ticks would reduce the frequency of
-        # a dither that counts ticks. The fingers resonate on the soft tips at 1 to 2 Hz.
+        # Use the clock instead of counting ticks, because late ticks would slow a dither that
+        # counts ticks. A slow dither could excite the resonance of the fingers on the soft tips (1
+        # to 2 Hz).
         g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
     return torque

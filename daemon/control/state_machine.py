@@ -57,9 +57,9 @@ _FORCE_TOLERANCE = 0.03
 # default finger, a friction torque of 0.05 N·m causes an error of 10 % at a force of 6 N. The
 # integral term removes the friction error within seconds.
 _FRICTION_TOLERANCE = 0.1
-# Time after which friction is assumed to hold a joint that is short of its goal, or a force that is
-# within _FRICTION_TOLERANCE of its target [s]. The value is ten times the settling time of the
-# force in a hand without friction.
+# Waiting time before a joint or a force counts as held by friction [s]: a joint that is short of
+# its goal, or a force that is within _FRICTION_TOLERANCE of its target. The waiting time is ten
+# times the settling time of the force in a hand without friction.
 _STUCK_TIME = 2.0
 # Minimum duration of apparent contact between the tips in an empty grip [s]. The duration is longer
 # than one frame period at 25 Hz.

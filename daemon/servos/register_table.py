@@ -54,8 +54,7 @@ class Register(NamedTuple):
 
 
 # Registers that `doctor --save` stores so that they can be restored later. ID, baud rate and
-# protocol are excluded, because a servo with a new ID, baud rate or protocol no longer replies to
-# requests at the old ones.
+# protocol are excluded, because a change makes the servo unreachable with the old settings.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),

@@ -49,9 +49,9 @@ class CommandServer:
         self._local = local
         self._clock = clock
         self._changes = 0  # number of executed commands other than status and stop
-        # Outcomes of requests with a key, oldest first. The dictionary key consists of the client
-        # name, which follows from the access key, and the request. An outcome is the reply or, for
-        # a late request, the numbers of stops and changes.
+        # Outcomes of requests with a key, oldest first. Each outcome is stored under the client
+        # name (determined by the access key) and the request. An outcome is the reply or, for a
+        # late request, the numbers of stops and changes.
         self._outcomes: OrderedDict[tuple[str, bytes], bytes | tuple[int, int]] = OrderedDict()
         self._stopped = b""  # reply to the last local stop
         self._answer_by = 0.0  # time after which local stops are answered without the gateway
