@@ -35,7 +35,7 @@ class Backend(NamedTuple):
 
     load: Callable[[], Any]
     metal: bool = True  # True for real hardware
-    hand: Any = False  # True if a simulated hand is needed; a servo backend may specify its class
+    hand: Any = False  # True if a simulated hand is needed; a servo backend may set its class
     name: str = ""  # plugin name, or empty for a built-in backend
     source: str = ""  # plugin name, package and version for messages
     section: type[BaseModel] | None = None  # plugin's settings model

@@ -37,7 +37,7 @@ class Clock(Protocol):
 class LoopClock(Clock, Protocol):
     """Clock of the loop, which also provides the machine's real time."""
 
-    behind: float  # total delay of `now` relative to the machine's time [s]
+    behind: float  # total time by which `now` lags behind the machine's clock [s]
 
     def host(self) -> float:
         """Return the machine's monotonic time [s], used to measure computing time and delay."""

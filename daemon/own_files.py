@@ -31,7 +31,7 @@ def open_regular(path: Path) -> BinaryIO:
 
     Raises OSError on failure, and if the path is a device or a pipe.
     """
-    mode = path.stat().st_mode  # Check first, because opening can affect a device.
+    mode = path.stat().st_mode  # Check the type first, because opening a device can affect it.
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, "found a device or a pipe, expected a regular file", str(path))
     no_wait = getattr(os, "O_NONBLOCK", 0)

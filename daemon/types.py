@@ -65,8 +65,8 @@ class Contact:
     """Contact of one fingertip: the newest frame estimate, extrapolated with later joint angles."""
 
     seq: int = 0  # sequence number of the frame
-    t: float = 0.0  # sample time of that frame [s]
-    t_arrival: float = 0.0  # arrival time of that frame [s]
+    t: float = 0.0  # sample time of the frame [s]
+    t_arrival: float = 0.0  # arrival time of the frame [s]
     t_valid: float = 0.0  # arrival time of the last frame with a valid estimate [s]
     invalid: Invalid = Invalid.NO_FRAME  # reason why the estimate is invalid
     contact: bool = False  # True if the tip is in contact
@@ -78,7 +78,7 @@ class Contact:
     gain: float = 1.0  # ratio of measured to modelled pressure
     modulus_scale: float = 1.0  # ratio of the tip modulus to its setting
     modulus_scale_std: float = 0.0
-    sensor_gain: float = 1.0  # The `gain` is modulus_scale · sensor_gain.
+    sensor_gain: float = 1.0  # `gain` equals modulus_scale · sensor_gain
     sensor_gain_std: float = 0.0
     torque_scale: float = 1.0  # ratio of the torque constant setting to the true value
     torque_scale_std: float = 0.0
@@ -87,7 +87,7 @@ class Contact:
     nis_angle: float = 1.0
     nis_footprint: float = 1.0
     nis_amplitude: float = 1.0
-    misfit: bool = False  # True if no model contact fits the frame; d and theta may be biased
+    misfit: bool = False  # True if the model does not fit the frame; d and theta may be biased
     force: float = 0.0  # normal force from the table, modulus_scale · F(d, total tilt) [N]
     energy: float = 0.0  # modulus_scale · U(d, total tilt) [J]
     force_std: float = 0.0  # standard deviation [N], including table and material-law errors
@@ -146,7 +146,7 @@ class Timing:
     wake_late_s: float = 0.0  # delay of this tick's start relative to its deadline
     overruns: int = 0  # number of ticks that took longer than the period
     late_in_row: int = 0  # number of consecutive late ticks, or 0 if the hand's clock pauses
-    behind_s: float = 0.0  # total time for which a simulated hand has waited for this machine
+    behind_s: float = 0.0  # total time that a simulated hand has waited for this machine
     busy_s: float = 0.0  # duration of a recent stall of this machine, or 0
 
 

@@ -76,7 +76,7 @@ class Envelope:
             width, count = settings.object.width, len(self._masses)
             column = min(range(len(sizes)), key=lambda k: abs(sizes[k] - width))
             row = max(sum(each <= control.tip_friction + 1e-9 for each in frictions) - 1, 0) * count
-            # Each string contains the outcomes of all object shapes with the same mass.
+            # Each string contains the outcomes for one object mass, with one character per shape.
             rows = zip(*(found[shape][row : row + count] for shape in found["shapes"]), strict=True)
             self._outcomes = ["".join(cells[column] for cells in shapes) for shapes in rows]
             self._force_limit = found["raised"]

@@ -11,11 +11,11 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Goal, State
 
 # Distance from the current angle to the goal angle of a torque-controlled joint [rad]. The distance
-# is large enough for the current limit to determine the torque; `hand_estimator` expects at least
-# 0.25 rad. The distance is smaller than `safety.goal_reach` so that the goal may jump from one side
-# of the joint to the other.
+# must be at least 0.25 rad, so that the current limit determines the torque (see `hand_estimator`).
+# The distance is smaller than `safety.goal_reach` so that the goal may jump from one side of the
+# joint to the other.
 _GOAL_OFFSET = 0.35
-# Difference between the maximum tilt during a rotation and the tilt that triggers a fault [rad].
+# Margin between the maximum tilt during a rotation and the tilt that triggers a fault [rad].
 _TILT_RESERVE = 0.1
 
 

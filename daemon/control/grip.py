@@ -50,7 +50,7 @@ class Grip:
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # object angle [rad]
         self.slip = state.slip
         self.commanded_max = math.inf  # highest commanded force allowed [N], set by `limit_force`
-        self.target_angle = math.nan  # target object angle [rad], NaN if not steered
+        self.target_angle = math.nan  # target object angle [rad], NaN if no target is set
         configure(state.slip, settings)
         law = state.law
         law.dt = dt

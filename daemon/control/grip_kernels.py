@@ -22,10 +22,10 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_ERROR_SIGMA = 2.0  # torque constant standard deviations allowed for in the force limit
+_TORQUE_ERROR_SIGMA = 2.0  # force limit margin, in standard deviations of the torque constant
 _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
-_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to this controller [rad]
+_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to equalising the tip forces [rad]
 _DITHER_STEP_MAX = 0.05  # maximum time step of the dither, even after a late tick [s]
 _STIFFNESS_MIN = 100.0  # lower bound of the stiffness [N/m]; gains are divided by the stiffness
 ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
@@ -45,8 +45,8 @@ class GripLaw(Record):
     friction_speed: float  # joint speed above which friction is fully compensated [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
-    turn_decay: float  # factor by which the rotation rate decays on each tick without a frame
-    is_blind: bool  # True if dither uprights the object without an angle measurement
+    turn_decay: float  # decay factor for the rotation rate, applied on each tick without a frame
+    is_blind: bool  # True for the `upright` law, which uses dither instead of angle measurements
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
     offset: float  # fingertip offset [m]
@@ -70,9 +70,9 @@ class GripState(Record):
     integral: float  # [N]
     grip_force: float  # sum of feed-forward and feedback [N]
     offset_rate: float  # rate of change of the offset that rotates the object [rad/s]
-    offset: float  # goal of (q1 − q2)/2 [rad]
+    offset: float  # goal for (q1 − q2)/2 [rad]
     dither_elapsed: float  # time since the dither began [s]
-    last_time: float  # start time, or time of the last tick that gave both joints equal torques [s]
+    last_time: float  # start time, or time of the last tick with equal torques for both joints [s]
     balance_offset: float  # part of the offset that equalises the tip forces [rad]
     closing_friction: float  # fraction of the joint friction that is compensated during closing
     torque: Pair  # most recent torques of both joints [N·m]
@@ -360,14 +360,15 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     lengths = (law.half_separation, law.length, law.offset, law.radius)
     spring = upright_spring(mean(q), mean(grasp.d), target, grasp.tilt_moment_ratio, lengths)
     spring = min(spring, g.joint_stiffness)
-    # The next hold must start at the current spring torque.
+    # The hold that follows the dither must start with the current spring torque.
     g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
     # The amplitude rises during the first period and decays to zero by the end of the dither.
     phase = law.dither_rate * g.dither_elapsed
     amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
     if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-        # Measure time with the clock instead of counting ticks. Otherwise, late ticks could slow
-        # the dither down to the resonance of the fingers on the tips (1 to 2 Hz).
+        # Use the clock instead of counting ticks, because late ticks would slow a dither that
+        # counts ticks. A slow dither could excite the resonance of the fingers on the soft tips (1
+        # to 2 Hz).
         g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
     return torque

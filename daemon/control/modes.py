@@ -204,6 +204,5 @@ COMMANDS: dict[str, CommandKind] = {
     ),
 }
 
-# These commands never stiffen or move the hand, so the daemon accepts them even if they arrive
-# late.
+# Commands that never stiffen or move the hand. The daemon accepts late commands of this kind.
 SAFE_COMMANDS = frozenset({"disarm", "tare", "clear"})

@@ -50,16 +50,16 @@ from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
 _AVERAGE_TIME = 0.1  # averaging time [s]; velocity readings fluctuate by one count (0.024 rad/s)
 _SETTLING_TIME = 1.0  # settling time of the residual, and hold time of a force increase [s]
-_DECAY_TIME = 2.0  # time to remove an increase of `grip_raise_max`, and decay time of rotations [s]
+_DECAY_TIME = 2.0  # time to reduce the force by `grip_raise_max`, and decay time of rotations [s]
 _SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
 _ROTATION_INCREASE = 0.5  # relative force increase after the object has rotated
-_ROTATION_MARGIN = 1.5  # minimum rotation that counts, relative to the rotation due to shear
+_ROTATION_MARGIN = 1.5  # minimum significant rotation, relative to the rotation due to shear
 _SHEAR_JUMP = 0.6  # minimum shear jump measured by solid tips [N], equal to six standard deviations
-_AGREEMENT = 0.25  # minimum share of each joint or tip in a change, as a fraction of the mean
+_AGREEMENT = 0.25  # minimum change at each joint or tip, as a fraction of the mean change
 _UNCONFIRMED_SHARE = 0.3  # highest unconfirmed force increase, as a fraction of the force
-_RELAXATION_SHARE = 0.2  # maximum force loss by relaxation during a hold, as a fraction
+_RELAXATION_SHARE = 0.2  # maximum relative force loss due to relaxation during a hold
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
-_SPARE_MIN = 0.3  # minimum fraction of the friction coefficient that remains after rolling
+_SPARE_MIN = 0.3  # minimum usable fraction of the friction coefficient
 
 
 class SlipLaw(Record):
@@ -103,7 +103,7 @@ class SlipState(Record):
     is_confirmed: bool  # True if a load may increase the force by more than _UNCONFIRMED_SHARE
     pull: float  # average pulling force measured by solid tips [N]
     twist: float  # average twisting force measured by solid tips [N]
-    usable_friction: float  # friction coefficient minus the parts for slip margin and rolling
+    usable_friction: float  # friction coefficient minus the shares of slip margin and rolling
     rotation_seen: Pair  # value of `unexplained_rotation` at the previous update [rad]
     rotation: Pair  # unexplained rotation per tip during the last _DECAY_TIME [rad]
     has_turned: bool  # True if a rotation of the object in the grip was detected on this tick
@@ -248,8 +248,8 @@ def _increased_force(s: SlipState, grasp: GraspState, commanded: float, sudden: 
     """Return the grip force [N] that the assumed load and the events of this tick require."""
     s.reflex_triggered = s.has_turned or sudden
     s.is_confirmed = s.is_confirmed or s.reflex_triggered
-    # If the object is pushed towards one finger, that tip's force increases. The joint torques show
-    # the push first.
+    # If the object is pushed towards one finger, the force on that finger's tip increases. The
+    # joint torques show the push earlier than the tip forces.
     by_torque = abs(grasp.torque_residual[0] - grasp.torque_residual[1])
     by_torque /= max(mean(grasp.moment_arm), s.law.arm_min)
     imbalance = 0.5 * max(abs(grasp.force[0] - grasp.force[1]), by_torque)
@@ -385,7 +385,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     _update_offset(s, grasp, residual, torque_change)
-    # If friction decreases or reverses, the change is not a load.
+    # A residual change due to decreasing or reversing friction is not a load.
     deviation = residual - s.offset
     increase = residual - s.start_offset
     s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
@@ -393,8 +393,8 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
-    # Joint friction can hide a load of the size `hidden`. While the detected load |L| rises from
-    # half of `hidden` to `hidden`, the estimate rises from 0 to |L| + `hidden`.
+    # Joint friction can hide loads of up to `hidden`. While the detected load |L| rises from half
+    # of `hidden` to `hidden`, the estimate rises from 0 to |L| + `hidden`.
     threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
     hidden = s.friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)

@@ -54,24 +54,24 @@ _ARRIVAL_DISTANCE = 0.03
 # % (1 σ).
 _FORCE_TOLERANCE = 0.03
 # Maximum force error due to joint or gear friction, as a fraction of the force target. With the
-# default finger, a friction of 0.05 N·m corresponds to 10 % of 6 N. The integral term removes this
-# error within seconds.
+# default finger, a friction torque of 0.05 N·m causes an error of 10 % at a force of 6 N. The
+# integral term removes the friction error within seconds.
 _FRICTION_TOLERANCE = 0.1
-# Waiting time [s]: a joint that has not reached its goal by then is held by friction, and so is a
-# force that is still within _FRICTION_TOLERANCE. The value is ten times the settling time of the
-# force without friction.
+# Waiting time before a joint or a force counts as held by friction [s]: a joint that is short of
+# its goal, or a force that is within _FRICTION_TOLERANCE of its target. The waiting time is ten
+# times the settling time of the force in a hand without friction.
 _STUCK_TIME = 2.0
-# Time for which the tips must appear to touch each other before the grip counts as empty [s]. The
-# value is longer than one frame period at 25 Hz.
+# Minimum duration of apparent contact between the tips in an empty grip [s]. The duration is longer
+# than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
 # Tolerance for a streamed force target, as a fraction of the target. A streamed target may change
-# continuously, so a grip also counts as settled when the force follows a setpoint within this
+# continuously, so a grip also counts as settled when the force follows a setpoint within the
 # tolerance.
 _STREAM_TOLERANCE = 0.25
-# Smaller changes in a streamed setpoint or in the force increase are treated as noise. The first
-# value is a fraction of the force. The second value is the standard deviation of the angle [rad].
+# Smaller changes in a streamed setpoint or in the force increase are treated as noise. _FORCE_NOISE
+# is a fraction of the force. _ANGLE_NOISE is the standard deviation of the angle [rad].
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
 
 
@@ -122,7 +122,7 @@ class Approaching(ControlState):
     command: GraspCommand
     touching: set[int] = field(default_factory=set)  # indices of the fingers in contact
     arrived_for: float = 0.0  # time since the setpoints reached the joint limits [s]
-    empty_for: float = 0.0  # time for which the tips have appeared to touch each other [s]
+    empty_for: float = 0.0  # duration of apparent contact between the tips [s]
 
 
 @dataclass
@@ -131,7 +131,7 @@ class GripHistory:
 
     lost_for: float = 0.0  # [s]
     lost_current: float = 0.0  # current limit while a contact is missing [A]
-    empty_for: float = 0.0  # time for which the tips have appeared to touch each other [s]
+    empty_for: float = 0.0  # duration of apparent contact between the tips [s]
     settled_force: float = math.nan  # commanded force when the grip last settled [N]
     settled_angle: float = math.nan  # commanded angle when the grip last settled [rad]
     increase_reported: bool = False
@@ -143,8 +143,8 @@ class Gripping(ControlState):
     """Base class of the states in which the grip controller computes joint torques."""
 
     history: GripHistory
-    reached_for: float = 0.0  # time for which force and angle have been at their targets [s]
-    near_for: float = 0.0  # time for which the force error has been within _FRICTION_TOLERANCE [s]
+    reached_for: float = 0.0  # time since force and angle reached their targets [s]
+    near_for: float = 0.0  # time since the force error fell below _FRICTION_TOLERANCE [s]
 
 
 @dataclass(kw_only=True)
@@ -183,10 +183,10 @@ class Control:
         self.grip = Grip(settings, self.fingers.indices, grasp)
         self.state: ControlState = Off()
         self.events: list[Event] = []
-        # The contact may be lost for as long as frames may be missing [s].
+        # Maximum duration of a contact loss [s], equal to the maximum time without frames.
         self._contact_loss_time = settings.safety.frame_age_fault / settings.tactile.rate
-        # Force and angle count as settled when they have stayed at their targets for the averaging
-        # time of their setpoints. The setpoints are averaged twice [s].
+        # Settling time [s]. Force and angle count as settled when they have stayed at their targets
+        # for the averaging time of their setpoints. The setpoints are averaged twice.
         self._settling_time = 2.0 * settings.control.smooth_time
 
     @property
@@ -374,8 +374,9 @@ class Control:
         # The tip may reach the object before the sensor detects contact. Limit the current so that
         # the tip force can't exceed the commanded force.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
-        # If the joint does not move under this torque, the joint friction is larger than the
-        # setting. Therefore also use `free_torque`, the friction torque measured in free motion.
+        # The joint friction may be larger than the setting, so also use `free_torque`, the friction
+        # torque measured in free motion. Otherwise, the joint might not move at the limited
+        # current.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 

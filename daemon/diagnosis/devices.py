@@ -52,7 +52,7 @@ from softfinger.daemon.servos.torque import goal_address
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS, Frame
 
-_LISTEN_TIME = 0.5  # time for which frames are received [s]
+_LISTEN_TIME = 0.5  # time during which frames are received [s]
 _REST_NOISE_RATIO = 3.0  # maximum median pressure at rest, as a multiple of the cell noise
 _RATE_TOLERANCE = 0.1  # tolerated relative frame rate error
 _POISSON_TOLERANCE = 0.02  # tolerance for ν, limited by the accuracy of the calibration

@@ -23,7 +23,7 @@ from softfinger.daemon.servos.register_table import REGISTERS
 from softfinger.daemon.types import FINGERS
 
 _FILE_SIZE_MAX = 1 << 20  # maximum file size [bytes]
-_PASS_COUNT = 2  # number of passes; a lower limit may be rejected until its upper limit is written
+_PASS_COUNT = 2  # number of passes; a servo may reject a lower limit until the upper limit is set
 
 
 class StoredServo(Section):

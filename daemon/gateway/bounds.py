@@ -13,8 +13,8 @@ MEMORY_MAX = 128 << 20  # data segment limit [bytes]; Python and libzmq use a th
 DESCRIPTOR_COUNT = 64  # number of file descriptors in addition to those of clients
 CLIENT_COUNT_MAX = 256  # maximum number of connections, commands and stream combined
 STEP_CPU_TIME_MAX = 3.0  # CPU time limit of one step [s], after which the kernel ends the process
-# Elapsed time limit of one step [s]. This limit is higher than the CPU limit, because the process
-# may have to wait on a busy machine.
+# Limit on the elapsed time of one step [s]. The elapsed time may exceed the CPU time, because the
+# process may have to wait on a busy machine.
 STEP_TIME_MAX = 30.0
 # Longest poll interval [s]. After a longer interval, the gateway stamps new requests with the time
 # of the previous poll.
@@ -26,16 +26,16 @@ SOCKET_QUEUE_LENGTH = 64  # number of requests, replies or subscriptions queued 
 PART_SIZE_RATIO = 4  # size limit of one message part, as a multiple of commands.max_bytes
 PART_COUNT_MAX = 16  # maximum number of parts in a request, including routing frame and envelope
 ENVELOPE_SIZE_MAX = 1024  # maximum combined size of routing frame and envelope [bytes]
-HANDSHAKES_PER_TURN = 64  # handshakes completed before the loop and the stream are served
+HANDSHAKES_PER_TURN = 64  # maximum number of handshakes before the loop and the stream are served
 SUBSCRIPTION_SIZE_MAX = 1024  # maximum size [bytes]; handshake messages are longer than topics
 SUBSCRIPTIONS_PER_TURN = 64
 REPEAT_INTERVAL = 0.1  # minimum interval between message repetitions for late subscribers [s]
 KEY_CHECK_INTERVAL = 0.5  # interval between key folder checks [s]
 
-# Time after a stop during which all requests except status are refused [s]. A flood of requests
-# extends this time.
+# Time after a stop during which only status requests are accepted [s]. A flood of requests extends
+# the time.
 REFUSAL_TIME = 0.02
-ANSWER_DELAY_MAX = 0.25  # maximum time for which replies are held back after a stop [s]
+ANSWER_DELAY_MAX = 0.25  # maximum delay of replies after a stop [s]
 
 # Requests
 UNANSWERED_MAX = 16  # maximum number of requests that await the loop's reply

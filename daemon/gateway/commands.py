@@ -29,7 +29,7 @@ from softfinger.daemon.gateway.endpoints import NO_WAIT, ClientSockets, read_par
 from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask, Channel
 
-# This byte sequence cannot occur inside a string.
+# Packed strings cannot contain the byte sequence of a packed stop command.
 _PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")
 _MALFORMED_REFUSAL = refusal(
     "envelope: expected a single frame with the command; an envelope may precede this frame if "
@@ -46,7 +46,7 @@ class Client:
     def __init__(self) -> None:
         self.waiting: deque[Ask] = deque()
         self.urgent = False  # True while an urgent request awaits its reply
-        self._behind = False  # True from the time a client exceeds its rate until it pauses
+        self._behind = False  # True if the client exceeded its rate and has not paused since
         self._tokens = math.inf
         self.last = -math.inf  # time of the last request
 
@@ -81,15 +81,15 @@ class CommandEndpoint:
         self.stops = 0  # stop count stamped on new requests
         self._fence = 0  # current stop count
         self._last_poll = clock()
-        # Time of the last poll before a gap, or infinity once all requests from the gap have been
-        # read.
+        # Time of the last poll before a gap between polls, or infinity once all requests that
+        # arrived in the gap have been read.
         self._dated = math.inf
         self._unread_max = 0  # maximum number of requests from the gap that are still unread
         self._since = 0.0  # time of the last stop, gap or check for older requests
-        self._arrived = 0  # number of requests since `_since`, except status
+        self._arrived = 0  # number of requests since `_since`, excluding status requests
         self._replies: deque[list[bytes]] = deque()  # replies that have not been sent yet
-        # Time for which replies have been held back [s]. One step adds at most REFUSAL_TIME, so a
-        # stall of the process has little effect.
+        # Current delay of the replies [s]. One step adds at most REFUSAL_TIME, so a stall of the
+        # process has little effect.
         self._held_for = 0.0
         # Clients that sent a request in the last second, in the order of their last requests.
         self._clients: dict[bytes, Client] = {}
@@ -122,8 +122,8 @@ class CommandEndpoint:
             if parts:
                 self._take([part.bytes for part in parts], self._sockets.name(parts[-1]), now)
                 continue
-            # The socket is empty, but the libzmq thread may still deliver older requests. They
-            # count as read only after a period with few new requests.
+            # The socket is empty, but the libzmq thread may still deliver older requests. All older
+            # requests count as read only after a period with few new requests.
             if now - self._since > bounds.REFUSAL_TIME:
                 if self._arrived <= bounds.TOTAL_RATE * bounds.REFUSAL_TIME:
                     self.stops, self._dated = self._fence, math.inf
@@ -143,7 +143,7 @@ class CommandEndpoint:
 
     def _take(self, parts: list[bytes], name: str, now: float) -> None:
         """Queue or refuse one client message."""
-        # Like a REP socket, return the frames up to the first empty frame with the reply.
+        # Like a REP socket, prefix the reply with the frames up to the first empty frame.
         ends = parts.index(b"", 1) + 1 if b"" in parts[1:-1] else 1
         route, payload = parts[:ends], parts[-1]
         if sum(map(len, route)) > bounds.ENVELOPE_SIZE_MAX or len(parts) > bounds.PART_COUNT_MAX:

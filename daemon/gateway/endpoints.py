@@ -54,7 +54,7 @@ class ClientSockets:
         config, is_router = self._config, kind == zmq.ROUTER
         part_size = bounds.PART_SIZE_RATIO * config.max_bytes
         opened: zmq.Socket[Any] = self._context.socket(kind)
-        # Set the socket options before bind, because they apply only to later connections.
+        # Set the socket options before bind, because options apply only to later connections.
         for option, value in (
             (zmq.MAXMSGSIZE, part_size if is_router else bounds.SUBSCRIPTION_SIZE_MAX),
             (zmq.SNDHWM, bounds.SOCKET_QUEUE_LENGTH if is_router else config.queue),

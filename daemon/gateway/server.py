@@ -33,7 +33,7 @@ from softfinger.daemon.wire.loop_link import (
     machine_time,
 )
 
-_TIMER_INTERVAL = 0.5  # interval at which the timers that end a stalled process are reset [s]
+_TIMER_INTERVAL = 0.5  # interval between resets of the timers that end a stalled process [s]
 
 
 class Server:
@@ -127,7 +127,7 @@ def _limit_resources() -> None:
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = min(bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT, most)
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
-    with contextlib.suppress(OSError):  # These two measures are optional.
+    with contextlib.suppress(OSError):  # The OOM score and the scheduling policy are optional.
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

@@ -56,8 +56,8 @@ class Gateway:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
-                # The process runs in its own session. Otherwise, Ctrl-C would end the process
-                # before it has sent the daemon's last messages.
+                # The process runs in its own session, because Ctrl-C must not end the process
+                # before the daemon's last messages have been sent.
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )
@@ -97,7 +97,7 @@ class Gateway:
         A suspended process is killed, because its timers don't run.
         """
         process = self.process
-        with contextlib.suppress(ChildProcessError):  # `close` has waited for the process.
+        with contextlib.suppress(ChildProcessError):  # `close` has already waited for the process.
             while _is_suspended(process.pid):
                 self._closing.wait(_SUSPENSION_TIME_MAX)
                 if _is_suspended(process.pid, os.WNOHANG):
@@ -110,7 +110,7 @@ class Gateway:
 
     def _kill(self) -> None:
         self._channel.close()
-        with self.process as process:  # waits for the end and closes the pipe
+        with self.process as process:  # `Popen.__exit__` closes the pipe and waits for the process.
             process.kill()
 
     def close(self) -> None:

@@ -188,7 +188,8 @@ class Daemon:
             closer = self._closers.pop()
             try:
                 closer()
-            except Exception as error:  # Torque off and the other cleanup functions must still run.
+            # The remaining functions, such as torque off, must still run.
+            except Exception as error:
                 logging.getLogger(__name__).error("closing: %s", error)
 
     def __enter__(self) -> Daemon:

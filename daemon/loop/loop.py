@@ -49,7 +49,7 @@ def command_age_max(settings: Settings, waits: bool) -> float:
 class Commands(Protocol):
     """Command source: `wire.command_server.CommandServer` or a recording."""
 
-    link: Link  # Its notices are emitted as events. A recording uses an unconnected link.
+    link: Link  # The loop emits the link's notices as events. Recordings use an unconnected link.
 
     def serve(self, handler: Handler) -> None:
         """Pass each request that is due on this tick to ``handler``."""

@@ -44,7 +44,8 @@ class ProcessReplay:
         with tempfile.TemporaryDirectory() as folder:
             settings = with_calibrations(settings, calibrations, Path(folder))
             models = make_models(settings)
-        settings = settings.model_copy(update={"task": TaskSettings()})  # replayed instead
+        # Disable the task, because the recording contains the task's commands.
+        settings = settings.model_copy(update={"task": TaskSettings()})
         self._clock = _Clock()
         self._commands = _Commands()
         self._servos = _Servos() if settings.servos.backend != "none" else None
@@ -180,7 +181,7 @@ class _Commands:
             try:
                 handler(request, 0.0)
             except Refused:
-                pass  # The state comparison will reveal the difference.
+                pass  # Comparing the states will reveal any difference.
         self.waiting = []
 
     def close(self) -> None:

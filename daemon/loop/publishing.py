@@ -20,7 +20,7 @@ _STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
     bit, (schema.STATE, schema.TACTILE, schema.STATS, schema.INPUT, schema.TRUTH)
 )
 _STATS_RATE = 1.0  # Hz
-_STATS_PHASE = 3  # ticks from state to statistics, so that no tick publishes both
+_STATS_PHASE = 3  # number of ticks between state and statistics; no tick publishes both
 
 
 def every(rate: float, wanted: float) -> int:
@@ -62,7 +62,7 @@ class Publishing:
         self._seen: list[Frame | None] = [None, None]  # newest frame per finger
         self._published = [-1, -1]  # number of the last published group of frames, per finger
         self._states = self._maps = 0  # numbers of published messages
-        # Time [s] and counts at the last publication of the rates.
+        # Time [s] and counts when the rates were last published.
         self._counted: tuple[float, ...] = (0.0,) * 6
 
     def __call__(self, state: State) -> None:

@@ -46,8 +46,8 @@ _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 # System call numbers of sched_setattr and sched_getattr for each machine type. The C library does
-# not wrap these calls. Their argument is struct sched_attr: size, policy, flags, nice, priority,
-# runtime, deadline, period.
+# not wrap the two system calls. The argument of both calls is struct sched_attr: size, policy,
+# flags, nice, priority, runtime, deadline, period.
 _ATTRIBUTE_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 _ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 _SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # range of time slices accepted by the kernel [ns]
@@ -63,7 +63,7 @@ class RealTime:
 
     def __init__(self, settings: Settings) -> None:
         self.granted: list[str] = []
-        self.refused: list[str] = []  # rejected measures, each with its consequence and remedy
+        self.refused: list[str] = []  # rejected settings, each with its consequence and remedy
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)

@@ -190,7 +190,7 @@ class Requests:
             If the request is rejected. The message gives the reason.
         """
         state, control = self._state, self._control
-        # A stop is accepted in every mode, from any client, with any fields.
+        # A stop command is accepted in every mode and from every client, even with unknown fields.
         if request["command"] == "stop":
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}
@@ -344,8 +344,8 @@ class Requests:
         if self._torque.servos is None or not silent:
             return
         if self._torque.pending and not state.read_error:
-            # The port works. A connection attempt would break the bus silence that makes the servos
-            # stop.
+            # The port works, so do not reconnect. Sending packets would end the bus silence that
+            # makes the servo watchdogs stop the servos.
             return
         try:
             self._torque.reconnect()

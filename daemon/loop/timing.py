@@ -41,7 +41,7 @@ LATENESS_MIN = 0.05  # minimum delay that is reported [s]
 # previous report.
 REPORT_INTERVAL = 60.0
 ATTRIBUTION_TIME = 0.25  # time after a late tick during which faults may be attributed to it [s]
-# Limits that a single late tick can exceed.
+# Limits that can be exceeded because of a single late tick.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
 Event = tuple[str, str, str]
@@ -116,7 +116,7 @@ class Lateness:
         self._timing = timing
         self._period = 1.0 / settings.loop.rate
         self._waits = waits
-        self._sum = 0.0  # total tick delay, or total time for which the hand has waited [s]
+        self._sum = 0.0  # total delay of the ticks, or total time that the hand has waited [s]
         self._reported = (0.0, -math.inf)  # total delay and time at the last report [s]
         self._busy_until = -math.inf
 
@@ -132,7 +132,7 @@ class Lateness:
             timing.busy_s, self._busy_until = gap, t + ATTRIBUTION_TIME
         elif t > self._busy_until:
             timing.busy_s = 0.0
-        if self._waits:  # The hand will also wait for this tick's delay before the next tick.
+        if self._waits:  # `behind_s` does not yet include the delay of this tick.
             self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
         elif gap > LATENESS_MIN:
             self._sum += gap

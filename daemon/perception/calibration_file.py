@@ -28,7 +28,7 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
-_FAULTY = 0.2  # Below this fraction of the median range, an unloaded cell counts as faulty.
+_FAULTY = 0.2  # minimum range of a working cell, as a fraction of the median range
 
 
 class CalibrationFileError(TactileError):

@@ -62,11 +62,11 @@ D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
 # 0.04 rad.
 IMAGE_SHIFT_MIN = 0.06
 _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
-_NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; below it, an object may rock
+_NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; an object held with less force may rock
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
-# A footprint that grows within the response time of the cells appears wider and flatter. The first
-# two values are the relative changes divided by var(d)/d². They result from fitting a paraboloid to
-# the mean of several paraboloids.
+# A footprint that grows within the response time of the cells appears wider and flatter. _WIDENING
+# and _FLATTENING are the relative changes divided by var(d)/d², determined by fitting a paraboloid
+# to the mean of several paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
 _SLOPE_SMOOTHING = 0.9  # low-pass coefficient for ∂ ln F/∂d, applied on every frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
@@ -86,7 +86,7 @@ class FrameContact(NamedTuple):
 class Scan(NamedTuple):
     """Predicted motion of one finger from a scan until now, and its state at the scan."""
 
-    d: float  # motion of d since the scan [m]
+    d: float  # change in d since the scan [m]
     q: float  # joint motion since the scan [rad]
     rotation: float  # object rotation since the scan [rad]
     d_rate: float  # at the scan [m/s]
@@ -113,7 +113,7 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
     fraction = 0.0
     for back in range(size):
         row = (newest - back) % size
-        if history[row].t == -math.inf:  # No joint reading is as old as the frame.
+        if history[row].t == -math.inf:  # The frame is older than all joint readings.
             before = after
             break
         before = row
@@ -230,7 +230,7 @@ def update(
     if is_new_contact:
         tip.touch_time = h.t
         _begin_contact(h, finger, sense, face + scan.rotation)
-    # Shortly after the touch, the cells still show motion from before the contact.
+    # Shortly after first contact, the cells still respond to motion that preceded the contact.
     cells_respond = h.t - tip.touch_time < h.response
     if is_new_contact or cells_respond:
         reset(h, D + finger, d + scan.d, (_FIRST_D_ERROR * d) ** 2)
@@ -252,7 +252,7 @@ def update(
     tip.shear = found.shear
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
-    if tip.gain_is_fixed:  # The filter estimates GAIN, so remove the gain's part of the error.
+    if tip.gain_is_fixed:  # The filter estimates GAIN, so remove the error due to the gain.
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = not cells_respond
@@ -340,7 +340,7 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
         if measured > 0.0:
             h.mean[FRICTION] += 0.5 * (measured - h.prior_mean[FRICTION])
             h.covariance[FRICTION, FRICTION] *= 0.5
-    # A load may already be acting on the object.
+    # A load may already be acting on the object, so increase the friction variance.
     h.covariance[FRICTION, FRICTION] += TORQUE_NOISE * TORQUE_NOISE
 
 

@@ -35,10 +35,10 @@ class GraspState(Record):
     force: Pair  # elastic tip forces [N]
     stiffness: Pair  # ∂F/∂d [N/m]
     normal: Pair  # normal forces [N]
-    shear: float  # shear force divided by normal force, at equilibrium without a load
+    shear: float  # ratio of shear force to normal force, at equilibrium without a load
     angle_std: float  # standard deviation of the object angle [rad]
     taper: float  # angle α between the object faces [rad]
-    tilt_moment_ratio: float  # constant of an upright tip, (∂U/∂θ)/(F θ d)
+    tilt_moment_ratio: float  # (∂U/∂θ)/(F θ d), a constant for an upright tip
 
     # Moment arms
     moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
@@ -58,16 +58,16 @@ class GraspState(Record):
 
     # Consistency
     nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running average, expected to be 1
-    angle_jump: Pair  # difference between newest frame and prediction in a grip [rad]
-    d_jump: Pair  # the corresponding difference in displacement [m], or 0 if d is not measured
+    angle_jump: Pair  # angle in the newest frame minus predicted angle, during a grip [rad]
+    d_jump: Pair  # d in the newest frame minus predicted d [m], or 0 if d is not measured
     rejects_frames: Pair  # 1 if too many consecutive frames were rejected
     d_bias: Pair  # [m]
     d_bias_std: Pair
     angle_bias: Pair  # [rad]
     angle_bias_std: Pair
     has_bias: Pair  # 1 if the sensor's bias is significant
-    gain_change: Pair  # logarithm of the gain divided by its prior
+    gain_change: Pair  # logarithm of the ratio of the gain to its prior
     gain_std: Pair
     gain_prior_std: Pair
-    has_wrong_current: Pair  # 1 if a joint's current has deviated from its goal for too long
-    sensor_fault: bool  # True if a faulty channel forbids an increase in grip force
+    has_wrong_current: Pair  # 1 if the joint's current has differed from its goal for too long
+    sensor_fault: bool  # True if the grip force must not increase because a channel is faulty

@@ -122,14 +122,14 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
     h.torque_max = max(h.torque_max, torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
-    if h.closing_speed > h.velocity_unit:  # In a closing joint, friction opposes the motion.
+    if h.closing_speed > h.velocity_unit:  # Friction opposes the closing motion.
         innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
-        # When the torque decreases, gear friction may hold any part of the decrease.
+        # When the torque decreases, gear friction may carry any part of the decrease.
         held_torque = min(h.torque_max - torque, h.load_held * torque)
         variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
         if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
-            h.covariance[FRICTION, FRICTION] += innovation * innovation  # The load has disappeared.
+            h.covariance[FRICTION, FRICTION] += innovation * innovation  # A load has disappeared.
         correct(h, TORQUES, innovation, variance, GATE)
     h.slopes[:] = 0.0
     normal = h.grasp.normal

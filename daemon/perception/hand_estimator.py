@@ -109,7 +109,7 @@ class HandEstimator:
         self._joints_read = False
         self._factors_outdated = True  # True if frames have arrived since the last write
         self._in_contact = [False, False]
-        self._invalid = [Invalid.NO_FRAME] * 2  # why each finger's newest estimate is not used
+        self._invalid = [Invalid.NO_FRAME] * 2  # reason for rejecting each finger's newest estimate
 
     def _set_prior(self, settings: Settings, priors: tuple[Prior, Prior]) -> None:
         """Set the priors and reset the state to them."""
@@ -203,7 +203,7 @@ class HandEstimator:
         if not in_contact:
             tip = self._state.tip[finger]
             if tip.in_contact:
-                self.grasp.free_torque[finger] = 0.0  # to be measured on the next approach
+                self.grasp.free_torque[finger] = 0.0  # will be measured during the next approach
                 tip.free_torque_max[:] = 0.0
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0
@@ -291,7 +291,7 @@ def _fill_from_frame(
     contact.force = contact.energy = contact.force_std = 0.0
     contact.inside = True
     if not estimate.contact:
-        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # Noise may hide a contact.
+        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # Noise may hide a light contact.
         return
     tilt = total_tilt(contact.theta, contact.tilt_y)
     force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)

@@ -41,13 +41,14 @@ ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 # Measurement channels in the order of `grasp.CHANNELS`; the first four exist once per tip.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-HISTORY_TIME = 0.5  # time span of the stored joint motion [s]; older frames are treated as this old
-LAW_POINTS = 17  # nodes in d from 0 to the radius
+# Time span of the stored joint motion [s], which limits the assumed age of a frame.
+HISTORY_TIME = 0.5
+LAW_POINTS = 17  # number of nodes in d, from 0 to the radius
 
-GATE = 3.0  # Innovations beyond this number of standard deviations have a reduced effect.
-OUTLIER_GATE = 5.0  # Deviations beyond this number of standard deviations count as faults.
+GATE = 3.0  # maximum innovation with full effect, in standard deviations
+OUTLIER_GATE = 5.0  # minimum deviation that counts as a fault, in standard deviations
 MODEL_ERROR = 0.05  # relative error of predicted motion and of normal forces
-MODEL_ERROR_TIME = 0.1  # correlation time of these errors [s]
+MODEL_ERROR_TIME = 0.1  # correlation time of motion and normal-force errors [s]
 TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with position and time
 
 # Random walks during a grip (per √s)
@@ -62,9 +63,9 @@ _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
 _WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times gain
 _VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
-_VARIANCE_MIN = 1e-6  # smallest ratio by which one measurement may reduce a variance
+_VARIANCE_MIN = 1e-6  # minimum ratio of measurement variance to predicted variance
 _CURRENT_ERROR = 0.25  # tolerated deviation of a current from its goal, as a fraction of the goal
-_CURRENT_NOISE = 0.02  # additional tolerance for this deviation [A]
+_CURRENT_NOISE = 0.02  # additional tolerance due to current noise [A]
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
 
 
@@ -73,11 +74,11 @@ class TrackedTip(Record):
 
     in_contact: bool
     touch_time: float  # time at which the contact began [s]
-    has_new_frame: bool  # True if a frame has arrived since the last update by torques
+    has_new_frame: bool  # True if a frame has arrived since the last update from torques
     gain_is_fixed: bool  # True if the frames measure force times gain instead of displacement
     rejected_count: int  # number of consecutive rejected frames
     last_angle_jump: float  # `grasp.angle_jump` of the previous frame [rad]
-    current_off_time: float  # time for which the current has differed from its goal [s]
+    current_off_time: float  # time since the current began to differ from its goal [s]
     tilt_y: float  # [rad]
     shear: float  # shear along the face in the hand plane, measured by a solid tip [N]
     log_slope: float  # ∂ ln F/∂d, low-pass filtered [1/m]
@@ -88,7 +89,7 @@ class TrackedTip(Record):
     speed: float  # joint speed [rad/s]
     torque: float  # joint torque [N·m]
     free_torque: float  # average torque without contact [N·m]
-    free_torque_max: Pair  # maxima in the current and in the previous _TOUCH_DELAY window
+    free_torque_max: Pair  # maximum |free_torque| in the current and previous windows [N·m]
     window_start: float  # [s]
     travel: Pair  # accumulated predicted motion of d [m] and of the joint [rad]
     law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F
@@ -124,14 +125,14 @@ class HandFilter(Record):
     velocity_unit: float  # [rad/s]
     latency: float  # `tactile.latency` [s]
     frame_rate: float  # `tactile.rate` [Hz]
-    frame_age_max: float  # maximum time for which a channel may be missing or wrong [s]
+    frame_age_max: float  # maximum time that a channel may be missing or wrong [s]
     rejected_max: float  # maximum number of consecutive rejected frames
     response: float  # `tactile.response` [s]
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
     relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
     torque_constant: float  # output torque per current of a closing joint [N·m/A]
     inertia: float  # joint inertia [kg·m²]
-    load_held: float  # fraction of the tip moment that gears hold when the torque decreases
+    load_held: float  # fraction of the tip moment that gears carry when the torque decreases
     is_single: bool  # True for a one-finger hand
     is_gripping: bool  # True if a grip controls the joint torques
     gain_is_known: bool  # True if `estimator.free_gain` is false
@@ -141,7 +142,7 @@ class HandFilter(Record):
     closing_speed: float  # mean closing speed of both joints [rad/s], low-pass filtered
     last_closing_speed: float  # value of `closing_speed` on the previous tick [rad/s]
     torque_max: float  # maximum mean torque during this grip [N·m]
-    balance_time: float  # time of the last update by torques and force balance [s]
+    balance_time: float  # time of the last update from torques and force balance [s]
     tip: Annotated[Records[TrackedTip], 2]
     grasp: GraspState
 
@@ -185,7 +186,7 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
             h.mean[i] += gain * innovation
             for j in range(STATES):
                 h.covariance[i, j] -= gain * h.scratch[j]
-        for k in (TORQUE, TORQUE + 1, LATENCY):  # These states are barely observable.
+        for k in (TORQUE, TORQUE + 1, LATENCY):  # barely observable states
             bound = OUTLIER_GATE * math.sqrt(h.prior_variance[k])
             error = h.mean[k] - h.prior_mean[k]
             h.mean[k] = h.prior_mean[k] + min(max(error, -bound), bound)
@@ -317,7 +318,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
-    # Before contact, the gap shrinks at the rate at which d would grow in contact.
+    # Before contact, the gap shrinks at the same rate as d would grow during contact.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:
@@ -337,7 +338,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left.travel[1] += step1
     right.travel[1] += step2
     # An impossible step would corrupt the state permanently. A taper of 180°, for example, leads to
-    # such steps.
+    # impossible steps.
     if not abs(d_step1) + abs(d_step2) + abs(rotation) * h.radius < h.radius:
         return
     left.travel[0] += d_step1

@@ -24,9 +24,9 @@ from softfinger.daemon.types import FINGERS, Event, Frame, SensorInfo, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAME_COUNT = 16
-_ZERO_INTERVAL = 8  # frames between zero updates; thermal drift takes seconds
+_ZERO_INTERVAL = 8  # number of frames between zero updates; thermal drift takes seconds
 _PRESSURE_STEPS = np.iinfo(np.uint16).max  # number of quantisation steps in a published pressure
-_STORED_TIME = 2.0  # time for which frame digests are stored [s]
+_STORED_TIME = 2.0  # storage time of frame digests [s]
 _CHANGED_CELLS_MIN = 4  # minimum number of changed cells; a few noisy cells may repeat by chance
 
 
@@ -124,7 +124,8 @@ class FingerPerception:
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
         """Create the perception for one finger; each tare appends an event to ``events``."""
-        full = getattr(sensor, "full_count", None)  # Some recordings specify their own value.
+        # Some recordings specify the count at which their cells saturated.
+        full = getattr(sensor, "full_count", None)
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
             settings = settings.model_copy(update={"tactile": own})
@@ -224,7 +225,7 @@ class FingerPerception:
             return self.frame.data
         if self._converter is None:
             return self._readings
-        # A zero offset below its calibrated value may push a reading beyond the scale.
+        # If the zero offset is below its calibrated value, a reading may exceed the scale.
         steps = np.minimum(self._readings * (1.0 / self.info.scale), _PRESSURE_STEPS)
         return np.rint(steps).astype(np.uint16)
 
@@ -254,7 +255,7 @@ class FingerPerception:
             return
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
-        if not np.median(ends) > 0.0:  # No contact could be measured with this zero offset.
+        if not np.median(ends) > 0.0:  # The zero offset leaves most cells without a range.
             text = f"the {side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))
             return

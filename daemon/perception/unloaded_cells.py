@@ -19,7 +19,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 _RIM_DISTANCE = 2.0  # distance from the tip rim beyond which a cell is unloaded, in pitches
 _CELL_COUNT_MIN = 50  # number of cells required to estimate the zero shift and the noise
 _AVERAGED_FRAME_COUNT = 8  # time constant of the noise average, in calls of `update`
-_CLIPPED_FRACTION = 0.25  # fraction of cells reading 0 above which the noise counts as clipped
+_CLIPPED_FRACTION = 0.25  # minimum fraction of cells reading 0 that indicates clipped noise
 _CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping at 0
 
 
@@ -77,9 +77,10 @@ class UnloadedCells:
         if self._reference is None:
             self._reference = level
         self.zero_shift = round(level - self._reference)
-        # Readings below the median may be clipped, so use only readings above it. Some cells may be
-        # loaded, so limit each deviation to three standard deviations. The error budget adds the
-        # quantisation error separately, so subtract its variance (1/12).
+        # Readings below the median may be clipped, so use only readings above the median. Some
+        # cells may be loaded, so limit each deviation to three standard deviations. The error
+        # budget adds the quantisation error separately, so subtract the quantisation variance
+        # (1/12).
         above = np.maximum(read - level, 0.0)
         deviation_max = 3.0 * max(self.noise, 1.0) if self._variance is not None else math.inf
         square = 2.0 * float(np.square(np.minimum(above, deviation_max)).mean()) - 1.0 / 12.0

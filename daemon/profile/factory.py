@@ -56,7 +56,8 @@ def make_table(
     """
     tip = tip or make_tip(settings)
     try:
-        if tip.physics != "springs":  # This table is fast to build, so it is not cached.
+        # Only tables of spring tips are cached. Other tables are fast to build.
+        if tip.physics != "springs":
             return ContactTable.build(tip, material)
         return _built(tip, material, settings.table.tolerance)
     except TableError as error:

@@ -13,7 +13,7 @@ from softfinger.daemon.errors import PluginError
 __all__ = ["Section", "setting"]
 
 # Every number has a lower and an upper bound, because implausible values are typing errors and must
-# not reach an integral. Some bounds are allowed values; others are not.
+# not be used in an integral. Some bounds are inclusive and others are exclusive.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]

@@ -21,7 +21,7 @@ from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 
 _WIDTH = 100  # maximum line length in sim.toml
-_NO_BOUND = 1e9  # Bounds of this magnitude only catch typing errors, so they are not shown.
+_NO_BOUND = 1e9  # magnitude of bounds that only catch typing errors and are therefore not shown
 _HEAD = """\
 #:schema ./schema.json
 # The built-in simulated hand, with every setting at its default. `softfinger run` without a profile

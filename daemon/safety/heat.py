@@ -31,12 +31,12 @@ from softfinger.kinematics.hand.servo_heat import (
 
 _UPDATE_INTERVAL = 0.5  # time between thermal model updates [s]
 _AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
-# Half the thermometer's resolution [°C]. Because readings are rounded, a reading may reach the
-# limit too early by this amount.
+# Half the thermometer's resolution [°C]. The thermometer rounds its readings, so a reading may
+# reach the limit while the actual temperature is lower by half the resolution.
 _HALF_STEP = 0.5
 _TARGET_MARGIN = 3.0  # margin below the limit for the target temperature after a reduction [°C]
-_FRACTION_MAX = 0.97  # largest ratio of new to old force that is worth a reduction
-_FRACTION_MIN = 0.6  # smallest ratio of new to old force, because the first estimate is uncertain
+_FRACTION_MAX = 0.97  # maximum ratio of new to old force; a smaller reduction is not worthwhile
+_FRACTION_MIN = 0.6  # minimum ratio of new to old force, because the first estimate is uncertain
 _SETTLING_TIME = 10.0  # time from a reduction to the next evaluation [s]
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
 # Fractions of the total heat capacity and thermal resistance that belong to the winding.
@@ -133,7 +133,7 @@ class HeatWatch:
         hot = self._limits.temperature_max
         who = f"the {FINGERS[i]} servo will reach {hot:g} °C in {left:.0f} s"
         if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
-            return ""  # The last reduction has not had its effect yet.
+            return ""  # The last reduction has not taken effect yet.
         now = state.goal.force
         square = sustained_square(
             self._states[i].array, self._limits.temperature_max - _TARGET_MARGIN

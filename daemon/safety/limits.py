@@ -32,7 +32,7 @@ from softfinger.kinematics.hand.geometry import tip_position
 
 _NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention the noise
 _WARNING_FRACTION = 0.9  # fraction of a fault limit above which a warning is issued
-# Expected current per position error [A/rad]. Every servo model has a stiffer position loop.
+# Expected current per position error [A/rad], lower than in the position loop of any servo model.
 _CURRENT_PER_ERROR = 2.0
 _STANDSTILL_SPEED = 0.05  # maximum speed of a joint at standstill [rad/s]
 # Minimum relative increase in commanded force, and the fraction of the increase that the tips must
@@ -45,8 +45,8 @@ _DRIFT_TIME = 0.1  # time window of the drift check [s], which allows for veloci
 # Interval between readings above which the drift window restarts [s]. The interval must also exceed
 # 3 ticks.
 _LATE_TIME = 0.02
-_FAILURE_TIME = 0.72  # time constant of the fraction of failed readings [s]
-_FAILED_FRACTION_MAX = 0.75  # value reached after 1 s without a valid reading
+_FAILURE_TIME = 0.72  # time constant for averaging the fraction of failed readings [s]
+_FAILED_FRACTION_MAX = 0.75  # maximum failed fraction, reached after 1 s without a valid reading
 _GAP_TIME = 0.1  # interval between readings above which position steps are not checked [s]
 
 
@@ -119,7 +119,7 @@ class View:
         self._t = math.nan  # time of the previous state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
         self._torque = False  # True if torque was on when the latest reading was requested
-        servos = settings.servos  # In current mode, the stiffness limits `pull`.
+        servos = settings.servos  # In current mode, `pull` is limited by the stiffness.
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
             self.pull = min(self.pull, 0.5 * servos.stiffness)
@@ -137,9 +137,9 @@ class View:
 
     def update(self, state: State) -> None:
         """Store the parts of this tick's state that later checks compare."""
-        # Readings without torque are not compared. An emulated hand's clock does not wait for this
-        # daemon while torque is off, so its joints may move further than the time between two
-        # readings allows.
+        # Readings taken while torque is off are not compared. The clock of an emulated hand does
+        # not wait for the daemon while torque is off. The joints may therefore move further than
+        # expected in the time between two readings.
         if self._torque:
             self.motion.update(state.t, state.reading)
         else:
@@ -181,9 +181,9 @@ def _touches(contact: Contact) -> bool:
     return contact.valid and contact.contact
 
 
-# A check receives the fraction of the bound that applies. It returns a description of the
-# violation, or "" if the state is within the bound. Checks do not modify the state. NaN violates
-# every bound.
+# The float argument of a check is the fraction of the bound to apply. A check returns a description
+# of the violation, or "" if the state is within the bound. Checks do not modify the state. NaN
+# violates every bound.
 Check = Callable[[View, State, float], str]
 FingerCheck = Callable[[View, State, float, int], str]
 
@@ -202,9 +202,9 @@ class Limit:
     keys: tuple[str, ...] = ()  # settings that define the limit
     needs: Literal["", "servos", "sensors"] = ""
     check: Check | None = None
-    lasts: float | str = 0.0  # time for which a violation must last [s], or the name of a setting
-    fraction: float = 1.0  # applied fraction of the bound
-    in_turn: bool = False  # True if only one of these rows is checked per tick
+    lasts: float | str = 0.0  # minimum duration of a violation [s], or the name of a setting
+    fraction: float = 1.0  # fraction of the bound to apply
+    in_turn: bool = False  # True if the row is checked in turn with others, one per tick
     gripping: bool = False  # True if the limit applies only while gripping
 
     def __call__(self, check: Check) -> Check:

@@ -24,7 +24,7 @@ _REPEAT_TIME = 1.0  # time without a violation after which a warning may be repe
 _HYSTERESIS = 0.95  # fraction of the bound below which a reported warning clears
 
 BUS = "servos.bus"  # name of the limit for errors of the servo backend
-TORQUE_OFF = "torque.off"  # limit for an unconfirmed torque off, see `safety.torque_state`
+TORQUE_OFF = "torque.off"  # limit name for a torque off that the servos have not confirmed
 
 
 class Breach(NamedTuple):
@@ -42,7 +42,7 @@ class _Watch:
         self.check = check
         lasts = limit.lasts
         self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
-        self.since = math.inf  # start of the violation [s], or inf if there is none
+        self.since = math.inf  # start of the violation [s], or inf without a violation
         self.reported = False
         self._ended = -math.inf
 
@@ -170,7 +170,7 @@ class Safety:
         goal = state.goal
         q, current = goal.q, goal.current
         present = state.reading.q
-        if state.seq - self._sent_seq != 1:  # Torque was off, so start here with zero current.
+        if state.seq - self._sent_seq != 1:  # Torque was off, so start with zero current.
             self._sent_q[:] = present
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq

@@ -18,9 +18,10 @@ from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 
-# Fraction of the watchdog time for which sending is repeated. The bus is then kept silent.
+# Duration of repeated torque-off attempts, as a fraction of the watchdog time. After the attempts,
+# the bus is kept silent.
 _TRY_FRACTION = 0.5
-_TRY_TIME_UNGUARDED = 0.05  # time spent on attempts before a report if servos.watchdog is 0 [s]
+_TRY_TIME_UNGUARDED = 0.05  # time for attempts before a failure report if servos.watchdog is 0 [s]
 _CLOSING_TRY_COUNT = 15  # number of torque-off attempts at shutdown
 
 

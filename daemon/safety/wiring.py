@@ -80,7 +80,7 @@ class WiringWatch:
 
     def _check_turn(self, state: State) -> None:
         angle, goal = state.object.angle, state.goal.angle
-        # The condition is also true for NaN. A streamed goal changes on every tick.
+        # A NaN goal also counts as changed. A streamed goal changes on every tick.
         if goal != self._goal:
             self._goal, self._turn = goal, math.nan
         if math.isnan(self._turn):

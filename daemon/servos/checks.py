@@ -20,7 +20,7 @@ from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-CHECKED = reg.BACKUP_READY  # number of registers to read, at addresses 0 to 146
+CHECKED = reg.BACKUP_READY  # number of registers to read (addresses 0 to 146)
 DRIVE_REVERSE = 0b0001
 FIX = "`softfinger doctor --fix`"
 REBOOT_FIX = "remove the cause, then reboot the servo with `softfinger doctor --fix`"

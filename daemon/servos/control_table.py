@@ -137,13 +137,13 @@ class ServoModel:
     number: int
     firmware: int  # firmware version that the emulated servo reports
     highest_baud: int  # index into BAUD_RATES
-    current_unit: float  # A per count, or 0 without a current sensor
+    current_unit: float  # current per count [A], or 0 without a current sensor
     current_limit: int  # default and upper bound
     velocity_limit: int  # default
     velocity_max: int  # upper bound of the velocity limit
     temperature_limit: int  # default [°C]
     voltage_min: int  # default and lower bound of the voltage limits [0.1 V]
-    voltage_max: int  # 0.1 V, default and upper bound
+    voltage_max: int  # default and upper bound of the voltage limits [0.1 V]
     velocity_gains: tuple[int, int]  # I, P
     position_gains: tuple[int, int, int]  # D, I, P
     shutdown: int
@@ -223,17 +223,16 @@ class ServoModel:
 
 _ALL = tuple(MODE_NAMES)
 _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MODE)
-# One row per model, in the order of the ServoModel fields: name, number, firmware, highest baud, A
-# per count, current limit, velocity limit and its bound, °C, 0.1 V, gains, shutdown, etc. The
-# sources are the model's page in the ROBOTIS e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or
-# …/mx/NAME-2/ (specifications and both areas of the control table). Where model numbers differ
-# (XD430), the source is control_table/dynamixel.model in dynamixel-sdk. The velocity limits of
-# XH430-V, XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's
-# values are for firmware before version 42. The page of the XW430-T200 lists the stall torque of
-# the XW540-T140, 6.9 N·m at 4.9 A. The values used here are those of the XH430-W210, scaled by the
-# gear ratio, 200 : 213. The same rule gives 3.2 N·m for the XW430-T333, whose page lists 3.1 N·m at
-# 1.3 A.
-_430 = 82, (28.5, 46.5, 34.0)  # g, mm
+# One row per model, in the order of the ServoModel fields. The source of each row is the model's
+# page in the ROBOTIS e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or …/mx/NAME-2/
+# (specifications and both areas of the control table). Where model numbers differ (XD430), the
+# source is control_table/dynamixel.model in dynamixel-sdk. The velocity limits of XH430-V,
+# XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's limits
+# apply to firmware before version 42. For the XW430-T200, the e-Manual lists the stall torque of
+# the XW540-T140, 6.9 N·m at 4.9 A. The row of the XW430-T200 therefore contains the data of the
+# XH430-W210, with the stall torque scaled by the gear ratio, 200 : 213. For the XW430-T333, the
+# same kind of scaling gives 3.2 N·m, close to the 3.1 N·m at 1.3 A in the e-Manual.
+_430 = 82, (28.5, 46.5, 34.0)  # mass [g], size [mm]
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)
 _XL330 = 18, (20.0, 34.0, 26.0)

@@ -56,7 +56,7 @@ _HEALTH_INTERVAL = 0.25  # s
 _CHECK_INTERVAL = 0.01  # s
 _CHECK_FRACTION = 0.05  # maximum fraction of the line capacity that checks may use
 _RECENT_TIME = 0.035  # maximum age of a recent goal [s]
-_FROZEN_TIME = 0.1  # maximum time for which a servo's 1 ms clock may stand still [s]
+_FROZEN_TIME = 0.1  # maximum time that a servo's 1 ms clock may stand still [s]
 _VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a reply is missing
 _CHECK_TIMEOUT = 0.2  # reply timeout during the checks [s]; `clear` blocks the loop for this time
 # Reply timeout for an emulated hand [s]. The hand's clock pauses while the machine is late.
@@ -84,7 +84,7 @@ class DynamixelServos:
         self._reads: TickReads | None = None
         self._waiting: SerialPort | None = None  # open port whose servos have not responded yet
         self._turn = 0  # index of the most recently used span length
-        self._varied_reads = 0  # remaining requests whose replies could be mistaken for others
+        self._varied_reads = 0  # number of remaining requests with ambiguous replies
         self._next_health = self._next_check = -math.inf  # clock times of the next reads
         self._check_interval = _CHECK_INTERVAL
         self._retries = 0

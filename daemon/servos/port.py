@@ -74,7 +74,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             if self._low_latency:
                 self.ser.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
-            pass  # Pseudo-terminals and some adapters lack this mode; see latency_file().
+            pass  # Pseudo-terminals and some adapters lack low-latency mode.
         self.received.clear()
         self.ser.reset_input_buffer()
         return True

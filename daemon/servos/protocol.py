@@ -190,7 +190,7 @@ class GroupRead:
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler = self._handler
-        for servo_id in self.data:  # Each servo sends its own reply, in this order.
+        for servo_id in self.data:  # The servos reply in the order of `data`.
             while True:
                 packet, result = handler.rxPacket(self.port, False)
                 if result != COMM_SUCCESS:

@@ -146,7 +146,7 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
         damaged += handler.damaged > before
         silent += result == COMM_RX_TIMEOUT
         if silent > 1 and not damaged:
-            break  # No servo uses this ID.
+            break  # The ID is unused.
     return damaged > 1  # A single corrupted reply may be interference.
 
 

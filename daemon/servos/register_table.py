@@ -27,8 +27,8 @@ from softfinger.daemon.servos.joint import JointScale
 # The duration of a read includes the return delays of both servos. With delays above 50 µs, a read
 # would take longer than a tick at 500 Hz.
 RETURN_DELAY_MAX: Final = 25
-# Drive mode bits that must be clear. These bits make a servo follow another servo, or switch torque
-# on when a goal is written.
+# Drive mode bits that must be clear, because they make a servo follow another servo, or switch
+# torque on when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
 _STARTUP_FIRMWARE = 45
@@ -54,7 +54,7 @@ class Register(NamedTuple):
 
 
 # Registers that `doctor --save` stores so that they can be restored later. ID, baud rate and
-# protocol are excluded, because a servo stops replying at its old address once they change.
+# protocol are excluded, because a change makes the servo unreachable with the old settings.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),
@@ -94,7 +94,7 @@ class Requirement(NamedTuple):
 
     register: Register
     holds: Callable[[int], bool]
-    mended: Callable[[int], int]  # function that returns the correct value for a wrong one
+    mended: Callable[[int], int]  # function that maps a wrong value to the correct value
     told: Callable[[int], str]  # function that describes the wrong value and the expected value
     status: Status
     armed: bool = False  # True for RAM that `arm` writes

@@ -161,7 +161,7 @@ class SimulatedServos:
             limit = self._settings.current_limit[joint]
             bound = scale.bound_counts(min(abs(goal.current[joint]), limit))
             current = bound * scale.current_unit
-            if self._mode == reg.CURRENT_MODE:  # This is the daemon's position loop.
+            if self._mode == reg.CURRENT_MODE:  # The daemon controls the position.
                 q, dq = self._q[joint], self._dq[joint]
                 current = current_toward(self._settings, goal.q[joint], current, q, dq)
                 counts = min(max(scale.current_counts(current), -bound), bound)
@@ -202,5 +202,6 @@ class SimulatedServos:
     def _drive(self) -> None:
         for joint in self._joints:
             goal_q, goal_current = self._goal_q[joint], self._goal_current[joint]
-            torque = self._torque and not self._errors[joint]  # as in a real servo after a shutdown
+            # Like a real servo, apply torque only if no hardware error has occurred.
+            torque = self._torque and not self._errors[joint]
             self._hand.drive(joint, self._mode, torque, goal_q, goal_current)

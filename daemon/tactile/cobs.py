@@ -53,7 +53,7 @@ from softfinger.kinematics.compiled.kernel import kernel
 _HEADER = struct.Struct("<BBHIHH")
 _CRC = struct.Struct("<H")
 _CRC_START = 0xFFFF
-_TICK = 1e-6  # s per tick of the board clock
+_TICK = 1e-6  # duration of one tick of the board clock [s]
 _BLOCK = 254  # maximum length of a COBS block [bytes]
 
 
@@ -145,10 +145,11 @@ class CobsDecoder(DelimitedDecoder):
             steps = 1
         self._missed += steps - 1
         self._seq = seq
-        # The clock has wrapped around, or the board has restarted, which SensorClock detects.
+        # A smaller tick count means that the clock has wrapped around or that the board has
+        # restarted. SensorClock detects restarts.
         self._wraps += ticks < self._ticks
         self._ticks = ticks
-        # Two-byte counts are not copied, because the buffer belongs to this frame alone.
+        # Two-byte counts are not copied, because no other frame uses this buffer.
         cells = message[_HEADER.size : size].view(f"<u{kind}")
         counts = cells.astype(np.uint16, copy=False)
         t_sensor = (self._wraps * 2.0**32 + ticks) * _TICK

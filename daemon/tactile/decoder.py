@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 __all__ = ["Decoded", "DelimitedDecoder"]
 
-_LOST_AFTER = 10  # number of frame lengths without a frame after which the stream counts as lost
+_LOST_AFTER = 10  # number of frame lengths without a frame that indicates a lost stream
 
 
 @dataclass(slots=True)

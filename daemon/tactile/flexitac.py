@@ -19,9 +19,9 @@ from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
 _SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest frame
-_MARKER_COUNT_MAX = 96  # number of markers, stored so that a different grid size is detected
+_MARKER_COUNT_MAX = 96  # maximum number of stored markers, used to detect a different grid size
 _GAP_TIME = 1e-3  # minimum gap between frames [s]
-_CELL_COUNT_MIN = 16  # minimum number of cells between markers; a closer ``AA 55`` is image content
+_CELL_COUNT_MIN = 16  # minimum number of cells between markers; a closer ``AA 55`` is image data
 
 
 class FlexiTacDecoder(Decoder):
@@ -50,7 +50,7 @@ class FlexiTacDecoder(Decoder):
         self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # [s]
         self._t_whole = -math.inf  # time at which the last returned frame was complete
         self._start = 0  # stream position of the buffer's first byte
-        # Stream position of the end of each piece in the buffer, and its read time.
+        # End position in the stream and read time of each piece in the buffer.
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
         self._markers: deque[int] = deque(
@@ -198,7 +198,7 @@ class FlexiTacDecoder(Decoder):
     def _lose(self) -> None:
         self.locked = False
         self._resyncs += 1
-        if self._buffer.startswith(MARKER):  # This marker belongs to an incomplete frame.
+        if self._buffer.startswith(MARKER):  # The marker belongs to an incomplete frame.
             self._note(0)
             self._skip(len(MARKER))
 

@@ -39,12 +39,12 @@ _COUNT_MAX = 65535
 _RANGE_ERROR = f"frames: found readings outside 0 to {_COUNT_MAX} counts"
 _LISTED_COUNT_MAX = 8  # maximum number of arrays listed in a message
 _SAMPLE_COUNT_MAX = 200  # maximum number of frames for estimating zero and noise
-_NOISE_SIGMA_MAX = 6.0  # maximum negative noise, in standard deviations
+_NOISE_SIGMA_MAX = 6.0  # maximum magnitude of negative readings, in noise standard deviations
 _CLIPPED_COUNT_MIN = 3  # minimum number of cells that share the maximum reading
 _UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # time units other than s
 _DATE_RANGE = (1e9, 4e9)  # Unix time [s], from 2001 to 2096
-_INTERVAL_RATIO_MAX = 100.0  # maximum ratio to the expected frame interval for times in seconds
-_INTERVAL_RATIO_NOTED = 10.0  # ratio to the expected frame interval above which a note is given
+_INTERVAL_RATIO_MAX = 100.0  # maximum ratio of actual to expected frame interval for times in s
+_INTERVAL_RATIO_NOTED = 10.0  # ratio of actual to expected frame interval that causes a note
 
 
 @dataclass(frozen=True)
@@ -183,8 +183,8 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
 
 def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     part = archive.getinfo(f"{name}.npy")
-    # NumPy uses only these compression methods. Other methods may unpack to more than the stated
-    # size.
+    # NumPy uses only stored and deflated parts. With other compression methods, the unpacked data
+    # may exceed the stated size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name}: found an unsupported compression method, expected deflate")
     return part
@@ -378,7 +378,7 @@ def _factor(t: NDArray[Any], step: float, rate: float) -> float:
     """Return the unit [s] of undated times, derived from their step. Raises ValueError."""
     whole = t.dtype.kind in "ui"
     if len(t) > 2 and (t % 1 == 0).all() and (np.diff(t) == 1).all():
-        if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # about a frame per second
+        if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # about one frame per second
             return 1.0
         raise ValueError(
             "t: found frame numbers that increase by 1, expected times in s; remove t if the "
@@ -397,7 +397,7 @@ def _clipped(found: FrameRecording, scale: float, full: int) -> str:
     cells = np.count_nonzero(at_top.any(axis=0))
     if top == 0 or top >= full or cells < _CLIPPED_COUNT_MIN:
         return ""
-    # If the readings are rounded, the next lower reading is equally frequent.
+    # If the top reading is due to rounding, the next lower reading is about as frequent.
     below = int(counts[~at_top].max(initial=0))
     if below and np.count_nonzero(at_top) <= 2 * np.count_nonzero(counts == below):
         return ""

@@ -27,10 +27,10 @@ __all__ = ["SerialReader"]
 _READ_SIZE = 65536  # number of bytes per read, which equals the capacity of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _GAP_TIME = 5e-4  # time without a byte that counts as a gap between frames [s]
-# Waiting time beyond a frame's transmission time before the request is repeated [s].
+# Timeout of a request in addition to the transmission time of a frame [s].
 _REQUEST_TIMEOUT = 0.1
 _WAIT_MIN = 3e-4  # minimum wait [s]; shorter waits cost more than the wake-ups they avoid
-_WAIT_MAX = 2e-3  # maximum delay if the number of missing bytes is wrong [s]
+_WAIT_MAX = 2e-3  # maximum wait [s], which limits the delay if the number of missing bytes is wrong
 
 
 class SensorClock:

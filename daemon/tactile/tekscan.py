@@ -29,7 +29,7 @@ _SIZE_MAX = 1024  # maximum number of rows or columns
 _HEADER_LINES_MAX = 1000
 _READING_MAX = 1e12  # maximum reading in the unit of the readings
 _RAW_SATURATION = 255  # maximum reading of the manufacturer's 8-bit electronics
-_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, which allows for rounding
+_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure that counts as saturated
 _EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),

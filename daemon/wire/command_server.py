@@ -29,8 +29,8 @@ Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: reques
 
 _ANSWER_TIMEOUT = 0.4  # maximum time to wait for the gateway before confirming a local stop [s]
 _COMMANDS_PER_TICK = 2  # maximum number of commands per tick, not counting stops
-_UNPACKED_SIZE_MAX = 4096  # number of bytes after which unpacking continues on the next tick
-_OUTCOME_COUNT_MAX = 256  # number of stored outcomes of requests with a key
+_UNPACKED_SIZE_MAX = 4096  # number of bytes after which unpacking pauses until the next tick
+_OUTCOME_COUNT_MAX = 256  # maximum number of stored outcomes of requests with a key
 _KEY_LENGTH_MAX = 64
 _VALUE_TYPES = (str, int, float, type(None))  # bool is a subclass of int
 
@@ -49,8 +49,9 @@ class CommandServer:
         self._local = local
         self._clock = clock
         self._changes = 0  # number of executed commands other than status and stop
-        # Outcomes of requests with a key, by client name (from its access key) and request, oldest
-        # first: the reply, or for a late request the counts of stops and changes.
+        # Outcomes of requests with a key, oldest first. Each outcome is stored under the client
+        # name (determined by the access key) and the request. An outcome is the reply or, for a
+        # late request, the numbers of stops and changes.
         self._outcomes: OrderedDict[tuple[str, bytes], bytes | tuple[int, int]] = OrderedDict()
         self._stopped = b""  # reply to the last local stop
         self._answer_by = 0.0  # time after which local stops are answered without the gateway
@@ -76,7 +77,7 @@ class CommandServer:
 
     def _stop(self, handler: Handler, client: str) -> bytes:
         reply = accepted(handler({"command": "stop", "client": client}, 0.0))
-        self.link.fence()  # The client may continue after the reply, so raise the fence first.
+        self.link.fence()  # The client may continue after the reply, so update the fence first.
         return reply
 
     def _unpack(self, handler: Handler) -> None:

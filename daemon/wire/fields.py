@@ -77,7 +77,7 @@ class Member(NamedTuple):
     name: str
     type: Any
     unit: str
-    meaning: str  # prefix of the field descriptions, for a nested map
+    meaning: str  # meaning of the field, or prefix for the descriptions of a nested map
     source: FieldSource[Any]
     get: Getter
 

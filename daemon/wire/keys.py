@@ -143,7 +143,7 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
             client.mkdir()
             zmq.auth.create_certificates(client, "client")
             shutil.copyfile(server / "server.key", client / "server.key")
-            # Perform this step last, so that the server accepts only clients with complete keys.
+            # Move the public key last, so that the server accepts only clients with complete keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     finally:
         os.umask(before)

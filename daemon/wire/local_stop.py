@@ -22,7 +22,7 @@ from softfinger.daemon.own_files import home_folder, shared_folder
 from softfinger.kinematics.compiled.own_folder import require_own
 
 IN_USE = "is in use; is another softfinger running?"
-_LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # names for 127.0.0.1 on this machine
+_LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # hosts that include 127.0.0.1
 _DATAGRAM_SIZE_MAX = 4096  # bytes
 _SENDER_COUNT_MAX = 16  # maximum number of senders that await a reply
 
@@ -70,7 +70,7 @@ class LocalStop:
     def answer(self, reply: bytes) -> None:
         """Send the reply to all clients that sent a stop."""
         while self._senders:
-            with contextlib.suppress(OSError, TypeError):  # The sender has ended or has no name.
+            with contextlib.suppress(OSError, TypeError):  # The sender has exited or has no name.
                 self._socket.sendto(reply, self._senders.popleft())
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ import msgpack
 
 # From the loop
 PUBLISH = "publish"  # topic index, number of messages to keep for late subscribers, message
-REPLY = "reply"  # the request's `Ask.urgent` and `Ask.route`, reply
+REPLY = "reply"  # `Ask.urgent` and `Ask.route` of the request, and the reply
 FENCE = "fence"  # number of stops so far
 
 # From the gateway
@@ -93,7 +93,7 @@ class Channel:
                 del self._unsent[: self._end.send(self._unsent)]
         except BlockingIOError:
             return False
-        except OSError:  # The other end is closed, but it may have left unread messages.
+        except OSError:  # The other end is closed, but unread messages may remain.
             self._unsent.clear()
         return True
 

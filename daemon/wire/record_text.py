@@ -20,8 +20,7 @@ _COLOUR = "#0a8078"  # colour that is readable on light and on dark pages
 # Number of shades in a picture. More shades make the SVG longer without a visible difference.
 _SHADES = 12
 _SIDE = 176  # longer side of a picture [px]
-# Minimum full scale of a picture [Pa]. With this minimum, the noise of an unloaded tip remains
-# faint.
+# Minimum full scale of a picture [Pa], which keeps the noise of an unloaded tip faint.
 _FULL = 10e3
 
 

@@ -43,18 +43,18 @@ Kind = Literal["power", "cubic"]
 DEAD_RESPONSE = 0.2  # fraction of the median response below which a cell counts as dead
 _EXPONENTS = (0.3, 3.0)
 _UNREST_SIGMA = 8.0  # multiple of the median noise above which a cell is unsteady
-# Minimum number of unsteady cells for a tare to fail. A smaller number of unsteady cells may be
-# faulty.
+# Minimum number of unsteady cells that makes a tare fail. A smaller number of unsteady cells may be
+# due to faulty cells.
 _UNREST_CELL_COUNT = 4
 _TILT_MIN = math.radians(3.0)  # minimum tilt range from which the rotation can be determined
 _UPRIGHT_ERROR = math.radians(0.5)
 _PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, as a multiple of the noise
 _LAG_MAX = 8  # maximum lag of the noise correlation, in cells
 _SIGNIFICANT_SIGMA = 4.0  # number of standard errors above which a result is significant
-# Clipping at 0 affects a zero offset below this many noise standard deviations.
+# Minimum zero offset that is not affected by clipping at 0, in noise standard deviations.
 _CLIPPED_SIGMA = 4.0
 _HOLD_RATIO_MIN = 2.0  # minimum hold time, as a multiple of the longest time constant
-_ITERATIONS = 25  # number of iterations that fit term strengths and press in turn
+_ITERATIONS = 25  # number of iterations that fit the term strengths and the press alternately
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -364,7 +364,7 @@ def fit_centre(
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
-    # Add the uncertainty of the upright orientation. An error in this angle shifts the centroid by
+    # Add the uncertainty of the upright orientation. An orientation error shifts the centroid by
     # the moment arm times the error.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
     std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
@@ -480,7 +480,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
         memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
         columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
         fits = []
-        # Try every subset of the few terms, and keep the best subset with positive strengths.
+        # Try every subset of the terms, and keep the best subset with positive strengths.
         for chosen in itertools.product((False, True), repeat=len(told)):
             used = np.flatnonzero((True, *chosen))
             found = np.linalg.lstsq(columns[:, used], load[held:], rcond=None)[0]

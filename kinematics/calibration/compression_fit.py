@@ -25,9 +25,9 @@ from softfinger.kinematics.contact.table import ContactTable
 FloatArray = NDArray[np.float64]
 
 _UNIT = Material.constant(1.0)
-_SLACK = 0.02  # fraction of the range of d below which a reversal is encoder noise
-_TURNS = 5  # minimum number of rows per reversal of d; with fewer, the rows are not in test order
-_DEEP = 0.9  # fraction of the maximum d below which a cycle is preconditioning
+_SLACK = 0.02  # maximum reversal of d due to encoder noise, relative to the range of d
+_TURNS = 5  # minimum number of rows per reversal of d; fewer rows mean a wrong row order
+_DEEP = 0.9  # minimum peak of a full-depth branch, as a fraction of the range of d
 TOE = 0.1  # half width of the toe around the first contact, as a fraction of the depth
 # Fraction of the maximum force above which points are used for extrapolating to zero force.
 _STEEP = 0.2
@@ -37,14 +37,14 @@ _LOADED = 20.0  # minimum force range of a run, as a multiple of the noise
 # Minimum noise due to rounding and interpolation, as a fraction of the maximum force.
 _SMOOTHEST = 1e-4
 _ROUNDS = 60
-_CLIP = 0.02  # maximum step of the zero of d, as a fraction of the depth
+_CLIP = 0.02  # maximum change in the zero offset of d per iteration, as a fraction of the depth
 _STEP = 1e-8  # step for numerical derivatives [m]
 _TOLERANCE = 1e-7  # relative tolerance of the tables
-_EDGE = 1.0 - 1e-4  # usable fraction of a table's range, which leaves room for the derivative step
+_EDGE = 1.0 - 1e-4  # usable fraction of a table's range; the remainder is for the derivative step
 _TOO_DEEP = "the run exceeds the depth or tilt range of the model's data"
 _NO_BEGINNING = "no zero offset of d fits the run: the run must include the onset of contact"
 # Higher-order coefficients of three material laws. The forces for σ = c_1 ε + c_2 ε² + c_3 ε³ are
-# linear combinations of the forces for these laws.
+# linear combinations of the forces for the three laws.
 _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
 
 
@@ -176,7 +176,7 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
             "the force does not increase with d; expected positive d and F in compression"
         )
     begin = float(d[0])
-    for _ in range(4):  # Each pass improves the zero offset of F from the rows before contact.
+    for _ in range(4):  # Each pass improves the zero offset of F.
         steep = rise > _STEEP * most
         if (count := np.count_nonzero(steep)) < 3:
             raise CalibrationError(

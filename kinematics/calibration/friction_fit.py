@@ -14,24 +14,24 @@ FloatArray = NDArray[np.float64]
 
 DURATION_MAX = 3600.0  # maximum recording time [s], which limits the memory use
 _STEP = 0.01  # step of the time grid for motion and torque [s]
-_WINDOW = 6  # number of steps on either side of an instant for fitting velocity and acceleration
+_WINDOW = 6  # half width of the window that fits velocity and acceleration, in steps
 _GAP_MAX = 0.035  # maximum gap in the data across which values are interpolated [s]
-# Speed above which static friction has mostly vanished [rad/s]. For the XL330, this speed is 0.12
-# rad/s.
+# Minimum speed at which static friction has mostly vanished [rad/s]. For the XL330, a speed of 0.12
+# rad/s is sufficient.
 _SLIDING_SPEED = 0.2
 # Speed below which a joint counts as stationary [rad/s]: one count of 1.5 mrad in 0.08 s.
 _REST_SPEED = 0.02
-# Rotation from standstill at which a joint counts as broken away [rad]: three counts, or ten times
-# the gear compliance.
+# Minimum rotation from standstill at break-away [rad]: three counts, or ten times the elastic
+# deflection of the gears.
 _BREAK_AWAY_DISTANCE = 5e-3
-# Maximum goal velocity at break-away [rad/s], and number of steps for which the limit applies. The
-# limit keeps the inertial torque small.
+# Maximum goal velocity at break-away [rad/s], and number of steps for which the velocity is
+# limited. The velocity limit keeps the inertial torque small.
 _BREAK_AWAY_RATE = 0.1, 20
 _MOTION_TIME_MIN = 0.5  # minimum motion time in each direction [s]
 _CORRELATION_TIME = 0.2  # correlation time of the residuals [s]
 _BREAK_AWAY_COUNT_MIN = 3  # minimum number of break-aways for a mean
-# Mean and standard deviation of the prior [N·m·s/rad]. Values identified for similar servos range
-# from 0.015 to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
+# Prior mean and standard deviation of the viscous friction [N·m·s/rad]. Values identified for
+# similar servos range from 0.015 to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
 _VISCOUS_PRIOR = 0.02, 0.02
 _INERTIA_ERROR = 0.5  # relative standard deviation of the configured inertia
 
@@ -90,8 +90,7 @@ def fit_friction(
     place, rate, acceleration = _motion(shown)
     after = np.clip(np.searchsorted(at, grid, "right"), 1, at.size - 1)
     whole = at[after] - at[after - 1] < _GAP_MAX
-    # Use only instants for which the direction of motion is constant throughout the smoothing
-    # window.
+    # Use only times at which the direction of motion is constant throughout the smoothing window.
     closes, opens = (_throughout(whole & (sign * rate > _SLIDING_SPEED)) for sign in (1.0, -1.0))
     seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
     if min(seconds) < _MOTION_TIME_MIN:
@@ -160,7 +159,7 @@ def _least_squares(
     if found[1] < 0.0:  # b cannot be negative, so use the solution for b = 0
         found = found - covariance[:, 1] * (found[1] / covariance[1, 1])
     # At a constant current, the quantisation error is also constant, so averaging does not reduce
-    # it.
+    # the error.
     std[0] = math.hypot(float(std[0]), math.sqrt(rounding))
     return found, std
 

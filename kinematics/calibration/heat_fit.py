@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
 
-_PRIOR_STD = (0.4, 0.4, 3.0)  # relative priors of rise and time, prior of ambient [°C] (1 σ)
-# Standard deviation of rounding to whole degrees and of similar reading errors [°C].
+_PRIOR_STD = (0.4, 0.4, 3.0)  # prior σ of rise (relative), time (relative), ambient [°C]
+# Standard deviation of the reading error, including rounding to whole degrees [°C].
 _READING_ERROR = 0.4
 _STEP = 1.0  # s
 _RISE_MIN = 8.0  # minimum temperature rise of the case [°C]
@@ -73,8 +73,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
 
     def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
         case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
-        # Equal readings share one rounding error, so each degree counts only once, however long it
-        # lasts.
+        # Equal readings share one rounding error, so all readings of the same degree together have
+        # the weight of one reading.
         weight = np.sqrt(warmed / grid.size) / _READING_ERROR
         return np.concatenate([(case - readings) * weight, (x - prior) / _PRIOR_STD])
 

@@ -17,13 +17,13 @@ _STEP = 1e-3  # step of the time grid and of the initial delays [s]
 _DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # range of latencies to search [s]
 # Minimum closing speed in a ramp [m/s], and averaging time of the speed [s].
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
-_RAMP_MARGIN = 0.2  # time before and after a ramp that still counts as part of the ramp [s]
+_RAMP_MARGIN = 0.2  # extension of a ramp at both ends [s]
 _CLOSING_MIN = 8e-4  # minimum closing distance in a ramp [m], seven encoder counts
 _FRAME_COUNT_MIN = 8  # minimum number of frames
 _TIME_ERROR = 1e-3  # standard deviation of the times of ticks, readings and frames [s]
 # Apparent widening of a growing footprint; see `perception.frame_channels`.
 _WIDENING, _SPREAD_MAX = 1.4, 0.1
-_ITERATIONS = 3  # number of iterations that alternate between the first touch and the fit
+_ITERATIONS = 3  # number of iterations that alternately estimate the first contact and the delay
 
 
 class LatencyFit(NamedTuple):
@@ -90,7 +90,7 @@ def fit_latency(
         shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # At standstill, the encoder error is constant. Half of this error shifts the ramp.
+    # At standstill, the encoder error is constant. Half of the encoder error shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))

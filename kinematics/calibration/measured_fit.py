@@ -20,7 +20,7 @@ _PRESS_COUNT_MIN = 6  # minimum number of presses
 _UPRIGHT_TILT = math.radians(1.0)
 _TILTED_MIN = math.radians(5.0)
 _CURVE_ERROR_MAX = 0.05  # maximum curve error, relative to the force and to the radius
-_STAGE_ERROR = 2e-3  # minimum relative error that is assumed for a stage and a sensor
+_STAGE_ERROR = 2e-3  # assumed relative error of the test stage and its force sensor
 
 
 class CurvesError(SoftfingerError, ValueError):

@@ -22,7 +22,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _UNIT_MATERIAL = Material.constant(1.0)
 _STEP = 1e-5  # step for numerical derivatives [m]
-_PLACE_STEP = 2e-4  # position step [m]; larger because rim cells change by whole sample points
+_PLACE_STEP = 2e-4  # position step [m]; larger, because rim cells change by whole sample points
 _ROTATION_STEP = 1e-4  # rad
 _ROTATION_STARTS = 8  # number of initial rotations to try
 _GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)

@@ -129,7 +129,7 @@ def _with_cached_lookups(flags: Any) -> Iterator[None]:
                 return None
             _SIGNATURES[key] = found, function._impl_keys[found.args]
         found, body = _SIGNATURES[key]
-        function._impl_keys[found.args] = body  # Numba looks up the body in this map.
+        function._impl_keys[found.args] = body  # Numba looks up the body in `_impl_keys`.
         return found
 
     def size(context: Any, kind: Any) -> int:
@@ -161,8 +161,8 @@ class BitcodeKernel(plain.InnerKernel):
             no_cfunc_wrapper=True,
             **options,
         )(self.py_func)
-        # Without this step, Numba would recompile for each literal argument. LLVM folds the
-        # constants anyway.
+        # Replace literal types. Otherwise, Numba would recompile the function for each literal
+        # argument. LLVM folds the constants anyway.
         resolve = self.dispatcher.get_call_template
         self.dispatcher.get_call_template = lambda args, kws: resolve(
             tuple(types.unliteral(each) for each in args), kws
@@ -210,7 +210,8 @@ class _InnerLowering(NativeLowering):
             state.flags.no_compile = False
         lowered = state["cr"]
         fndesc, env = lowered.fndesc, lowered.env
-        # Numba identifies an overload by its entry point, so each overload needs its own.
+        # Numba identifies an overload by the entry point, so each overload needs its own entry
+        # point.
         entry = _make_function(fndesc.lookup_module(), name, "", 0, env, (state.library,))
         state.targetctx.insert_user_function(entry, fndesc, [state.library])
         state["cr"] = _LowerResult(fndesc, lowered.call_helper, cfunc=entry, env=env)

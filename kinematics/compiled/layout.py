@@ -61,12 +61,12 @@ class Record(metaclass=_Slotted):
     __slots__ = ("_fields", "array")
 
     dtype: np.dtype[np.void]
-    array: Records[Self]  # array of one record, which is passed to kernels
+    array: Records[Self]  # array with a single record, which is passed to kernels
 
     def __init_subclass__(cls) -> None:
         hints = get_type_hints(cls, include_extras=True)
         kinds = {name: _kind(hints[name]) for name in cls.__annotations__}
-        # Align fields as in C. Otherwise, Numba uses slow unaligned access for each field.
+        # Align fields as in C, because Numba accesses unaligned fields slowly.
         cls.dtype = np.dtype([(name, *kind) for name, (_, *kind) in kinds.items()], align=True)
         for name, (inner, _, shape) in kinds.items():
             setattr(cls, name, _field(name, inner, shape))

@@ -27,7 +27,7 @@ TABLE_I_STRAIN = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 TABLE_I_MODULUS = (0.135e6, 0.149e6, 0.182e6, 0.201e6, 0.207e6, 0.255e6)
 TABLE_I_MAXIMUM = 0.304e6
 # Exact coefficients c_1, c_2, … of σ [Pa]. The modulus is the lowest-degree polynomial that passes
-# through these values and has zero slope at zero strain. The stress σ is the integral of the
+# through the measured values and has zero slope at zero strain. The stress σ is the integral of the
 # modulus.
 _TABLE_I = "135000 0 610000/9 4671875/12 -3015625/3 14453125/18 -4296875/21"
 

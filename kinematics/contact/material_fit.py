@@ -21,7 +21,7 @@ __all__ = ["MaterialError"]
 MIN_POINTS = 4
 _DEGREES = range(11)  # polynomial degrees of the modulus, in the order in which they are tried
 _NEGLIGIBLE_MISFIT = 1e-9  # misfit that is negligible, relative to the maximum stress
-# A lower degree is accepted if its misfit is at most this multiple of the smallest misfit.
+# Maximum misfit of a lower degree that is accepted, as a multiple of the smallest misfit.
 _MISFIT_RATIO_MAX = 1.5
 _MISFIT_MAX = 0.05  # maximum misfit of a successful fit, relative to the maximum stress
 _MODULUS_MIN = 1e-3  # minimum modulus, relative to the mean modulus
@@ -110,8 +110,8 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Extend the points to strain 1 using their slope at the end."""
     if x[-1] > 0.95:
         return x, y
-    # Fit a parabola to the last third of the points. Limit the slope at its end to 0.5 to 2 times
-    # the mean slope of the last quarter.
+    # Fit a parabola to the last third of the points. Limit the final slope of the parabola to 0.5
+    # to 2 times the mean slope of the last quarter.
     last = max(3, x.size // 3)
     back = x[-last:] - x[-1]
     slope = float(np.polyfit(back, y[-last:], 2)[1])

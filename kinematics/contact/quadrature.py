@@ -34,7 +34,7 @@ from softfinger.kinematics.contact.material import Material
 # Number of Gauss points per piece. With 14 points, ∂F/∂θ has an error of 1e-10. With 18 points,
 # only rounding errors remain.
 _NODES = 18
-# Number of points for laws above degree 8; 18 points may give an error of 1e-11.
+# Number of points for laws above degree 8. With 18 points, the error for these laws may be 1e-11.
 _NODES_HIGH_DEGREE = 26
 _PIECE_MIN = 2.0**-14  # minimum size of a graded piece, relative to the scale of the singular point
 
@@ -105,8 +105,8 @@ def _ratios(
     count = circle.shape[1]
     share = 1.0 / count
     nodes = gauss.shape[1]
-    # The integrand has poles at y² = −2 sin θ and, if y0 is not 0, at y = 0. For h = 0, it has no
-    # poles.
+    # The integrand has poles at y² = −2 sin θ and, if y0 is not 0, at y = 0. For h = 0, the
+    # integrand has no poles.
     start = max(2.0 * y0, _PIECE_MIN * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0

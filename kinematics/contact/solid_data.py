@@ -76,7 +76,7 @@ def solid_data(tip: Fingertip) -> SolidData:
         return np.asarray(chebyshev.chebval(at, np.moveaxis(coefficients, -1, 0)))
 
     root = float(stored["s_max"])
-    # This is 1 + t P with t = root/2 (1 + x), using 2 x T_i = T_(i−1) + T_(i+1).
+    # Compute 1 + t P with t = root/2 (1 + x), using 2 x T_i = T_(i−1) + T_(i+1).
     more = 0.5 * root * np.pad(by_poisson(stored["energy"]), ((0, 1), (0, 0)))
     ratio = more.copy()
     ratio[:-1] += 0.5 * more[1:]

@@ -40,8 +40,8 @@ from softfinger.kinematics.contact.table_record import (
 # Rounding error of the closed forms and of the final products in the kernel.
 _ROUNDING = 16.0 * np.finfo(float).eps
 # Bound on the relative rounding error of a piece. An error analysis of the pieces of seven laws of
-# degree 7 to 11 gives at most 3.5e-13. The largest part comes from y², because cos² θ − ρ² cancels
-# near the limit on θ.
+# degree 7 to 11 gives at most 3.5e-13. The largest part of the error comes from y², because cos² θ
+# − ρ² cancels near the limit on θ.
 _PIECE_ROUNDING = 1e-12
 # Number of additional Chebyshev coefficients in h and y that are computed but not stored.
 _EXTRA_V, _EXTRA_U = 4, 6

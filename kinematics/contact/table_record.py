@@ -48,7 +48,7 @@ class Table(Record):
     by_square: float  # 2/(maximum sin² θ)
     at_first: float  # g at t = 0, from Hertz theory
     tolerance: float
-    max_error: float  # bound on the relative error; for a solid tip, the data error
+    max_error: float  # bound on the relative error, or relative data error of a solid tip
     worst_d: float  # d at which the error is largest [m]
     worst_theta: float  # θ at which the error is largest [rad]
     coefficients: Annotated[FloatArray, PIECES * PIECE]

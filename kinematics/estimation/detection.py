@@ -25,10 +25,10 @@ from softfinger.kinematics.sensing.footprint import Grid, line_span, set_around,
 # raise the second level.
 PEAK_LEVEL, PATCH_LEVEL = 3.0, 4.9
 OUTLIERS_MAX = 6  # maximum number of outliers that are excluded from a frame
-# Detection level during a contact, divided by the level before contact. A ratio below 1 prevents
-# flicker.
+# Ratio of the detection level during a contact to the level before contact. A ratio below 1
+# prevents the detection from toggling.
 _HYSTERESIS = 0.5
-_NOISE_RATIO = 1.75  # ratio of measured noise to noise setting above which a frame is noisy
+_NOISE_RATIO = 1.75  # minimum ratio of measured noise to noise setting in a noisy frame
 _SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviations
 
 

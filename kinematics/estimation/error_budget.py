@@ -58,9 +58,9 @@ _CELL_COUNT_MIN = 48.0  # minimum number of cells for separating smooth and roug
 # Fractions of a smooth error's energy that appear in d (and in the gain), in each tilt, and in the
 # residuals. Curve errors, hysteresis and crosstalk are nearly as symmetric as the pressure.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_IN_RESIDUALS = 0.15, 0.06, 0.2
-# Relative tilt error of the solid model per d/a. The error was determined by comparison with frames
-# from independent finite-element models up to 20° and 7 mm. In this range, the error is 4 % for a
-# bonded tip and negligible for a lying tip.
+# Relative tilt error of the solid model, divided by d/a. A comparison with frames from independent
+# finite-element models up to 20° and 7 mm gave an error of 4 % for a bonded tip and a negligible
+# error for a tip that lies on its sensor.
 _SOLID_TILT_ERROR = 0.1
 # Threshold for products of neighbouring residuals, in noise standard deviations.
 _PRODUCT_SIGMA = 6.0
@@ -160,7 +160,7 @@ def set_budget(
         (variance, with_centre), _ = quadratic(np.stack([weights, centre], axis=2), rho)
         variance -= with_centre**2
         level = (level * math.sqrt(max(variance, 0.0)) + _NOISE_PEAK * max(with_centre, 0.0)) / norm
-    # A zero shift of twice the standard deviation ``baseline`` must not be detected as a contact.
+    # A zero shift of two standard deviations (``baseline``) must not be detected as a contact.
     shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
     options.patch_level = level + max(shift, 0.0)
 
@@ -255,7 +255,7 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
     lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip_noise
     first, last = index(fit.first_cell), index(fit.last_cell)
     total, number = _neighbours_products(cells, lowest, first, last)
-    # The residuals do not yet account for the last step's decrement.
+    # The residuals do not yet include the decrease due to the last step.
     total -= number * variance * state.budget.row_correlation + fit.decrement
     total = beyond if number < _CELL_COUNT_MIN else min(total, beyond)
     if total <= _PRODUCT_SIGMA * variance * math.sqrt(number * state.budget.cells_per_sample):

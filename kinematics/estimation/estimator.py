@@ -314,8 +314,8 @@ class ContactEstimator:
         state = self.state = EstimatorState()
         options = self._options = state.options
         self.noise = noise
-        # Counts are rounded, so the smallest count covers readings down to half a count below
-        # itself.
+        # Counts are rounded, so readings down to half a count below the smallest count are
+        # included.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.patch_level = _TOLERANCE, PATCH_LEVEL
@@ -378,7 +378,7 @@ class ContactEstimator:
             options.sine_max = options.step_sine = _SINE_MAX
         fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
         points = points_of(cells, material, grid.blur, count_for(cells, fineness))
-        # These are all arguments of the kernel except the state and the frame.
+        # Arguments of the kernel, except the state and the frame.
         self._arrays = self._rows, pixels, weights.array, *points
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:
@@ -465,8 +465,8 @@ class ContactEstimator:
         if not 0.0 < pascal_per_count < math.inf:
             raise ValueError(f"pascal_per_count must be positive, got {pascal_per_count}")
         saturation = full if self.saturation is None else self.saturation
-        # Copy the frame, so that the compiled code accepts any type, memory layout and write
-        # protection.
+        # Copy the frame. The compiled code requires a fixed type and memory layout, and a writable
+        # array.
         self._frame[...] = frame[self._window]
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(

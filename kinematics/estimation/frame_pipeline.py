@@ -33,25 +33,25 @@ from softfinger.kinematics.estimation.state import (
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-# Signal level in noise standard deviations. If a solid tip's signal exceeds this level but lacks
-# the contact pattern, the frame is faulty.
+# Signal level in noise standard deviations. If a solid tip's signal exceeds the level but lacks the
+# contact pattern, the frame is faulty.
 _STRONG_SIGNAL = 6.0
-# Clipping the noise at 0 raises the sums over neighbourhoods. Raising the detection level by this
-# amount restores the false alarm rate.
+# Increase in the detection level if noise is clipped at 0. Clipping raises the sums over
+# neighbourhoods. The increase restores the false alarm rate.
 CLIPPED_LEVEL_INCREASE = 0.5
-GAIN_MIN, GAIN_MAX = 0.05, 20.0  # range of the gain for a contact of this tip on this sensor
+GAIN_MIN, GAIN_MAX = 0.05, 20.0  # range of the gain for a contact of the configured tip
 D_MAX = 0.75  # maximum valid d, relative to the radius
 R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
-# Maximum relative error of d that a smooth misfit may cause. The curved face of a disc causes an
-# error of this size, which the covariance includes. A smaller limit applies if the gain is far from
-# 1. Such a gain together with a smooth misfit indicates a different tip, which the covariance does
-# not cover.
+# Maximum relative error of d that a smooth misfit may cause. The limit allows for the curved face
+# of a disc, because the covariance includes the resulting error. If the gain is far from 1, a
+# smooth misfit indicates a different tip. The covariance does not cover a different tip, so a
+# smaller limit applies.
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
 # The sensor needs a tare if at least ABOVE_FRACTION of the cells under the tip exceed both levels.
-# One level is relative to the noise, the other to the peak. A solid tip loads all cells, but 5 % of
-# them read less than 0.32 of the peak.
+# The first level is relative to the noise. The second level is relative to the peak. A solid tip
+# loads all cells, but 5 % of these cells read less than 0.32 of the peak.
 ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among the cells above half the peak
 ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for linear error propagation
@@ -81,7 +81,7 @@ def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Ce
                 reason = Invalid.MODEL_MISMATCH
                 continue
             # Search for a second contact only if the residual exceeds the noise and a small
-            # fraction of the energy. Skip this search for solid tips, which load their whole base.
+            # fraction of the energy. Solid tips load their whole base, so skip the search for them.
             if not options.is_solid and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
@@ -189,7 +189,7 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
     reason = _fit_frame(state, model, frame, cells)
     _set_results(state)
     if state.options.is_solid and reason == Invalid.NOT_CONVERGED:
-        # If this tip is in contact, the fit either converges within the data range or explains the
+        # If the tip is in contact, the fit either converges within the data range or matches the
         # frame at the limit of the range.
         unexplained = fit.misfit > (1.0 - R_SQUARED_MIN) * fit.readings
         reason = Invalid.MODEL_MISMATCH if unexplained or not fit.is_limited else reason

@@ -47,10 +47,10 @@ _LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of
 _PIVOT_MIN = 1e-11
 
 # A cell that cannot read below its floor (0, or the smallest count sent) has a mean reading above
-# the true pressure. At a pressure z standard deviations above the floor, this excess is E[max(z +
-# e, 0)] − z = E[max(e − z, 0)] with e ~ N(0, 1), in standard deviations. The excess is approximated
-# to within 3e-4 by (1 − z/CLIP_END)² times this polynomial. Cells more than CLIP_BELOW below the
-# floor carry almost no information.
+# the true pressure. At a pressure z standard deviations above the floor, the mean reading exceeds
+# the pressure by E[max(z + e, 0)] − z = E[max(e − z, 0)] standard deviations with e ~ N(0, 1). The
+# excess is approximated to within 3e-4 by (1 − z/CLIP_END)² times the polynomial with coefficients
+# CLIP. Cells more than CLIP_BELOW below the floor carry almost no information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
@@ -241,7 +241,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
         scale[i] = 1.0 / math.sqrt(normal[i, i])
         for j in range(first, i + 1):
             inverse[i, j] = inverse[j, i] = normal[i, j] * scale[i] * scale[j]
-    # Sweeping the matrix on each diagonal element in turn replaces it by its negative inverse.
+    # Sweeping the matrix on each diagonal element replaces the matrix by its negative inverse.
     for k in range(first, last):
         pivot = inverse[k, k]
         if not pivot > _PIVOT_MIN:

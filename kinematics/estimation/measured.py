@@ -21,10 +21,10 @@ from softfinger.kinematics.estimation.frame_pipeline import ABOVE_FRACTION, ABOV
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_CONTACT_SIGMA = 5.0  # contact threshold of the sum of readings, in standard deviations
+_CONTACT_SIGMA = 5.0  # contact threshold for the sum of readings, in standard deviations
 _EXTRAPOLATION_MAX = 1.02  # extrapolation limit, relative to the measured depth and tilt
 _EXTENT_ERROR_MAX = 0.08  # maximum relative difference between the measured and the expected extent
-_ITERATIONS_MAX = 20  # maximum number of iterations that solve for d and θ in turn
+_ITERATIONS_MAX = 20  # maximum number of iterations that solve for d and θ alternately
 _TOLERANCE = 1e-7  # convergence tolerance, relative to the range
 
 
@@ -115,7 +115,7 @@ class MeasuredEstimator:
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
         sum_std = math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
         self._contact_threshold = _CONTACT_SIGMA * sum_std
-        # Maximum d that is not detected. Its force equals the contact threshold.
+        # Maximum d that is not detected. At this d, the force equals the contact threshold.
         root = self._root_of(self._contact_threshold, 0.0, self._root_max)
         self._undetected_d = tip.radius * root**2
         self._seq: int | None = None
@@ -214,7 +214,7 @@ class MeasuredEstimator:
         result.covariance[:3, :3] = covariance * np.outer(per_tilt, per_tilt)
         result.systematic[:3, :3] = systematic * np.outer(per_tilt, per_tilt)
         extent = force * _curve(self._law.extent, t, square_n)[0]
-        # A second contact would change the mean squared radius by more than this tolerance.
+        # A second contact would change the mean squared radius by more than the tolerance.
         tolerance = _EXTENT_ERROR_MAX * extent + _CONTACT_SIGMA * math.sqrt(self._noise[3, 3])
         agrees = abs(square - extent) < tolerance
         t_max = _EXTRAPOLATION_MAX * self._root_max * (1.0 - 1e-9)
@@ -232,7 +232,7 @@ class MeasuredEstimator:
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         moment, moment_q = shown * lever, shown_q * lever + shown * lever_q
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        partials = np.zeros((3, 3))  # of the sum and both moments in (d, n_x, n_y)
+        partials = np.zeros((3, 3))  # of the sum and both moments with respect to (d, n_x, n_y)
         partials[0] = shown_t * per_d, *(2.0 * shown_q * n)
         partials[1:, 0] = (shown_t * lever + shown * lever_t) * per_d * n
         partials[1:, 1:] = moment * np.eye(2) + 2.0 * moment_q * np.outer(n, n)

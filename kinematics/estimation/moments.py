@@ -28,14 +28,14 @@ from softfinger.kinematics.estimation.state import (
 from softfinger.kinematics.sensing.footprint import axes, set_around, set_face
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-# Margin around the footprint, in cell diagonals. All cells that touch the footprint have their
-# centres within this margin, even after a small motion of the contact.
+# Margin around the footprint, in cell diagonals. The margin includes the centres of all cells that
+# touch the footprint, even after a small motion of the contact.
 _MARGIN = 0.75
 _BLUR_MARGIN = 2.0  # additional margin around the footprint, in standard deviations of the blur
 # Tilt at which the centroid's moment arm is computed [rad]. The arm is nearly independent of the
 # tilt.
 _TILT = 0.2
-_WEAK_PEAK = 15.0  # peak below which neighbourhood sums are used, in noise standard deviations
+_WEAK_PEAK = 15.0  # maximum peak for using neighbourhood sums, in noise standard deviations
 _SINE_MAX = 0.95
 
 

@@ -10,7 +10,7 @@ from softfinger.kinematics.sensing.footprint import Face, Grid
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-# Fit parameters. The last two apply only to solid tips.
+# Fit parameters. The last two parameters apply only to solid tips.
 GAIN, DEPTH, TILT_X, TILT_Y, SHEAR_X, SHEAR_Y = range(6)
 PARAMETERS = 6
 START_POINTS = 17  # number of depths in the table for the initial estimate
@@ -34,7 +34,7 @@ class Options(Record):
     modulus: float  # at zero strain [Pa]
     blur: float  # standard deviation [m]
     rotation: float  # rotation of the sensor [rad]
-    number: int  # number of cells that a contact can press
+    number: int  # number of cells that a contact can load
     free_gain: bool
     is_solid: bool
     deepest: float  # maximum d of the model [m]
@@ -53,8 +53,8 @@ class Signal(Record):
     patch_level: float
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf without a floor
-    number: int  # number of cells that a contact can press, without outliers
-    peak: float  # largest reading [counts]; if it is below the level, row and col are −1
+    number: int  # number of cells that a contact can load, excluding outliers
+    peak: float  # largest reading [counts]; row and col are −1 if the peak is below the level
     row: int
     col: int
     mean: float  # [counts]
@@ -124,8 +124,8 @@ class Fit(Record):
     step: Column
     scale: Column
     inverse: Normal
-    variance: float  # factor from ``inverse`` to the covariance due to noise [Pa²]
-    widening: float  # factor from `Budget.shared` to the covariance due to other errors
+    variance: float  # factor that converts ``inverse`` to the noise covariance [Pa²]
+    widening: float  # factor that converts `Budget.shared` to the covariance of other errors
     to_results: Matrix  # partials of (d, tilt_x, tilt_y, gain) with respect to the fit parameters
 
 
@@ -142,18 +142,18 @@ class Budget(Record):
     cells_per_sample: float  # Σρ², the number of cells per independent noise sample
     has_common_errors: bool  # True for any error other than correlated noise
     is_correlated: bool
-    # Factors on the four standard deviations, and degrees of freedom used.
+    # Factors for the four standard deviations, and number of degrees of freedom used.
     widening: Annotated[FloatArray, DEPTHS, 5]
-    response: Column  # Jᵀq of one pattern q, times its size
-    displacement: Column  # change of the fit parameters by one pattern
-    shared: Normal  # covariance of the fit parameters due to common errors and smooth misfit
+    response: Column  # Jᵀq, multiplied by the size of the pattern q
+    displacement: Column  # change in the fit parameters due to one pattern
+    shared: Normal  # covariance of the fit parameters due to common errors and a smooth misfit
 
 
 class EstimatorState(Record):
     """Complete state of an estimator except for its cell arrays."""
 
     options: Options
-    grid: Grid  # cells that a contact can press
+    grid: Grid  # cells that a contact can load
     signal: Signal
     estimate: Estimate
     moments: Moments
@@ -170,7 +170,7 @@ class Cells(NamedTuple):
     reach: FloatArray  # √(a² − x² − y²), negative for unused cells [m]
     x: FloatArray  # cell centre [m]
     y: FloatArray
-    height: FloatArray  # the same as ``reach``, but negative for the frame's outliers, too
+    height: FloatArray  # like ``reach``, but also negative for outliers in the frame
     pattern: FloatArray  # pattern for detecting the contact of a solid tip
     model: FloatArray  # modelled pressure including gain and shear [Pa]
     residual: FloatArray  # reading − model, or 0 for cells excluded from the fit [Pa]

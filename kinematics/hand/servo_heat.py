@@ -27,14 +27,14 @@ FloatArray = NDArray[np.float64]
 
 WINDING, CASE, AMBIENT, HEATING = range(4)
 COPPER = 0.0039  # temperature coefficient of the winding's resistance [1/K]
-TIME_MAX = 3600.0  # maximum time to a limit that is reported [s]
+TIME_MAX = 3600.0  # maximum reported time to a limit [s]
 _ROOM_TEMPERATURE = 25.0  # °C
 _CONVECTION_DIFFERENCE = 30.0  # temperature above ambient at which τ_c is defined [K]
 _INITIAL_STD = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
 _RANDOM_WALK = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
-_STEP_STD = 0.12  # standard deviation of the case temperature when the reading steps [°C]
+_STEP_STD = 0.12  # standard deviation of the case temperature when the reading changes [°C]
 _STAY_STD = 6.0  # standard deviation of a reading that stays constant for 1 s [°C]
-_COUPLING = 0.25  # unobservable error of τ_w, as a fraction of W − C
+_COUPLING = 0.25  # error in W due to the unobservable error in τ_w, as a fraction of W − C
 
 
 class HeatLaw(Record):

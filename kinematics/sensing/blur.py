@@ -14,7 +14,8 @@ import numpy as np
 
 from softfinger.kinematics.compiled.layout import FloatArray
 
-# Width in points. Moment-matching weights are used below it, and Gaussian samples above it.
+# Maximum blur width for moment-matching weights, in points. For larger widths, the weights are
+# Gaussian samples.
 _MOMENT_MATCHED_MAX = 0.75
 _CUTOFF = 4.5  # truncation of the Gaussian, in standard deviations
 

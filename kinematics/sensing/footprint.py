@@ -108,8 +108,7 @@ def line_span(face: Face, a: float, y: float) -> Span:
     root = math.sqrt(root)
     left = (v * q - root) / e
     right = (v * q + root) / e
-    # A root below the base plane is not a footprint edge. In this case, the footprint ends at the
-    # rim.
+    # A root below the base plane is not a footprint edge. The footprint then ends at the rim.
     return -edge if q < v * left else left, edge if q < v * right else right
 
 

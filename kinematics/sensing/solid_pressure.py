@@ -27,11 +27,12 @@ from softfinger.kinematics.sensing.footprint import Grid, axes
 
 MODES = 32
 IMAGES = 2 * MODES
-_LANES = 8  # the number of images is padded to a multiple of it; it must divide IMAGES
+# The number of images is padded to a multiple of _LANES. IMAGES must also be a multiple of _LANES.
+_LANES = 8
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
-# Number of sample points per cell side: for cells inside the rim, for cells cut by the rim, and
-# with blur.
+# Number of sample points per cell side: for cells inside the rim, for cells cut by the rim, and for
+# all cells if the sensor blurs.
 _INSIDE, _CUT, _BLURRED = 6, 24, 12
 
 

@@ -37,7 +37,7 @@ PLANES = 4
 POINT_X, STRAIN, SLOPE, FACTOR, POINT_STRESS = range(5)  # rows of `SpringPoints.line`
 Cells = tuple[int, int]  # half-open range
 _SPREAD_MIN = 1e-12
-# Gauss-Legendre rule on the rectangle of a point, scaled to a width of 1.
+# Gauss-Legendre rule for the rectangle around a point, scaled to a width of 1.
 _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 
 
@@ -110,9 +110,9 @@ def _set_strains(
         # linear.
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
-        # Width of the uniform distribution of f. The exact width is 4 (big + small²/(3 big)). With
-        # the approximation, the mean of max(f, 0) is correct to within 2 % if the outline passes
-        # through the centre and f is a plane.
+        # Approximate width of the uniform distribution of f. The exact width is 4 (big + small²/(3
+        # big)). With the approximate width, the mean of max(f, 0) is correct to within 2 % if the
+        # outline passes through the centre and f is linear.
         by_x = abs(size_x * (x - z * v))
         by_y = abs(size_y * (y - z * w))
         big = max(by_x, by_y)

@@ -48,14 +48,14 @@ from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTacti
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
-_STEP = 0.002  # maximum delay of the physics [s]
+_STEP = 0.002  # maximum interval between physics updates [s]
 _REQUESTS = ("report", "forget", "place")  # words on the control socket that do not start a fault
 # Joint goals [rad]. A goal of 6 rad lies beyond the joint stops.
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
 _TURN_CURRENT = 0.3  # motor current equivalent to turning a joint by hand [A]
 _TURN_TIME = 1.0  # s
-_STALL_TIME = 0.05  # longest time that one call adds to the hand's clock [s]
-# Maximum lead of the hand's clock over the daemon's clock [s]. The daemon waits for replies.
+_STALL_TIME = 0.05  # maximum time that one call adds to the hand's clock [s]
+# Maximum lead of the hand's clock over the daemon's clock [s].
 _AHEAD_TIME = 0.002
 _POLL_INTERVAL = 0.0005  # interval between checks for a new deadline [s]
 # Default board, as in config/hil.toml.
@@ -106,7 +106,7 @@ class EmulatorClock:
         self.held = False
         if t > self._bound and self.servos is not None:
             if not self.servos.driven():
-                self._bound = math.inf  # Torque is off, or the daemon has ended.
+                self._bound = math.inf  # Torque is off, or the daemon has exited.
             elif t > (bound := max(self._bound, self.servos.answering_until)):
                 self.held = True
                 self._origin += t - bound
@@ -130,7 +130,7 @@ class EmulatedServos:
 
     baud: int = 0  # 0 for an immediate reply at any baud rate
     factory: bool = False  # factory defaults except for IDs and baud rate
-    ids: tuple[int, ...] | None = None  # replacements for the IDs in the settings, possibly equal
+    ids: tuple[int, ...] | None = None  # replacements for the configured IDs; may be duplicates
 
 
 class Emulator:

@@ -197,8 +197,8 @@ def carry_out(folder: Path, text: str) -> str:
         If the emulator rejects the text; the message lists the expected words.
     """
     reply = send_words(folder, text)
-    # The motion follows the emulated hand's clock, which stops while the emulator is suspended.
-    # Therefore, ask for the remaining time again.
+    # Query the remaining time again after each wait, because the emulated hand's clock stops while
+    # the emulator is suspended.
     kind = text.partition(" ")[0]
     while kind in _MOTIONS and reply.startswith("{"):
         left = json.loads(reply)["wait"]

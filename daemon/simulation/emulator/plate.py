@@ -118,7 +118,7 @@ def _value(name: str, text: str) -> float:
 
 def _press(values: dict[str, float], table: ContactTable, scale: float) -> PlatePress:
     d, theta, pressure = values.get("depth", 0.0), values["tilt"], values.get("pressure", 0.0)
-    # Limit the depth to the range in which the contact law is valid at this tilt.
+    # Limit the depth to the range in which the contact law is valid at the given tilt.
     d_max = 0.75 * table.tip.radius * (1.0 - abs(math.sin(theta)))
     known = [(float(x), lookup(table.data, x, theta)) for x in np.linspace(0.0, d_max, 1001)]
     depths = [x for x, (*_, inside) in known if inside]
@@ -142,7 +142,7 @@ class Plate:
         self._d = [-_CLEARANCE]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
-        ]  # press and standstill flag for the interval that begins at each knot
+        ]  # for each interval between knots: the press, and True if the plate stands still
         self._reported = -1
         self.arrives = 0.0  # arrival time of the last press in the sequence
 

@@ -30,10 +30,10 @@ _READS_PER_TURN = 4  # maximum number of reads per turn; the limit leaves time f
 # process may be delayed.
 _GAP_TIME = 0.02
 # Typical pseudo-terminal latency from a write to the reader's wake-up [s]. A paced bus subtracts
-# this latency in both directions, because the simulated wire has its own transmission time.
+# the latency in both directions, because the simulated wire has its own transmission time.
 PASSAGE_TIME = 15e-6
-# Maximum age of a reading when its reply is sent [s]. Real servos also measure at their own
-# intervals. With this tolerance, the physics can be computed outside the exchange.
+# Maximum age of a reading when its reply is sent [s], which allows computing the physics outside
+# the exchange. Real servos also measure at their own intervals.
 _LAG_TIME = 0.0005
 
 
@@ -205,8 +205,8 @@ class PtyServoBus:
             self._write(heapq.heappop(self._due)[2])
 
     def _write(self, data: bytes) -> None:
-        # If a client never reads, the terminal buffer fills up. A real line would lose these bytes,
-        # too.
+        # If a client never reads, the terminal buffer fills up. A real line would also lose the
+        # excess bytes.
         try:
             os.write(self._master, data)
         except BlockingIOError:

@@ -25,7 +25,7 @@ from softfinger.daemon.simulation.faults import BOARD_FAULTS, WELL
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
-# Maximum number of unread bytes. This limit must be less than 4095, the maximum that a tty reports.
+# Maximum number of unread bytes. A tty reports at most 4095 bytes, so the limit must be lower.
 _TTY_SIZE_MAX = 2048
 _DRAIN = 4096
 _RETRY_TIME = 5e-4  # interval between polls of the source for a late frame [s]
@@ -201,7 +201,7 @@ class TactileBoard:
             counts = counts if self._frozen is None else self._frozen
         self._frozen = counts
         if "saturated" in faults:
-            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # The encoder clips these.
+            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # The encoder clips them.
         elif "zero" in faults:
             counts = np.zeros_like(counts)
         if "wrong-size" in faults:

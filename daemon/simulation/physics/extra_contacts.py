@@ -45,9 +45,10 @@ from softfinger.daemon.simulation.physics.tip import (
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
 
-STIFFNESS = 1e5  # contact stiffness per corner, normal to the palm and along it [N/m]
+STIFFNESS = 1e5  # normal and tangential contact stiffness of a corner on the palm [N/m]
 LOSS = 1e-3  # ratio of damping to stiffness [s]
-# Limit in tip radii. The tip-to-tip contact is evaluated if half the centre distance is smaller.
+# Maximum distance for evaluating the tip-to-tip contact: half the distance between the tip centres,
+# in tip radii.
 _DISTANCE_MAX = 1.5
 
 

@@ -282,8 +282,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
-    # From here on, pass a single record, because each array argument costs a reference count per
-    # call.
+    # From here on, pass a single record, because each array argument costs a reference count update
+    # per call.
     data = tables[0]
     h = p.step
     g = _GAMMA * h
@@ -311,7 +311,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             state.position[2] = script_x(plant, plant.step_count * h)
         if relaxing:
             relax_shears(plant)
-        # This evaluation models slip by limiting the shears, which `settle` then stores.
+        # The evaluation models slip by limiting the shears. `settle` then stores the limited
+        # values.
         evaluate_state(plant, data)
         if scripted:
             open_guard(plant)
@@ -320,7 +321,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             if changed == 2:
                 limit_energy(plant, data)
             elif changed == 1:
-                # The bristles of the slowed gears are also undeflected at first.
+                # Slowing the gears increases their friction and therefore adds bristles. New
+                # bristles are undeflected.
                 store_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:

@@ -32,7 +32,7 @@ LAYERS = 8  # number of footprint layers that slip successively from the edge in
 CORNERS = 8  # maximum number of corners of an object
 SHEARS = CORNERS + 2  # palm shear at each corner, followed by the tip-on-tip shear of each tip
 PALM_ROWS = 2 * CORNERS  # height and slip of each corner
-EXTRA_ROWS = PALM_ROWS + 6  # adds d, θ and d_t of each tip on the other tip
+EXTRA_ROWS = PALM_ROWS + 6  # adds d, θ and d_t of each tip's contact with the other tip
 
 Shears = Annotated[FloatArray, SHEARS]
 
@@ -43,7 +43,7 @@ class Motion(Record):
     The bristles change at the joint velocities.
     """
 
-    position: FloatFive  # [rad], [rad], [m], [m], [rad]
+    position: FloatFive  # joint angles [rad], object x and y [m], object angle [rad]
     velocity: FloatFive
     shear: Pair  # d_t of each tip on the object [m]
     extra_shear: Shears  # [m]
@@ -85,7 +85,7 @@ class Parameters(Record):
     scale: float  # ratio of the real modulus to the table modulus
     friction: float
     loss: float  # ratio of damping to stiffness [s]
-    shear_stiffness: float  # shear stiffness relative to the spring model
+    shear_stiffness: float  # ratio of shear stiffness to that of the spring model
     shear_coupling: float  # coupling of d_t with d and θ: 1 for springs, 0 for bristles
     creep: float  # fraction of a sticking shear that relaxes per sub-step
     micro_slip: bool  # True if the edge of the footprint slips first
@@ -102,7 +102,7 @@ class Parameters(Record):
     half_width: float  # [m]
     half_height: float  # [m]
     roundness: float  # radius of a disc [m]
-    factor: float  # tip stiffness on the object relative to a plane
+    factor: float  # ratio of tip stiffness on the object to tip stiffness on a plane
     extent: float  # maximum distance of an outline point from the object centre [m]
     corners: int  # used entries of the outline
     outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
@@ -119,7 +119,7 @@ class Parameters(Record):
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
     stribeck: float  # additional friction at standstill [N·m]
-    load_friction: Pair  # friction divided by gear torque, and the additional ratio at standstill
+    load_friction: Pair  # ratio of friction to gear torque, and the additional ratio at standstill
     stribeck_speed: float  # speed at which the additional friction has decreased to 1/e [rad/s]
     presliding: float  # bristle deflection at which the gears slip [rad]
     torque_constant: float  # [N·m/A]
@@ -147,7 +147,7 @@ class Goals(Record):
     q: Pair  # [rad]
     current: Pair  # [A]
     stiffness: Pair  # position-loop stiffness relative to the factory setting
-    damping: Pair  # damping beyond the factory setting, relative to the factory stiffness [s]
+    damping: Pair  # ratio of additional damping to the factory stiffness [s]
     duty: Pair  # motor voltage limit as a fraction of the supply voltage
     load: FloatTriple  # external force x, y [N] and external torque [N·m] on the object
 
@@ -193,7 +193,7 @@ class TipContact(Record):
     shear: float  # d_t after it was limited [m]
     shear_variance: float  # shear variance of the layers [m²]
     shear_rate: float  # rate of d_t without slip [m/s]
-    force: float  # total force on the tip base, which is the sum over a pressure grid [N]
+    force: float  # total force on the tip base, equal to the sum over a pressure grid [N]
     energy: float  # elastic energy [J]
     normal: float  # N [N]
     tangential: float  # T [N]
@@ -244,7 +244,7 @@ class Plant(Record):
     step_count: int  # number of completed sub-steps
     sample_count: int  # number of samples taken
     energy: float  # kinetic, elastic and gravitational energy [J]
-    energy_limit: float  # maximum energy that the work done on the hand allows [J]
+    energy_limit: float  # maximum energy, given the work done on the hand [J]
     limited_step_count: int  # number of sub-steps that the energy guard has limited
     last_state: Motion  # state before the step
     stage_state: Motion  # state of the second stage

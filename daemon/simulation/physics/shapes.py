@@ -28,10 +28,10 @@ class Shape:
     """Outline of an object with its centre of mass at the origin. Lengths are in m."""
 
     kind: int  # shape constant from plant_state
-    corners: FloatArray  # counter-clockwise corners [n, 2]; a disc has its circumscribed square
+    corners: FloatArray  # counter-clockwise [n, 2]; for a disc, corners of the circumscribed square
     roundness: float  # radius of a disc, or 0 for other shapes
     gyration: float  # radius of gyration
-    mean_radius: float  # mean distance of all points from the centre, for the spin friction
+    mean_radius: float  # mean distance of all points from the centre, used for the spin friction
 
     @property
     def extent(self) -> float:

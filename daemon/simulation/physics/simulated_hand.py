@@ -173,7 +173,7 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # This damping makes the joint and its position loop critically damped.
+    # Make the joint and its position loop critically damped.
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
@@ -253,7 +253,7 @@ class SimulatedHand:
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         goals.stiffness[:] = goals.duty[:] = 1.0
-        # The buffer holds every sample that may be on its way to a sensor's reader.
+        # The buffer holds all samples that a sensor may still deliver.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLE_COUNT
         self._ring = np.zeros(stored, Sample.dtype)
@@ -274,8 +274,8 @@ class SimulatedHand:
         self.normal = felt.array["normal"]  # N [N]
         self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
-        # Penetration depth of the backing plate's rim. If it is above 0, the tip is beyond its
-        # limit.
+        # Penetration depth of the backing plate's rim. If the rim penetrates the object, the tip is
+        # compressed beyond its limit.
         self.rim = felt.array["rim"]  # m
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
         self.torque_on = goals.torque_on  # 1 if the servo's torque is on

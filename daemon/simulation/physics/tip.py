@@ -223,7 +223,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # shear at which T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # Most steps are far from slip, which two comparisons can establish.
+        # Two comparisons show whether the contact is far from slipping, as it is in most steps.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction
@@ -256,9 +256,9 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     else:
         shear = 0.0
 
-    # Damping must not make a separating tip pull, and shear damping must not exceed friction. A
-    # stuck tip does not slide. The spring model's term tan θ ḋ is an exception that keeps the
-    # virtual work consistent.
+    # Damping must not make a separating tip pull the object. Shear damping must not exceed the
+    # friction force. A sticking tip does not slide, apart from the term tan θ ḋ of the spring
+    # model, which keeps the virtual work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
     loss = p.loss
@@ -352,7 +352,7 @@ def touch_object(
     rotation_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
     # The integrator matrix uses the stiffness at the end of the step and therefore remains accurate
-    # during an impact. Damping uses the current stiffness.
+    # during an impact. Damping uses the stiffness at the present position.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
         tip.gain = fade(theta)[0] * p.factor * plant.relaxation_factor[finger]

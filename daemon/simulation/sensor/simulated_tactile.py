@@ -40,7 +40,7 @@ class StageTouch(NamedTuple):
 
     d: float  # m
     theta: float  # rad
-    pressure: float  # uniform pressure on all cells [Pa]; replaces the contact if it is above 0
+    pressure: float  # uniform pressure on all cells [Pa]; a positive value replaces the contact
 
 
 class SimulatedTactile:
@@ -125,7 +125,7 @@ class SimulatedTactile:
 
     def _read(self, number: int, arrival: float) -> None:
         """Compute the newest frame from a sample that the plant still stores."""
-        # If readings depend on earlier contacts, samples without a computed frame also matter.
+        # If readings depend on earlier contacts, also apply the samples without a computed frame.
         first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
             self._press(each)
@@ -181,7 +181,7 @@ class SimulatedTactile:
             shear = float(sample.tangential[finger]) * (1.0 - d / self._radius)
             self._model.press(d, theta, 0.0, number * self._period, curvature, factor, shear)
             return True
-        # Divide out the effect of curvature, because the sensor model already includes it.
+        # Remove the effect of curvature, because the sensor model already includes this effect.
         factor *= math.sqrt(1.0 + curvature * self._radius)
         # The force is proportional to d². If half the tip is beyond the face edge, the force is
         # halved.

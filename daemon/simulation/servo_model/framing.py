@@ -142,7 +142,7 @@ class PacketParser:
             end = 7 + length
             body = bytes(buffer[7 : end - 2])
             if len(buffer) > end - 2:
-                body += b"\0"  # A header at the end of the body is not followed by stuffing.
+                body += b"\0"  # No stuffing follows a header at the end of the body.
             if intruder := _UNSTUFFED.search(body):
                 self._drop(7 + intruder.start())
                 continue

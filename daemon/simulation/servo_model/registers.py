@@ -24,7 +24,7 @@ _LIMITS = {
     reg.GOAL_CURRENT: reg.CURRENT_LIMIT,
     reg.GOAL_VELOCITY: reg.VELOCITY_LIMIT,
 }
-_PAIRS = {  # addresses of lower limits and their upper limits
+_PAIRS = {  # maps lower limits to the corresponding upper limits
     reg.MIN_POSITION_LIMIT: reg.MAX_POSITION_LIMIT,
     reg.MIN_VOLTAGE_LIMIT: reg.MAX_VOLTAGE_LIMIT,
 }

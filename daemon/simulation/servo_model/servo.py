@@ -80,7 +80,7 @@ class EmulatedServo:
         self._boot_at = -math.inf  # end of a reboot
         self._next_step = math.inf
         self._next_sense = t
-        # Write that is waiting for an action instruction.
+        # Registered write that is waiting for an action instruction.
         self._registered: tuple[int, bytes] | None = None
         for address, value in eeprom.items():
             self.table.set(address, value)
@@ -355,7 +355,7 @@ class EmulatedServo:
         self._joint.forget_turns()
         self._registered = None
         self._reset_goals()
-        # The value is 0 if the firmware lacks this register.
+        # The value is 0 if the firmware lacks the register.
         if self._memory[reg.STARTUP_CONFIGURATION] & 1:
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.hold()

@@ -67,7 +67,7 @@ class ServoBus:
         self.lag = 0.0  # maximum age of a reading when its reply is sent [s]
         self.packets = 0  # number of packets received
         self._now = -math.inf
-        self._due = -math.inf  # time of the next servo event, or an earlier time
+        self._due = -math.inf  # lower bound for the time of the next servo event
 
     @classmethod
     def from_settings(
@@ -205,7 +205,7 @@ class ServoBus:
         if packet.id == BROADCAST:
             return self._broadcast(packet, servos, t)
         if instruction == framing.STATUS:
-            return []  # This packet is the reply of another servo, or an echo.
+            return []  # The packet is a reply from another servo, or an echo.
         # Status return level 0 allows replies only to pings, level 1 also to reads, and level 2 to
         # all instructions.
         needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)
@@ -217,7 +217,7 @@ class ServoBus:
                 delay, name = servo.return_delay, servo.id
                 error, data = _execute(servo, instruction, packet.parameters, t)
                 if level >= needed:
-                    # The reply uses the alert bit that applies after the instruction.
+                    # The alert bit of the reply reflects the state after the instruction.
                     status = framing.status(name, error | servo.alert, data)
                     replies.append(TimedReply(delay, status))
             elif servo.shadow == packet.id:

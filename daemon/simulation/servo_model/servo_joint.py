@@ -215,7 +215,7 @@ ROOM_TEMPERATURE = 25.0  # °C
 _THERMOMETER_LAG = 4.0  # s
 _CONVECTION = 0.006  # relative increase in cooling per kelvin of temperature difference [1/K]
 _STEP_MAX = 1.0  # maximum step [s]
-# Arrival tolerance in counts. Without this tolerance, rounding of the square root would prevent
+# Arrival tolerance in counts. Without a tolerance, rounding of the square root would prevent
 # arrival.
 _ARRIVAL_TOLERANCE = 1e-6
 
@@ -270,7 +270,7 @@ class Profile:
             return
         limit = self.speed if self.speed > 0.0 else math.inf
         if self.acceleration > 0.0:
-            # Maximum speed from which the servo can stop at the target, allowing for the next step.
+            # Maximum speed from which the servo can stop at the target after one more step.
             a = self.acceleration
             stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
             speed = math.copysign(min(limit, stop), distance)
