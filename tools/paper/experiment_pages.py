@@ -216,7 +216,7 @@ def integrated_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def _appendix() -> tuple[Sheet, ...]:
-    d = np.arange(1, 81) / 10.0  # At d = 0, the terms cancel.
+    d = np.arange(1, 81) / 10.0  # Exclude d = 0, where all terms are zero.
     metres = d * MILLI
     columns = {"d [mm]": d}
     for how, terms in (

@@ -139,7 +139,7 @@ class _Build:
         self._started = time.monotonic()
         self._bar, self._tell = bar, tell
         self._processes: list[subprocess.Popen[str]] = []
-        self._own = threading.local()  # Each thread has one process.
+        self._own = threading.local()  # Each thread uses its own process.
         self.failed = self._over = False
 
     def run(self) -> None:

@@ -99,7 +99,7 @@ class EventLog:
             shown = text
         else:
             shown = f"{level:7} {kind:8} {text}"
-            if not self._journal:  # The journal adds the time itself.
+            if not self._journal:  # The systemd journal adds the time.
                 date = "%H:%M:%S" if self._file is None else "%Y-%m-%d %H:%M:%S"
                 shown = f"{_clock(date, timestamp)} {shown}"
         if self._journal:

@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     shapes = tuple(arguments.shape or SHAPES)
     axes = (
         tuple(sorted(arguments.friction or FRICTIONS)),
-        tuple(sorted(arguments.mass or MASSES)),  # The reader of the map requires sorted values.
+        tuple(sorted(arguments.mass or MASSES)),  # The map must be sorted.
         tuple(sorted(arguments.size or SIZES)),
     )
     print(

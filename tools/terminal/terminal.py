@@ -89,8 +89,8 @@ class Terminal:
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
             self._attributes = termios.tcgetattr(self._keyboard)
-            tty.setcbreak(self._keyboard)  # This call also discards keys that were typed earlier.
-            # Otherwise, Ctrl-Z would also suspend the daemon while torque is on.
+            tty.setcbreak(self._keyboard)  # This call also discards earlier key presses.
+            # Disable Ctrl-Z, because it would also suspend the daemon while torque is on.
             if not self._suspendable:
                 ours = termios.tcgetattr(self._keyboard)
                 ours[6][termios.VSUSP] = b"\0"

@@ -25,7 +25,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.viewing.landscape import fingers_of
 
 FloatArray = NDArray[np.float64]
-GOAL, OBJECT = "goal", "object"  # colour names, in addition to the finger names
+GOAL, OBJECT = "goal", "object"  # colour names in addition to the finger names
 
 # Colour-blind users can distinguish these colours on a dark background. The page defines separate
 # colours for each theme.

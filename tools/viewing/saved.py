@@ -17,8 +17,8 @@ from softfinger.tools.viewing.pictures import Pictures, Row
 from softfinger.tools.viewing.sources import Playback, ViewError, marks_of
 
 _PICTURE_COUNT_MAX = 6000  # maximum number of pictures in the page's memory; each has about 10 kB
-_SCALE = 3000.0  # units of the moving picture per metre
-_ARC = 30  # number of points above which every second point of a line is omitted
+_SCALE = 3000.0  # SVG user units per metre
+_ARC = 30  # number of points above which a line omits every second point
 
 
 def save(path: Path, recording: Recording, period: float, say: Callable[[str], None]) -> None:
