@@ -188,7 +188,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
             trace -= (cells.pitch_x**2 + cells.pitch_y**2) / 12.0
             for _ in range(4):
                 square = (m_x * m_x + m_y * m_y) / (a - d / 3.0) ** 2
-                # The covariance of the pressure has the trace (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
+                # The trace of the pressure covariance is (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
                 b, c = a * (24.0 - 12.0 * square), 6.0 - 5.0 * square
                 d = float((b - math.sqrt(max(b * b - 144.0 * c * trace, 0.0))) / (2.0 * c))
             s_x, s_y = m_x / (a - d / 3.0), m_y / (a - d / 3.0)

@@ -106,7 +106,8 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
                 f"servo {servo}: torque is on: stop `softfinger run`, or send `disarm`"
             )
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # After power-up, the position of a servo is its encoder count, which is always within one turn.
+        # After power-up, the position of a servo is its encoder count, which is always less than
+        # one turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder

@@ -211,7 +211,7 @@ def _numbers(state: State) -> dict[str, Any]:
     """Return the numbers to log with an event; ``seq`` identifies the event in a recording."""
     numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
     real = {
-        name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON cannot represent NaN.
+        name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON has no NaN.
         for name, pair in numbers.items()
     }
     return {"seq": state.seq, "mode": state.mode, **real}
