@@ -60,7 +60,7 @@ finally:
     over.set()
 """
 
-# Script that does the same as HELD for a user without permissions.
+# Script that does the same as HELD, but for a user without permissions.
 REFUSED = """
 import json, os, resource
 from softfinger.daemon.loop.realtime import RealTime

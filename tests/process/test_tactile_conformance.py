@@ -119,7 +119,7 @@ def test_incomplete_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
 def test_a_silent_board_keeps_the_last_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="silent@0.2") as rig:
         rig.sensor.open()
-        rig.wait(lambda frame: rig.images.number > 60)  # Of these frames, 40 were sent.
+        rig.wait(lambda frame: rig.images.number > 60)  # The board sends only the first 40 images.
 
         def silent() -> bool:  # Earlier frames may still be in transit.
             last, number = rig.sensor.latest(), rig.images.number

@@ -63,7 +63,7 @@ PALE = """(() => {
   }
   return found;
 })()"""
-# Numbers of the headline that its age covers.
+# Headline numbers that are covered by the age label.
 OVER_NUMBERS = """(() => {
   const age = document.querySelector(".headline .age").getBoundingClientRect();
   return [...document.querySelectorAll(".headline :is(h2, span, small):not(.age)")].filter(each => {
@@ -245,7 +245,7 @@ def test_stale_data_are_marked(page, fake):
             return set(" ".join(page(names)).split()) - {"old", "card"}
 
         assert page.text(".mode") == "holding"
-        # Time after which a state without a successor counts as stale.
+        # A state counts as stale after this time.
         assert page("picture.patience.state + scene.period") <= 0.5
         fake.dead.add("left")
         until(lambda: old() == {"left"})
@@ -378,7 +378,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         fake.replies["grasp"] = {"ok": False, "error": "grasp: too hot for that"}
         page.key("Equal", "+", text="+")
         until(lambda: page.text("#force output") == "✗ grasp: too hot for that")
-        until(lambda: page("settings.force.wanted") is None)  # The hand did not adopt this force.
+        until(lambda: page("settings.force.wanted") is None)  # The page discards the refused force.
         del fake.replies["grasp"]
         until(lambda: page("document.querySelector('#force [type=number]').value") == "7.3")
 
@@ -415,7 +415,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
 
         os.killpg(page.browser.process.pid, signal.SIGSTOP)
         asleep = fake.published
-        # This wait corresponds to 10 s of the stream.
+        # Wait for 10 s of states.
         until(lambda: fake.published > asleep + 1000)
         os.killpg(page.browser.process.pid, signal.SIGCONT)
         until(lambda: page.lag() < 0.5)
@@ -482,7 +482,7 @@ def test_colours_labels_and_keys_are_accessible(page, fake):
             assert page(PALE) == []
         page.click("#theme")
         until(lambda: page("document.documentElement?.dataset.theme") == "light")
-        page.open(viewed.commanding)  # This browser keeps its selection.
+        page.open(viewed.commanding)  # The browser stores the selected theme.
         assert page("document.documentElement?.dataset.theme") == "light"
 
         tree = page.browser.ask("Accessibility.getFullAXTree")["nodes"]

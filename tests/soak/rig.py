@@ -27,7 +27,7 @@ from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError
 from softfinger.tools.processes.emulate import emulator_process
 
-_PATIENCE = 300.0  # time-out for the start of a process, including kernel compilation [s]
+_PATIENCE = 300.0  # timeout for the start of a process, including kernel compilation [s]
 _STATE_RATE = 250.0  # Hz
 # These settings affect only startup. A busy machine may delay the first bytes of the emulated hand.
 _PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
