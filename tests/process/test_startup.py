@@ -67,7 +67,7 @@ sys.exit(cli.main(sys.argv[2:]))
         ("argparse", ["limits"], -signal.SIGINT),
         ("pydantic", ["run"], -signal.SIGINT),
         ("softfinger.tools.terminal.stream_state", ["monitor"], -signal.SIGINT),
-        # This import reraises KeyboardInterrupt.
+        # While a subcommand is running, Ctrl-C raises KeyboardInterrupt.
         ("softfinger.daemon.safety.limits", ["limits"], 130),
     ],
 )

@@ -165,8 +165,8 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
     record_hand(tmp_path / "run.mcap", FORCES, 4.4, profile=path, hand=plant)
     assert calibrate("latency", tmp_path) == 0
     told = capsys.readouterr().out
-    # Cells with a response time of 60 ms hide part of the latency. With other cells, the latency is
-    # found to within a few ms.
+    # A cell response time of 60 ms hides part of the latency. For all other cells, the latency is
+    # accurate to within a few ms.
     tolerance = 6e-3 if profile == "velostat" else 3e-3
     assert load(tmp_path / "my.toml").tactile.latency == pytest.approx(latency, abs=tolerance)
     assert float(told.split(" ± ")[1].split(" ms")[0]) < 1e3 * tolerance

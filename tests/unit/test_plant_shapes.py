@@ -136,7 +136,7 @@ def test_curvature_softens_the_contact_like_the_springs(curved, upright, tilted)
         assert springs_on_a_cylinder(d, math.radians(30), curved) == pytest.approx(
             (share,) * 2, rel=tilted
         )
-    # The share is exact to leading order.
+    # The share is exact to leading order in d.
     assert springs_on_a_cylinder(1e-4, 0.3, curved) == pytest.approx((share,) * 2, rel=1e-3)
 
 

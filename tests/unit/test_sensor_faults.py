@@ -16,9 +16,9 @@ FORCE = 6.0
 BOTH = {"consistency.left_sensor", "consistency.right_sensor"}
 
 # Each fault has a kind, a value, a duration [s], the affected fingers, the expected events, and the
-# mode expected afterwards. A falling zero offset hides a light touch completely. The joints then
-# hold their position. If only one tip seems to let go, its frames are rejected instead. A rising
-# zero offset is visible next to the footprint.
+# mode expected afterwards. A falling zero offset completely hides a light touch, and the joints
+# then hold their position. If only one tip seems to let go, the daemon rejects the frames of this
+# tip instead. A rising zero offset is visible next to the footprint.
 LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
     "one zero sinks": ("drift", -0.1, 1.0, (0,), {"consistency.left_sensor"}, "armed"),
     "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, "armed"),

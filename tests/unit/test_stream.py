@@ -110,7 +110,7 @@ def test_a_stuck_subscriber_blocks_no_others_and_its_queue_is_bounded(context, a
         for seq in range(10_000):
             state.seq = seq
             publisher.send(STATE, state, BOTH)
-            # This call never returns if it waits for the stuck subscriber.
+            # This call would never return if it waited for the stuck subscriber.
             served.service.step(0.0)
             while reading.poll(0):
                 reading.recv_multipart()
@@ -155,7 +155,7 @@ def test_late_subscribers_receive_settings_and_events_again(context, addresses, 
     publisher.settings(98.0, 0.5, HandInfo("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
-    served.settle()  # Otherwise, the first subscription could arrive earlier.
+    served.settle()  # Otherwise, the subscription could arrive before the events.
     early = subscribe(context, addresses[0])
     told: list[tuple[bytes, dict[str, Any]]] = []
 

@@ -52,8 +52,8 @@ def test_the_footprint_matches_the_forward_model(grid, contact):
     centroid = (pressure * cols).sum(), (pressure * rows).sum()
     outline, middle = shown
     assert middle == pytest.approx(np.array(centroid) / pressure.sum(), abs=0.05)
-    # Every loaded cell has a corner inside the outline, and the cells at the ends of the outline
-    # are loaded.
+    # Every loaded cell has a corner inside the outline. The cells at the ends of the outline are
+    # loaded.
     pressed = np.column_stack((cols[pressure > 0.0], rows[pressure > 0.0]))
     low, high = outline.min(axis=0), outline.max(axis=0)
     assert (pressed >= low - 0.5).all()

@@ -107,7 +107,7 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
 
 
 def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
-    # The approach of a centred object is the same with and without a swap.
+    # With a centred object, the approach is the same with and without swapped servos.
     daemon = make("swapped")
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 2.0)
