@@ -114,7 +114,7 @@ def test_systematic_errors_do_not_average_out():
             first = replace(contacts[0])
     contact = contacts[0]
     assert first.d_std == pytest.approx(math.hypot(5e-5, 2e-5), rel=1e-3)
-    # The standard deviation must not decrease further, because the zero offset can drift.
+    # The standard deviation must not fall below 2e-5 m, because the zero offset can drift.
     assert 2e-5 < contact.d_std < 1.2 * first.d_std
     assert 4e-3 < contact.theta_std < first.theta_std
     # The force error has three parts: an error in d times ∂F/∂d = 2F/d, an error in θ times F tan
