@@ -393,7 +393,7 @@ class Body:
         depth, before, touching, held = state
         held = held.copy()
         target = (1 - d) - self.reach
-        room = before[self.normal] - ((1 - depth) - self.reach)  # ≤ 0; the plane moves by d − depth
+        room = before[self.normal] - ((1 - depth) - self.reach)  # gap to the plane at `depth`, ≤ 0
         motion, pressures = before.copy(), self.pressures(before, 0 * before)
         touching = touching | (target < 0.3 * target.min()) if not touching.any() else touching
         size = 1.0

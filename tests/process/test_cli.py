@@ -140,7 +140,7 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     socket.send_multipart([b"", b"x" * 5000])
     assert socket.poll(60_000)  # The gateway has also read all earlier requests.
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"
-    select.select([], [], [], 0.5)  # This is the stall.
+    select.select([], [], [], 0.5)  # Stall for half a second.
     daemon.running.process.send_signal(signal.SIGCONT)
     replies = []
     for _ in requests:
@@ -174,7 +174,7 @@ def test_a_client_waiting_for_its_reply_is_served_after_a_stall(daemon):
         hand.status()
         daemon.running.process.send_signal(signal.SIGSTOP)
         arming = pool.submit(hand.arm)
-        select.select([], [], [], 0.5)  # This is the stall.
+        select.select([], [], [], 0.5)  # Stall for half a second.
         daemon.running.process.send_signal(signal.SIGCONT)
         arming.result(60.0)
         assert hand.status()["torque"] is True

@@ -238,7 +238,7 @@ def test_a_cancelled_command_is_not_repeated(fake):
     fake.replies["arm"] = LATE
     asyncio.run(cancelled())  # The cancellation waits for the attempt in progress.
     count, published = len(fake.requests), fake.published
-    until(lambda: fake.published > published + 50)  # This takes half a second.
+    until(lambda: fake.published > published + 50)  # Wait for half a second.
     assert len(fake.requests) == count
 
 

@@ -294,7 +294,7 @@ def test_the_process_using_a_port_is_named(terminal, locked):
 
 
 def test_latency_timer_is_checked_and_repaired(tmp_path, monkeypatch):
-    path, sysfs = "/dev/ttyUSB7", tmp_path / "sys"  # This is a fake adapter.
+    path, sysfs = "/dev/ttyUSB7", tmp_path / "sys"  # fake adapter
     timer = sysfs / "ttyUSB7" / "device" / "latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text("16\n")

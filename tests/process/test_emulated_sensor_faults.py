@@ -22,7 +22,7 @@ LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"
 CURRENT = "left:current=2"
-REFUSED = "left:shift-x=3"  # fault after which the hand lets go
+REFUSED = "left:shift-x=3"  # fault after which the hand releases the object
 
 
 @contextlib.contextmanager

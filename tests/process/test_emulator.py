@@ -292,7 +292,7 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
             assert servos.ping(1) == 1020
         servos.close()
         assert capsys.readouterr().err == ""
-        # An invalid fault makes the whole message invalid.
+        # If one fault name is invalid, the emulator ignores the whole message.
         assert send(tmp_path, "silent=2 sillent=2") == 1
         assert "'sillent=2'" in capsys.readouterr().err
         assert SdkServos(tmp_path).ping(2) == 1020

@@ -81,7 +81,8 @@ def test_assessment_of_exchange_times():
     assert near.text.endswith(
         "this takes most of a tick of 2 ms (loop.rate = 500), so ticks will be late"
     )
-    both = judged(0.0028, 0.003)  # Both times are between a tick and reply_timeout.
+    # Both times are longer than a tick and shorter than reply_timeout.
+    both = judged(0.0028, 0.003)
     assert (both.status, both.fix.split(",")[0]) == ("FAIL", "set loop.rate = 260")
     assert (
         "expected at most 2 ms, the period of a tick (loop.rate = 500), and at most 4 ms"

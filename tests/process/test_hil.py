@@ -278,7 +278,8 @@ def test_lost_packets_do_not_keep_torque_on(rig):
     )
     send_words(rig.folder, "well")
     until(lambda: not rig.status()["torque"])
-    if rig.status()["mode"] == "fault":  # The mode depends on when torque off was confirmed.
+    # The mode depends on the time at which torque off was confirmed.
+    if rig.status()["mode"] == "fault":
         rig.does("clear")
     rig.works()
 

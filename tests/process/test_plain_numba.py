@@ -35,8 +35,8 @@ sys.exit(failed)
 """
 
 
-# Both compilers produce bit-identical results on this processor. On other processors, they may
-# choose different products for fused multiply-add.
+# Both compilers produce bit-identical results on this processor. On other processors, the compilers
+# may choose different products for fused multiply-add.
 SAME_BITS = "znver3"
 
 

@@ -157,7 +157,7 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             page.connect((host, int(port)))
             page.settimeout(WAIT)
             page.sendall(WATCH.format(host=viewed.host).encode())
-            wish = bytes([0x81, 0x80, 0, 0, 0, 0])  # This is an empty text frame.
+            wish = bytes([0x81, 0x80, 0, 0, 0, 0])  # empty text frame
             page.setblocking(False)
             begun = fake.published
 
@@ -498,7 +498,7 @@ def test_a_recording_is_saved_as_a_moving_picture(recorded, tmp_path):
     lines = [each for each in ElementTree.parse(path).getroot().iter() if "values" in each.attrib]
     counts = {len(each.attrib["values"].split(";")) for each in lines}
     assert counts == {1 + math.ceil(Recording(recorded).duration / 0.1)}
-    assert len(lines) >= 6 + 5  # The lines show fingers and tips, and contacts, arrows and object.
+    assert len(lines) >= 6 + 5  # The lines show the fingers, tips, contacts, arrows and object.
 
 
 def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline):

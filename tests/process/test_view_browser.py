@@ -30,7 +30,7 @@ pytestmark = [
 LEASE = 10.0  # s
 SHIM = Path(__file__).parents[2] / "docs" / "iframe-worker.js"
 PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
-# Fraction of a canvas's pixels that have nearly the given colour.
+# Fraction of the canvas pixels with approximately the given colour.
 FRACTION = """((selector, colour) => {
   const canvas = document.querySelector(`${selector} canvas`);
   const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
@@ -39,7 +39,7 @@ FRACTION = """((selector, colour) => {
     count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
   return 4 * count / data.length;
 })"""
-# Visible texts with a contrast below WCAG AA, which is 4.5, or 3 for large letters.
+# Visible texts with a contrast below the WCAG AA limit of 4.5, or 3 for large text.
 PALE = """(() => {
   const linear = part => part <= 10.31 ? part / 3294.6 : ((part / 255 + 0.055) / 1.055) ** 2.4;
   const parts = colour => colour.match(/[\\d.]+/g).map(Number);
@@ -420,9 +420,9 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         os.killpg(page.browser.process.pid, signal.SIGCONT)
         until(lambda: page.lag() < 0.5)
         rows = page("past.rows.map(row => row[0])")
-        # The rows include the states during sleep.
+        # The rows include the states that were published while the browser was suspended.
         assert rows == [*range(rows[0], rows[0] + len(rows))]
-        page.click("[name=stop]")  # The stop is sent although the connection was closed in between.
+        page.click("[name=stop]")  # The page sends the stop, although its connection was closed.
         until(lambda: fake.requests[-1]["command"] == "stop")
 
         page("location.reload()")

@@ -40,7 +40,7 @@ def test_a_grip_outside_the_map_gets_a_warning_with_the_reason():
 
 def test_the_warning_considers_both_bounds_of_the_force_increase():
     # At this friction, a grip of 10 N that increases to 20 N can carry 7.3 N. A grip that increases
-    # only to 15 N cannot.
+    # only to 15 N cannot carry this load.
     control = {"tip_friction": 0.25, "object_load": 4.8}
     assert Envelope(settings(0.040, **control)).warning(10.0) == ""
     for bound in ({"grip_raise_max": 5.0}, {"grip_raise_share": 0.5}):

@@ -189,8 +189,8 @@ def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
     # covariance includes an error of the tip data. The lower limit is smaller, because these frames
     # come from the same data.
     least, most = (0.6, 1.5) if physics == "springs" else (0.2, 1.5)
-    # With spring tips, an offset of 0.5 mm causes an error in d that exceeds its estimated
-    # uncertainty.
+    # With spring tips, an offset of 0.5 mm causes an error in d that exceeds the estimated
+    # uncertainty of d.
     most = 3.0 if (name, physics) == ("centre", "springs") else most
     assert least < worst_nees(known, tip, imperfect) < most
     request.getfixturevalue("exact_solid_data")

@@ -57,8 +57,8 @@ def test_friction_is_measured_by_a_sweep(tmp_path, capsys, friction, more, expec
     assert calibrate("friction", tmp_path) == 0
     told = capsys.readouterr().out
     found = load(tmp_path / "my.toml").control.joint_friction
-    # The additional static friction falls by a factor of e per 0.12 rad/s. At these velocities, a
-    # tenth of it remains.
+    # The additional static friction falls by a factor of e per 0.12 rad/s. At the velocities of
+    # this test, a tenth of this friction remains.
     assert found == pytest.approx(expected, abs=2 * COUNT)
     assert f"control.joint_friction = {found:g}" in told
     assert ("at break-away" in told) == (at_rest is not None)

@@ -81,7 +81,7 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
     q, d, angle = (0.12, 0.21), (3e-3, 4e-3), -0.1
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a = HAND.tip_radius
-    middle = tips.mean(axis=0)  # Any point of the object is suitable.
+    middle = tips.mean(axis=0)  # Any reference point on the object is suitable.
     w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
     arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
@@ -126,7 +126,7 @@ def test_holding_forces_balance_a_tapered_object(grasp, taper):
     felt = [sheared_gradient(looked_up[i], d[i], theta[i], shear[i]) for i in range(2)]
     for i, each in enumerate((normal1, normal2)):
         assert felt[i][0] - shear[i] * math.tan(theta[i]) == pytest.approx(each, rel=1e-4)
-    # Sum the forces on the object at the contacts, and the moments that the tips apply to it.
+    # Sum the contact forces on the object, and the moments that the tips apply to the object.
     forces = [pressed[0] * n[0] - shear[0] * t[0], -pressed[1] * n[1] + shear[1] * t[1]]
     assert sum(forces) == pytest.approx([0.0, 0.0], abs=1e-12)
     touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]

@@ -99,7 +99,7 @@ def test_gravity_accelerates_a_free_object_and_a_grasp_holds_it():
     start = grasp.symmetric(0.004)
     place(held, start.q, start.pose)
     settled(held, (0.9, 0.9), 0.7, 1.0)
-    # The y components of the tip forces carry the weight to within 1 %, without slip.
+    # The y components of the tip forces equal the weight to within 1 %, and the tips do not slip.
     along = held.tangential * np.cos(held.object_pose[2]) * [-1, 1]
     assert abs(along.sum()) == pytest.approx(0.3 * 9.80665, rel=0.01)
     place_before = held.object_pose[1]

@@ -200,7 +200,7 @@ def test_joint_motion_compensates_for_slow_cells(response):
     estimator = HandEstimator(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     d, q = 0.003, 0.15
-    # Distances below the tip's apex [m], in equal steps of area.
+    # Distances below the tip's apex [m], with equal steps in area.
     below = np.linspace(0.0, 0.01, 400)
     pressure, shown, fitted = np.maximum(d - below, 0.0), q, (d, 1.0)
     follows = -math.expm1(-0.002 / response)

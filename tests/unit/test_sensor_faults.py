@@ -195,7 +195,7 @@ def test_real_loads_and_turns_are_not_measurement_faults(load: tuple[float, floa
 
 
 def given(repeats: RepeatDetector, frames: list[float]) -> bool:
-    for number in frames:  # An increase by a tenth affects only one cell.
+    for number in frames:  # An increase by 10 % affects only one cell.
         repeats.update(np.array([number, number, number, 10.0 * number]).astype(np.uint16))
     return repeats.is_fault
 

@@ -272,7 +272,7 @@ def test_friction_identified_during_the_approach_limits_load_detection():
         for load in np.linspace(0.0, 5.5, 500):
             watched.run(load, 1)
         assert (watched.run(5.5, 100) > FORCE) == raised
-        # The approach current of 0.15 A bounds the torque.
+        # The approach current of 0.15 A limits the torque.
         assert watched.grip.slip.friction == pytest.approx(min(shown, 0.15 * 1.78))
 
 

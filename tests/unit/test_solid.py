@@ -125,7 +125,7 @@ def test_the_estimate_reaches_its_bound_for_any_shear(tip, counts):
                 assert [found.shear_x, found.shear_y] == pytest.approx(shear, rel=0.01, abs=0.1)
                 error = [found.d - d, found.tilt_x - tilt_x, found.tilt_y - tilt_y]
                 squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
-    # For 96 frames with three values each, the mean is 1 ± 0.08. It is larger where cells in
+    # For 96 frames with three values each, the mean is 1 ± 0.08. The mean is larger where cells in
     # tension carry no information.
     assert 0.7 < np.mean(squares) < 1.4
 
@@ -193,7 +193,7 @@ def test_dead_saturated_and_isolated_cells_are_excluded():
     truth = (0.005, 0.2, -0.1)
     frame = GRID.pressure(TIPS[0], RUBBER, *truth) + NOISE * rng.standard_normal(GRID.shape)
     frame[~active] = 0.0
-    frame[active & (frame > 45e3)] = 45e3  # This line clips 60 cells.
+    frame[active & (frame > 45e3)] = 45e3  # Clip 60 cells.
     frame[8, 20] = 200e3
     readings = Readings(saturation=45e3)
     found = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE, active=active, readings=readings)(frame)

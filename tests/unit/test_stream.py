@@ -189,7 +189,7 @@ def test_a_long_message_is_sent_in_pieces_and_received_whole(context, addresses,
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorInfo(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     served.publisher.settings(98.0, 0.5, facts)
-    served.settle()  # Otherwise, the first subscriber would receive it twice.
+    served.settle()  # Otherwise, the first subscriber would receive the message twice.
     socket = subscribe(context, addresses[0])
     assert receive(socket, served)[1]["settings"] == facts.settings
     served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)

@@ -95,8 +95,8 @@ def test_the_upright_law_does_not_use_the_angle(sense, angle_known, simulation):
 
 
 def test_solid_tips_bring_the_object_upright() -> None:
-    # Bonded rubber has no local minimum. The control law therefore uses a different spring, from
-    # the tips' own table.
+    # Bonded rubber has no local minimum. The control law therefore uses a different stiffness,
+    # computed from the contact table of these tips.
     sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
     simulation = {"object_angle": START}
     with SimulatedDaemon(

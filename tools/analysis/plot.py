@@ -53,7 +53,7 @@ LINES: dict[str, dict[str, Any]] = {
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
 _POINTS = 700  # maximum number of points per finger and panel; more points would overlap
-# Axis label, scale factor, field of the fingers or the object, and field of its goal.
+# Axis label, scale factor, field of the value, and field of the goal.
 _AGAINST_TIME = (
     ("force F [N]", 1.0, "force", "goal_force"),
     ("object angle [°]", DEGREES, "angle", "goal_angle"),

@@ -101,9 +101,9 @@ class Way(NamedTuple):
     tips: Sections = _DEFAULT
     aim: float | None = None
     is_steered: bool = False  # True if the measured angle is controlled to 0
-    law: Callable[[SimulatedDaemon], Grip] | None = None  # replacement for the daemon's law
+    law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's control law
     force: float = _FORCE
-    # Load along x and y [N], which is applied once the grip is established.
+    # Load along x and y after the grip is established [N].
     weight: tuple[float, float] = (0.0, 0.0)
 
 
@@ -163,9 +163,9 @@ LATE_LIMITS = {
     for name, (control, law) in _STEERED_LAWS.items()
     for delay in DELAYS
 }
-# After the shear has relaxed, the energy minimum of tips without tangential coupling has four times
-# the curvature of spring tips. If the tangential stiffness is less than three quarters of the
-# default, the energy has a maximum instead of a minimum.
+# Compared with relaxed spring tips, tips without tangential coupling have four times the energy
+# curvature at θ = 0. If the tangential stiffness is less than three quarters of the default, the
+# energy has a maximum at θ = 0.
 _TIPS: dict[str, Sections] = {
     "solid": SOLID,
     "without tangential coupling": {"simulation": {"tip_law": "bristles"}},

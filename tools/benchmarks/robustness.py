@@ -26,7 +26,7 @@ from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
 # Time limit for establishing the hold, duration of the undisturbed hold, and observation time [s].
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
-# Limits of the relative force error, and limit of the displacement [m].
+# Two limits of the relative force error, and the displacement limit [m].
 _ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01
 _REPORT_TIME_MAX = 2.0  # time limit for reporting a force error above `_ERROR_MAX` [s]
 # Limits without a load: ratio of force to requested force, and time above this ratio [s].

@@ -20,7 +20,7 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 EXCESS_RATIO = 1.3  # ratio of force to requested force above which the force is excessive
 LOST_SLIDE = 0.1  # displacement along the faces above which the object counts as lost [m]
-_TORQUE_ERROR = 0.1  # maximum relative torque constant error
+_TORQUE_ERROR = 0.1  # maximum relative error of the torque constant
 # Goal current that counts as a reaction, relative to the current during the hold.
 _INCREASED_RATIO = 1.25
 _AVERAGING_TIME = 0.5  # final part of the hold over which the force is averaged [s]
@@ -38,7 +38,7 @@ class Watch:
         self.slid = 0.0  # object displacement while torque is on [m]
         # Pairs of time [s] and force relative to the requested force.
         self._mean: list[tuple[float, float]] = []
-        self._below = math.inf  # time since which the force has been above the limit [s]
+        self._below = math.inf  # time at which the force last rose above the limit [s]
         self._place: Sequence[float] = ()
 
     def see(self, t: float, forces: Sequence[float], place: Sequence[float], torque: bool) -> None:

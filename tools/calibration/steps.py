@@ -64,10 +64,10 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-# Relative softening after the first loads above which a warning is given. Test plates and noise
-# cause less softening.
+# A warning is given if the rubber softens by more than this fraction after the first loads. The
+# test plate and noise cause smaller changes.
 _SOFTENS = 0.03
-# New calibration, summary line, and panels of the plot.
+# New calibration, summary line, and plot panels.
 Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 

@@ -23,7 +23,8 @@ from typing import Any, TextIO
 
 from softfinger.daemon.own_files import write_text
 
-# Maximum number of lines queued for a slow reader. The oldest lines are dropped.
+# Maximum number of lines queued for a slow reader. If the queue is full, the oldest line is
+# dropped.
 _LINE_COUNT_MAX = 1000
 _PRIORITIES = {"error": "<3>", "warning": "<4>", "": "<6>", "info": "<6>"}  # see sd-daemon(3)
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}

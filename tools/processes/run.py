@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.no_task:
         settings = settings.model_copy(update={"task": TaskSettings()})
     signals = Signals()
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # Ignore the signal until the loop runs.
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # Ignore SIGUSR1 until the loop runs.
     try:
         log = EventLog(arguments.log, arguments.log_file)
     except OSError as error:

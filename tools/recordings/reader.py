@@ -37,7 +37,7 @@ _CHUNK_SIZE_MAX = 64 << 20  # unpacked chunk size limit [bytes]; chunks usually 
 # time.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
-_OTHERS_NAMED_MAX = 3  # maximum number of other programs' channels that a warning lists
+_OTHERS_NAMED_MAX = 3  # maximum number of other programs' channels in a warning
 _FIELD_COUNT_MAX = 500  # maximum number of fields per message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # record header with kind and content size
@@ -107,7 +107,7 @@ class Recording:
         self.end = math.nan
         self.chunks = 0
         self._first = 0  # log time of the earliest message [ns]
-        self._left = 0  # remaining limit for unpacked data [bytes]
+        self._left = 0  # number of bytes that may still be unpacked
         self._names: dict[int, str] = {}  # maps channel numbers to channel names
         self._other_names: dict[int, str] = {}
         try:
@@ -163,7 +163,7 @@ class Recording:
     @cached_property
     def zero(self) -> int:
         """Daemon clock time of the first message [ns], which is the origin of all times ``t``."""
-        state = self._left, self.chunks  # The loop changes these variables.
+        state = self._left, self.chunks  # Save the variables that the loop changes.
         for _, message in self.messages():
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
             if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):

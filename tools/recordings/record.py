@@ -60,8 +60,8 @@ _PROGRESS_INTERVAL = 0.5  # time between two progress lines, and between two flu
 _BATCH_SIZE = 1000  # number of messages between time checks
 
 
-# If the recorder is killed, only the incomplete chunk is lost. The chunk contains the messages
-# since the last flush.
+# If the recorder is killed, only the incomplete chunk is lost. The incomplete chunk contains the
+# messages since the last flush.
 CHUNK_SIZE = 256 * 1024  # chunk size before compression [bytes], 0.2 s of state at 1 kHz
 
 
@@ -167,7 +167,7 @@ class RecordingWriter:
             channel, convert = self._channels[key]
             try:
                 data = self._dumps(convert(message))
-            except TypeError:  # orjson also raises this for values that JSON cannot represent.
+            except TypeError:  # orjson raises TypeError for values that JSON cannot represent.
                 return
             sequence = message.get("seq")
             sequence = sequence & 0xFFFFFFFF if isinstance(sequence, int) else 0

@@ -37,7 +37,7 @@ STEP_ANGLE = math.radians(5.0)  # object rotation per arrow-key press [rad]
 # Upper limit of each force range [N], and force step in this range [N].
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
 _ACCUMULATION_TIME = 1.0  # time within which key presses are combined [s]
-_CONFIRMATION_TIME = 3.0  # time limit for confirming disarming with a second press of d [s]
+_CONFIRMATION_TIME = 3.0  # time limit for the second press of d, which confirms disarming [s]
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 

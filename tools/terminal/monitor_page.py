@@ -67,7 +67,7 @@ _KEYS_EXPLAINED = (
     ("+ -", "increase or reduce the force, including that of the current grip"),
 )
 
-# Label, field, factor, decimals, unit, and field of the standard deviation.
+# Label, field, scale factor, number of decimals, unit, and field of the standard deviation.
 _ROWS = (
     ("d", "d", 1e3, 2, "mm", "d_std"),
     ("θ", "theta", math.degrees(1.0), 1, "°", "theta_std"),

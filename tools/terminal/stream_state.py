@@ -38,7 +38,7 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-RECENT_TIME = 3.0  # time window for the total wait of a simulated hand [s]
+RECENT_TIME = 3.0  # period over which the waits of a simulated hand are summed [s]
 EVENT_COUNT_MAX = 200  # number of stored events
 GLOSSARY = (  # meanings of the terms on the pages
     ("d", "displacement of the tip by the object's face"),
@@ -123,12 +123,12 @@ class StreamState:
     def __init__(self) -> None:
         self.state = read(schema.HandState, None)
         self.state_time = -math.inf
-        self.mode = self.fault = ""  # values of the last state
+        self.mode = self.fault = ""  # mode and fault of the last state
         self.frames: dict[str, ShownFrame] = {}
         self.events: list[ShownEvent] = []
         self._news: deque[ShownEvent] = deque(maxlen=EVENT_COUNT_MAX)
         self._event_times: deque[tuple[float, float]] = deque(maxlen=2 * EVENT_COUNT_MAX)
-        self.times: schema.LoopStatistics | None = None  # statistics of all previous ticks
+        self.times: schema.LoopStatistics | None = None  # statistics of all ticks so far
         # A warning is shown if a servo is predicted to reach its temperature limit within this time
         # [s].
         self.heat_warning_time = 0.0
@@ -194,8 +194,8 @@ class StreamState:
         )
 
     def _read_event(self, event: schema.Event, _: float) -> None:
-        # A late subscriber receives repeated events with their original seq and time. An event from
-        # another daemon has a different time.
+        # A late subscriber receives repeated events with their original seq and time. If the time
+        # differs, the event comes from another daemon.
         name = event.seq, event.timestamp
         if event.again and name in self._event_times:
             return
@@ -330,7 +330,7 @@ class Commander:
     reply to a stop.
     """
 
-    OPEN_LIMIT = 8  # maximum number of open commands; more commands are dropped, except stop
+    OPEN_LIMIT = 8  # maximum number of open commands; further commands are dropped, except stop
 
     def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
         self._context = context

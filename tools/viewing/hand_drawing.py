@@ -181,10 +181,10 @@ def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
 
 # Picture coordinates are measured in cells from the corner of the first cell, with x along the
 # columns and y along the rows. In the sensor's axes, the footprint for displacement d and outward
-# normal n is an ellipse. With h = a − d and ρ² = 2ad − d², its centre is h·(n_x, n_y), and its
-# semi-axes are ρ n_z along the tilt and ρ across the tilt. The pressure centroid is at (a −
-# d/3)·(n_x, n_y). This position is exact for any constant modulus and a close approximation for a
-# measured material law.
+# normal n is an ellipse. With h = a − d and ρ² = 2ad − d², the centre of the ellipse is h·(n_x,
+# n_y), and the semi-axes are ρ n_z along the tilt and ρ across the tilt. The pressure centroid is
+# at (a − d/3)·(n_x, n_y). The centroid position is exact for any constant modulus, and a close
+# approximation for a measured material law.
 
 
 def grid_of(frame: TactileFrame) -> SensorGrid | None:

@@ -45,9 +45,9 @@ from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
-_WAITING_COUNT_MAX = 40  # maximum number of commands awaiting a reply, over all pages
+_WAITING_COUNT_MAX = 40  # maximum number of commands of all pages that await a reply
 _REQUEST_TIMEOUT = 5.0  # timeout for a request's header [s], long enough for a busy browser
-_NAME_LENGTH_MAX = 40  # maximum number of characters of a command name that are displayed
+_NAME_LENGTH_MAX = 40  # maximum number of displayed characters of a command name
 _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
 _BUFFER_SIZE = 256 << 10  # maximum amount of data queued for a page or a Foxglove client [bytes]
 _MESSAGE_SIZE_MAX = 65536  # maximum size of a message from a page or a Foxglove client [bytes]

@@ -153,7 +153,7 @@ class Pictures:
         self._period = period
         self._number = 0  # number of rows so far
         self._marks: list[Any] = []
-        self.recording: dict[str, Any] = {}  # status that the page's recorder sets
+        self.recording: dict[str, Any] = {}  # status of the page's recorder
         self._settings_text = ""  # last settings message, unparsed
         self.seen = self.unreadable = 0  # number of states; number of unreadable messages
         self.clear()
@@ -188,7 +188,7 @@ class Pictures:
             if number(message, "seq") < self.feed.state.seq:
                 self._begin_rows()  # The daemon was restarted.
             elif self.states and self.time // STEP != stamp // STEP:
-                last = self.feed.state  # last state before the new row
+                last = self.feed.state  # last state of the previous time step
                 self._past.append((last, Row(self._number, _packed(_row(self._number, last)))))
                 self._number += 1
             self.time = stamp
