@@ -37,7 +37,7 @@ def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
     return found
 
 
-# Timing by the doctor
+# Timing measured by the doctor
 
 
 def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running):
@@ -100,7 +100,7 @@ def test_assessment_of_exchange_times():
     assert judge_exchanges(ExchangeTimes(1.0, 1.0, 1.0, 1.0), Settings(), "50").status == "FAIL"
 
 
-# Tests on connecting
+# Checks during connection
 
 
 def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bus):

@@ -65,7 +65,7 @@ _ENCODER = ("fast", "strayed", "jumped", "numb")
 # faults in which the servo does not receive the torque-off command
 _UNHEARD = ("silent", "gone", "deaf")
 _WATCHDOG = 100  # number of ticks until the servo watchdogs stop the motors (0.2 s)
-_LOST = 20  # number of consecutive lost goals after which the daemon must detect the fault
+_LOST = 20  # number of consecutive lost goals after which the loss is reported
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
 # Faults of a sensor or of a current measurement, each with its range of values and the channel that
 # may be named.

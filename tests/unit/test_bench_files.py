@@ -207,7 +207,7 @@ def test_a_cell_that_is_nan_in_all_frames_is_dead(press, tmp_path):
     check(tmp_path / "a.asf")
 
 
-# Exports of other locales
+# Exports from other locales
 
 LOCALES = {
     "decimal commas, semicolons": {"point": ",", "separator": ";"},

@@ -51,7 +51,7 @@ def test_a_constant_load_below_static_friction_causes_no_creep(share):
 
 
 def test_an_oscillating_load_below_static_friction_causes_no_drift():
-    # In this case, a LuGre joint would creep in each period (Dupont et al., 2002).
+    # With the LuGre model, the joint would creep in each period (Dupont et al., 2002).
     hand = joint()
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
     phases = np.arange(0.0, 60.0, 0.02) * 2.0 * math.pi

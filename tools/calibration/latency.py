@@ -32,7 +32,8 @@ _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
 # Accepted range for the ratio of d from frames to d from joints. A ratio outside this range means
 # that the frames do not follow the joints.
 _SCALE = 0.5, 2.0
-_MISFIT_MAX = 0.3e-3  # maximum rms residual [m]; sliding, tilting or a second contact increases it
+# Maximum rms residual [m]. Larger values indicate sliding, tilting or a second contact.
+_MISFIT_MAX = 0.3e-3
 # Relative errors of d from frames. The first error applies if d is estimated from the frame shape,
 # and the second error applies if d is estimated from the frame amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2

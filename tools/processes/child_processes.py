@@ -95,7 +95,7 @@ class MonitorProcess:
                 break
             except subprocess.TimeoutExpired:
                 end()
-        # If the monitor was killed, the screen still shows its page.
+        # If the monitor was killed, the monitor page is still on the screen.
         if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
