@@ -97,7 +97,7 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
     s = np.sqrt(samples.d)
     hertz = 4 / (3 * (1 - poisson**2)) * s**3
     of_energy, of_push = energy_terms(s, samples.theta)
-    # Differences in U and N between meshes with this cell width, at each contact radius s.
+    # Scatter of U and N between meshes, for this cell width and each contact radius s.
     scatter = 1e-4 + np.concatenate([0.05 * (step / s) ** 2, 0.2 * (step / s) ** 2 + 5e-4])
     right = np.concatenate([samples.energy / (0.4 * hertz * s**2) - 1, samples.push / hertz - 1])
     left = np.concatenate([of_energy, of_push])

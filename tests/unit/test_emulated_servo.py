@@ -287,7 +287,7 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     c.write(reg.BUS_WATCHDOG, 5, 1)
     c.write(reg.GOAL_CURRENT, 40, 2)
     c.write(reg.GOAL_POSITION, 4000, 4)
-    for _ in range(20):  # Regular packets prevent a trip of the watchdog.
+    for _ in range(20):  # Regular packets keep the watchdog from tripping.
         c.later(0.09)
         assert c.read(reg.BUS_WATCHDOG, 1) == 5
     assert c.bus.plant.dq[0] > 0.0

@@ -36,7 +36,7 @@ COLOURS = {
     OBJECT: (0, 158, 115),
 }
 
-_ARROW_SCALE = 1.6e-3  # length of a force arrow [m/N]
+_ARROW_SCALE = 1.6e-3  # length of a force arrow per newton [m/N]
 _ARROW_MAX = 0.045  # maximum length of a force arrow [m]
 _HALF_TURN = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 _TURN = np.linspace(0.0, 2.0 * np.pi, 61)
