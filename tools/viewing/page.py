@@ -45,7 +45,7 @@ from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
-_WAITING_COUNT_MAX = 40  # maximum number of commands of all pages that await a reply
+_WAITING_COUNT_MAX = 40  # maximum total number of commands awaiting a reply
 _REQUEST_TIMEOUT = 5.0  # timeout for a request's header [s], long enough for a busy browser
 _NAME_LENGTH_MAX = 40  # maximum number of displayed characters of a command name
 _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)

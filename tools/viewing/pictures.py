@@ -50,7 +50,7 @@ _DARK_SIGMA = 2.0  # minimum visible pressure, in standard deviations of the cel
 _FULL_SCALE_MIN = 10.0  # minimum full scale, in standard deviations of the cell noise
 _OLD_TIME = 0.35  # minimum age at which a message is shown as old [s]
 _OLD_PERIODS = 4.0  # minimum age at which a message is shown as old, in stream periods
-_NUMBER_MAX = 1e6  # limit for drawn numbers, because messages may contain any value
+_NUMBER_MAX = 1e6  # limit for drawn numbers; messages may contain any value
 _DEGREE = math.degrees(1.0)
 
 
