@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 CHANGELOG = "CHANGELOG.md"
-# Lines that state the version, date or year of the release: file, quantity and pattern.
+# File, quantity and pattern of each line that states the version, date or year of the release.
 RELEASE_LINES = (
     ("softfinger/__init__.py", "version", r'(?m)^(__version__ = ")(.*)(")$'),
     ("lerobot_robot_softfinger/pyproject.toml", "version", r'(?m)^(version = ")(.*)(")$'),

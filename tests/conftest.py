@@ -206,7 +206,7 @@ def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
         waited = time.monotonic() - begin
         if waited > seconds:
             raise TimeoutError(f"not within {seconds:g} s: {condition}")
-        # Sleep so that the awaited process gets the processor.
+        # Sleep, so that the awaited process can use the processor.
         select.select([], [], [], min(0.002 + 0.01 * waited, 0.02))
 
 

@@ -224,7 +224,7 @@ def _main(argv: Sequence[str] | None) -> int:
         # The reader has closed the pipe, as with `| head`. Discard the remaining output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except SettingsError as error:  # The error has one line per key.
+    except SettingsError as error:  # The error message has one line per key.
         print(error, file=sys.stderr)
         return 2
     except SoftfingerError as error:

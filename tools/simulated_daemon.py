@@ -26,7 +26,7 @@ class TrueStates:
     t: NDArray[np.float64]  # s
     force: NDArray[np.float64]  # force per tip [n, 2] [N]
     angle: NDArray[np.float64]  # rad
-    slip: NDArray[np.float64]  # ratio |T|/μN, the larger one of both tips
+    slip: NDArray[np.float64]  # maximum of |T|/μN over both tips
 
     def since(self, index: int) -> TrueStates:
         """Return the record from tick ``index`` on."""

@@ -75,7 +75,7 @@ class StopCondition:
 
     def wake(self, *_: object) -> None:
         """Interrupt a wait."""
-        # Do not use an Event here, because the interrupted thread may hold its lock.
+        # Do not use an Event here, because the interrupted thread may hold the lock of the Event.
         with contextlib.suppress(BlockingIOError):  # A full buffer also wakes the thread.
             self._wake.send(b"!")
 
@@ -96,7 +96,7 @@ class Interrupted(BaseException):
     """A signal arrived before the daemon was running; deliberately not an `Exception` subclass."""
 
 
-# By default, these signals end the process immediately, so that only the servo watchdog would
+# By default, these signals end the process immediately, and only the servo watchdog would then
 # switch torque off. SIGHUP means that the terminal was closed.
 _TERMINATING = available_signals("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
 

@@ -150,7 +150,7 @@ class Sweep(Generic[Case, Result]):
                 if len(self._results) > before:
                     before, workers = len(self._results), processes
                 elif workers > 1:
-                    # Run one case at a time to identify the case that crashes its worker.
+                    # Run one case at a time to identify the case that crashes a worker.
                     workers = 1
                 else:
                     case = self._cases[self._left()[0]]

@@ -25,8 +25,8 @@ class SoftfingerConfig(RobotConfig):
     full_scale: float = FULL_SCALE  # pressure shown as white in images [Pa]
     least_force: float = 0.5  # minimum grip force [N]; a smaller `grip.force` opens the hand
     timeout: float = 5.0  # timeout for a reply, a state or a frame [s]
-    start_timeout: float = 120.0  # timeout [s] for the first state; the daemon may be compiling
-    disarm_on_disconnect: bool = True  # If True, the hand drops the object on disconnection.
+    start_timeout: float = 120.0  # timeout for the first state [s], including compilation
+    disarm_on_disconnect: bool = True  # True if the hand drops the object on disconnection
 
     def __post_init__(self) -> None:
         super().__post_init__()

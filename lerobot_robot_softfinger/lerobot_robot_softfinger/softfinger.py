@@ -57,7 +57,7 @@ class Softfinger(Robot):
         config = self.config
         hand = Hand(config.address, client="lerobot", timeout=config.timeout, keys=config.keys)
         try:
-            # The daemon's first start is slow because of compilation.
+            # The first start of the daemon is slow, because the daemon compiles the kernels.
             hand.state(config.start_timeout)
             hand.status()
             self._waiting = hand.frames()

@@ -24,7 +24,7 @@ Arrays = dict[str, NDArray[Any]]
 BASES = ("bonded", "lying")
 STICKING = "-sticking"
 BLOCKS = tuple(base + face for face in ("", STICKING) for base in BASES)
-HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are used for validation instead of the fit
+HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are used for validation only
 
 
 def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:

@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from research.solid_tip.green import FloatArray, Green
 
-# Cells up to this distance outside the undeformed overlap may be in contact (in units of a).
+# Cells may be in contact up to this distance outside the undeformed overlap (in units of a).
 BEYOND = 0.06
 
 
@@ -45,7 +45,7 @@ class TiltedPlane:
         self.axes = axes = axes if sticking else axes[:1]
         m = np.arange(len(green.rings))[:, None, None]
         rings, places = [], []
-        self.parts = []  # slice of forces, loads (3, M, n) and shares (M, 1) of each ring
+        self.parts = []  # for each ring: slice of the forces, loads (3, M, n), shares (M, 1)
         count = 0
         for ring, (cells, (r, z)) in enumerate(zip(green.cells, green.place, strict=True)):
             phi = 2 * np.pi * (np.arange(cells // 2) + 0.5) / cells

@@ -24,10 +24,10 @@ from research.solid_tip.green import GAUSS, RING_EDGES, FloatArray, quadratic
 D_MAX, THETA_MAX = 0.4, np.radians(36.0)
 NU = (0.45, 0.4995)
 S_MAX = np.sqrt(D_MAX)
-ORDERS = (11, 6)  # numbers of coefficients in s and in sin²θ
+ORDERS = (11, 6)  # number of coefficients in s, and in sin²θ
 HARMONICS = 9
-# Cells beyond this radius are down-weighted, because the stress of a bonded tip is singular there
-# and the base of a lying tip ends there.
+# Cells beyond this radius are down-weighted, because a bonded tip has a stress singularity at the
+# rim, and the base of a lying tip ends at the rim.
 RIM = 0.95
 
 
@@ -97,7 +97,7 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
     s = np.sqrt(samples.d)
     hertz = 4 / (3 * (1 - poisson**2)) * s**3
     of_energy, of_push = energy_terms(s, samples.theta)
-    # Scatter of U and N between meshes for this contact radius s and cell width.
+    # Scatter of U and N between meshes, for this cell width and each contact radius s.
     scatter = 1e-4 + np.concatenate([0.05 * (step / s) ** 2, 0.2 * (step / s) ** 2 + 5e-4])
     right = np.concatenate([samples.energy / (0.4 * hertz * s**2) - 1, samples.push / hertz - 1])
     left = np.concatenate([of_energy, of_push])
@@ -108,7 +108,7 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
 def push_of(energy: FloatArray) -> FloatArray:
     """Convert coefficients of V to those of Q = 6/5 V + s/5 ∂V/∂s in N = N_Hertz (1 + s Q)."""
     slope = chebyshev.chebder(energy, axis=0) * (2 / S_MAX)
-    s = np.array([S_MAX / 2, S_MAX / 2])  # the variable s as a Chebyshev series
+    s = np.array([S_MAX / 2, S_MAX / 2])  # Chebyshev series of the variable s
     product = np.apply_along_axis(lambda row: chebyshev.chebmul(s, row), 0, slope)
     return np.asarray(1.2 * energy + 0.2 * product[: len(energy)])
 
@@ -147,7 +147,8 @@ def fit(
     for m in range(HARMONICS):
         weight = np.sqrt(areas * (1.0 if m == 0 else 0.5)) * np.where(RING_EDGES[1:] > RIM, 0.05, 1)
         flat = patterns[:, :, m] * weight
-        # Include the base moment, so that the modes reproduce it despite the low weight of the rim.
+        # Include the base moment, so that the modes reproduce this moment despite the low weights
+        # at the rim.
         moment = (m == 1) * 2.0 * patterns[:, :, m] @ levers
         flat = np.concatenate([flat, moment[..., None]], axis=-1)
         _, size, rows = np.linalg.svd(flat.reshape(-1, areas.size + 1), full_matrices=False)
@@ -211,7 +212,7 @@ class SolidTip:
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
         """Average the pressure over cells of a square grid centred under the tip; rows along y."""
-        parts, turns = 10, 2000  # number of radial and angular pieces of each ring
+        parts, turns = 10, 2000  # numbers of radial and angular pieces per ring
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,
             np.arange(self.edges.size),

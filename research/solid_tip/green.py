@@ -24,8 +24,8 @@ from scipy.sparse.linalg import splu
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Rings of the base. The elements are small at the rim, where the stress of a bonded base is
-# singular. The elements are mirrored beyond the rim, because a lying base spreads.
+# Ring edges on the base. The rings are narrow at the rim, where the stress of a bonded base is
+# singular. The rings continue beyond the rim as a mirror image, because a lying base spreads.
 RING_EDGES = np.sin(np.linspace(0, np.pi / 2, 97))
 RING_EDGES = np.concatenate([RING_EDGES, 2 - RING_EDGES[RING_EDGES > 0.8][-2::-1]])
 MIDDLES = (RING_EDGES[1:] + RING_EDGES[:-1]) / 2
@@ -60,7 +60,8 @@ class Meridian:
         radius, angle = (
             np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2])) for ends in (radii, angles)
         )
-        # Node (i, j) has radius i and polar angle j. All nodes with i = 0 are the origin, node 0.
+        # Node (i, j) has the i-th radius and the j-th polar angle. All nodes with i = 0 are at the
+        # origin and share the number 0.
         number = np.arange(radius.size * angle.size).reshape(radius.size, angle.size)
         number = np.maximum(number - angle.size + 1, 0)
         self.number = number

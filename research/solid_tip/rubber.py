@@ -36,12 +36,12 @@ from research.solid_tip.green import (
 )
 
 WEDGE = 0.1  # angle of the wedge [rad]
-# Stiffness, in units of E, of the spring that holds the mean position of a base that is not bonded.
+# Stiffness of the spring that holds the mean position of an unbonded base, in units of E.
 STIFF = 1e3
 HARMONICS = 9
 AZIMUTHS = 48  # number of azimuths at which the base pressure is evaluated
 SLICES = 8
-ROOTS = np.linspace(0.2, np.sqrt(0.4), 8)  # √(d/a) of the presses
+ROOTS = np.linspace(0.2, np.sqrt(0.4), 8)  # √(d/a) of each press
 REACHED = 0.5  # minimum undeformed height of nodes that the plane may touch [a]
 CHUNK = 64  # number of elements that are processed at once
 
@@ -53,7 +53,7 @@ class Strained(NamedTuple):
     push: float  # normal force N
     shear: float  # force against the tip along (cos θ, 0, −sin θ)
     energy: float
-    base: FloatArray  # harmonics of the base pressure versus radius on the sensor, shape (H, R)
+    base: FloatArray  # harmonics of the base pressure as a function of the radius, shape (H, R)
 
 
 class State(NamedTuple):
@@ -341,7 +341,7 @@ class Body:
     def _solve_at_rest(self, right: FloatArray, known: FloatArray) -> FloatArray:
         """Solve for linear elements as in `solve`, using the response to forces on the face."""
         assert self.moves is not None
-        # From the start, all forces are in equilibrium, except for those on the face.
+        # From the start, all forces except those on the face are in equilibrium.
         given = ~np.isnan(known[self.pushed])
         load = right[self.pushed]
         if given.any():
@@ -393,7 +393,7 @@ class Body:
         depth, before, touching, held = state
         held = held.copy()
         target = (1 - d) - self.reach
-        room = before[self.normal] - ((1 - depth) - self.reach)  # ≤ 0; the plane moves by d − depth
+        room = before[self.normal] - ((1 - depth) - self.reach)  # gap to the plane at `depth`, ≤ 0
         motion, pressures = before.copy(), self.pressures(before, 0 * before)
         touching = touching | (target < 0.3 * target.min()) if not touching.any() else touching
         size = 1.0

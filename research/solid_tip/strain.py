@@ -29,8 +29,8 @@ from research.solid_tip.rubber import HARMONICS, strained
 NU = fit.chebyshev_nodes(*fit.NU, 3)
 SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
 AREAS = np.pi * np.diff(RING_EDGES**2)
-# For each block, the indices of sin²θ in `SINES` to press, and the values of ν. At the far corner
-# of the domain, the elements of lying rubber are crushed and the solution does not converge, so the
+# Tilts computed for each block, as a map from indices of `SINES` to values of ν. At the largest
+# depth and tilt, the elements of lying rubber collapse and the solution does not converge, so the
 # fit extrapolates there.
 TILTS = {
     "bonded": {1: NU[1:2], 2: NU[1:2], 4: NU[1:2]},
@@ -58,7 +58,7 @@ where the base has slid. force_error and pressure_error are the errors of N and 
 where the pressure is smooth (within 0.95 a), compared with other meshes, for d up to 0.35 a and θ
 up to 20°. Maximum and rms errors of the fit:
 {errors}"""
-# Errors determined from the presses in tests/harness/solid_reference.py. A coarse mesh hardly
+# Errors determined from the results of tests/harness/solid_reference.py. A coarse mesh hardly
 # resolves the rim of a tilted bonded base.
 FORCE_ERROR = 0.005
 PRESSURE_ERROR = {"bonded": 0.01, "lying": 0.004}
@@ -177,8 +177,8 @@ class Strain:
         rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
         first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
         shear, harmonics = through(self.sines, shears), through(self.sines, bases)
-        # At small tilts, the higher harmonics are very small. After division by sin^m θ, they
-        # contain only mesh errors.
+        # At small tilts, the higher harmonics are very small. After division by sin^m θ, only mesh
+        # errors would remain.
         least = len(self.sines) > 1
         higher = through(self.sines[least:], bases[least:])
 

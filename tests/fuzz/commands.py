@@ -63,7 +63,7 @@ def some_message(rng: random.Random) -> bytes:
         return rng.randbytes(rng.randrange(0, 200))
     if kind < 0.12:
         return rng.randbytes(rng.choice((_MAX_BYTES - 1, _MAX_BYTES + 1, 4 * _MAX_BYTES + 1)))
-    if kind < 0.15:  # These messages are nested, or have lengths that exceed the data.
+    if kind < 0.15:  # The value is deeply nested, or its length exceeds the data.
         deep = rng.choice((b"\x91" * 3000, b"\x81\xa1a" * 1000, b"\xdf\xff\xff\xff\xff"))
         return deep + rng.randbytes(rng.randrange(8))
     try:

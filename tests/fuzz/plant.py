@@ -12,7 +12,7 @@ from softfinger.kinematics.compiled.kernel import kernel
 from tests.fuzz import Report
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 
-LONGER = 10  # factor by which the step of one in three hands is multiplied
+LONGER = 10  # One in three hands uses a time step that is longer by this factor.
 EACH = 400  # number of commands per hand
 SHAPES = ("rectangle", "rectangle", "disc", "wedge", "none")
 # The columns are joint, mode, torque on, goal, current, three load components, load set, reset,

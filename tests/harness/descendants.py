@@ -47,7 +47,7 @@ def end_with_this_process() -> None:
     os.environ["TESTS_OF_PROCESS"] = str(os.getpid())
 
 
-# Processes whose standard input closes when this process ends.
+# Processes whose standard input closes when this process exits.
 _watching: list[subprocess.Popen[bytes]] = []
 
 
@@ -56,7 +56,7 @@ def running(process: int | None = None) -> set[int]:
     tasks = Path(f"/proc/{process or os.getpid()}/task").glob("*/children")
     found: set[int] = set()
     for task in tasks:
-        with contextlib.suppress(OSError):  # The task has ended.
+        with contextlib.suppress(OSError):  # The thread has ended.
             found |= set(map(int, task.read_text().split()))
     return found
 

@@ -24,7 +24,7 @@ from softfinger.tools.cli import main, make_parser
 from softfinger.tools.terminal.status import describe
 from tests.harness.daemon_process import SOFTFINGER, Running
 
-_BUSY = "DOCUMENTED_BUSY"  # marks processes started by a command, which run separately
+_BUSY = "DOCUMENTED_BUSY"  # environment variable that makes `softfinger` run as a separate process
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
 # Commands with one of these options exit on their own, so the tests run them.
 _ENDS = {"--record", "--recompute"}
@@ -97,7 +97,7 @@ class Softfinger:
             return _await(words[1])
         if name == "emulate" and "--send" not in words:
             return self._emulate(words)
-        if name == "run":  # For a recording, `run` uses the default addresses.
+        if name == "run":  # A recording uses the default addresses.
             for each in ("stream", "commands"):
                 words += ["--set", f"{each}.address=ipc://{Path.cwd()}/{each}"]
             return subprocess.run([*SOFTFINGER, *words, "--duration", "1"], check=False).returncode

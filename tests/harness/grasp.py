@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 # Equilibrium tolerance relative to the contact forces. Rounding errors are about 1e-14.
 _TOLERANCE = 1e-11
-_STEP = 1e-6  # Step for force differences, in rad for rotations and in tip radii for displacements.
+_STEP = 1e-6  # Step for finite differences of forces, in rad or in tip radii.
 
 
 class GraspError(SoftfingerError, ValueError):
@@ -69,7 +69,7 @@ class GraspState:
 class GraspForces:
     """Grasp forces, each of shape (2,), left finger first."""
 
-    force: FloatArray  # force F on the tip's base, which is the sum over a pressure grid [N]
+    force: FloatArray  # force F on the tip's base, equal to the sum over a pressure grid [N]
     normal: FloatArray  # N [N]
     tangential: FloatArray  # T [N]
     turning: FloatArray  # ∂U/∂θ, the moment that turns the object relative to the tip [N·m]

@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from tests.conftest import until
 
-WAIT = 60.0  # time-out for one reply [s]
+WAIT = 60.0  # timeout for one reply [s]
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _FLAGS = (
     "--headless=new",
@@ -57,7 +57,7 @@ class Browser:
                 pages[:] = [each for each in json.load(answer) if each["type"] == "page"]
             return bool(pages)
 
-        until(listed)  # The browser opens its first page after it starts listening.
+        until(listed)  # The browser starts listening before it opens its first page.
         waits: Any = {"open_timeout": WAIT, "ping_interval": None}
         url = pages[0]["webSocketDebuggerUrl"]
         self._socket = connect(url, proxy=None, max_size=None, **waits).__enter__()

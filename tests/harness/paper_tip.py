@@ -48,7 +48,7 @@ def dense(
     grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
 ) -> np.ndarray[Any, Any]:
     """Return the blurred pressure averaged over cells, with ``pieces`` samples per cell side."""
-    from scipy.ndimage import gaussian_filter  # This import is slow, and few tests need it.
+    from scipy.ndimage import gaussian_filter  # Importing SciPy is slow; few tests need it.
 
     d, tilt_x, tilt_y = contact
     axes = []

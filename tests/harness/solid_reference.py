@@ -20,7 +20,7 @@ BLOCKS = ("bonded", "lying", "bonded-sticking", "lying-sticking")
 # Block, tilt [°], mesh, slices, and depths [mm] of the stored frames.
 COARSE = Meridian(9, 2, 0.2)
 TILTED = (
-    ("bonded", 15.0, Meridian(9, 8, 0.2), 8),  # This mesh is refined at the rim.
+    ("bonded", 15.0, Meridian(9, 8, 0.2), 8),  # mesh that is refined at the rim
     ("bonded", 20.0, COARSE, 10),
     ("lying", 15.0, COARSE, 9),
 )

@@ -10,7 +10,7 @@ from websockets.sync.client import connect
 
 from tests.harness.daemon_process import SOFTFINGER
 
-WAIT = 60.0  # time-out for one picture [s]
+WAIT = 60.0  # timeout for one picture [s]
 
 
 class Viewed:

@@ -52,8 +52,8 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
     found = load(file, folder)
     assert (found.servos.ids, found.servos.direction) == ((2, 1), (-1, 1))
     assert found.servos.zero == pytest.approx((1500, 5300), abs=5)
-    # The emulated stops are 0.05 rad outside the limits. Of this distance, 0.03 rad are kept as a
-    # margin.
+    # The emulated stops are 0.05 rad outside the limits. The calibration keeps a margin of 0.03
+    # rad, so the limits move outwards by 0.02 rad.
     assert found.hand.q_min == pytest.approx((-0.42, -0.32), abs=0.01)
     assert found.hand.q_max == pytest.approx((0.92, 0.82), abs=0.01)
     assert "ids = [2, 1] # left, right" in file.read_text()

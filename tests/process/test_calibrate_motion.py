@@ -12,7 +12,8 @@ from tests.conftest import own_addresses
 from tests.harness.daemon_process import Running
 from tests.harness.emulated import HIL, EmulatorProcess
 
-# True values of the hand. The profile contains 0.05 and 0.015.
+# True friction [N·m], static friction [N·m] and latency [s] of the hand. The profile has a friction
+# of 0.05 N·m and a latency of 0.015 s.
 FRICTION, AT_REST, LATENCY = 0.09, 0.13, 0.035
 BYTES = 5.13e-3  # duration of a frame on the wire [s]
 COUNT = 1.78 * 2.69e-3  # torque per current count [N·m]
@@ -65,7 +66,7 @@ def test_friction_is_calibrated_by_sweeping_a_joint(hand, calibrate, capsys):
     assert (
         "keep the space around the fingers free; the joints will sweep left 0° to -23°" in told.err
     )
-    # At the sweep's velocities, a tenth of the additional static friction remains.
+    # At the sweep velocities, a tenth of the additional static friction remains.
     found = load(profile, profile.parent)
     assert found.control.joint_friction == pytest.approx(FRICTION, abs=2 * COUNT)
     shown = float(told.out.split("at break-away ")[1].split(" ")[0])

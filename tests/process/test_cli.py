@@ -59,7 +59,7 @@ def test_duration_and_settings_on_the_command_line(profile, inline):
 def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
     second = softfinger("run", "--config", str(daemon.profile))
     assert second.returncode == 1
-    # Both addresses are in use. The order of start-up determines which address is found first.
+    # Both addresses are in use. The start-up order determines which address is found first.
     taken = (f"stream.address: {daemon.addresses[0]}", f"commands.address: {daemon.commands}")
     assert any(f"{each} is in use; is another softfinger" in second.stderr for each in taken)
 
@@ -140,7 +140,7 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     socket.send_multipart([b"", b"x" * 5000])
     assert socket.poll(60_000)  # The gateway has also read all earlier requests.
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"
-    select.select([], [], [], 0.5)  # This is the stall.
+    select.select([], [], [], 0.5)  # Stall for half a second.
     daemon.running.process.send_signal(signal.SIGCONT)
     replies = []
     for _ in requests:
@@ -174,7 +174,7 @@ def test_a_client_waiting_for_its_reply_is_served_after_a_stall(daemon):
         hand.status()
         daemon.running.process.send_signal(signal.SIGSTOP)
         arming = pool.submit(hand.arm)
-        select.select([], [], [], 0.5)  # This is the stall.
+        select.select([], [], [], 0.5)  # Stall for half a second.
         daemon.running.process.send_signal(signal.SIGCONT)
         arming.result(60.0)
         assert hand.status()["torque"] is True

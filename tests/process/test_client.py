@@ -41,7 +41,7 @@ from tests.harness import fake_daemon
 from tests.harness.daemon_process import python
 from tests.harness.fake_daemon import FakeDaemon
 
-IN_VAIN = 6.0  # time in which a state arrives even on a busy machine [s]
+IN_VAIN = 6.0  # timeout of waits that must fail; a state arrives sooner even on a busy machine [s]
 
 
 @pytest.fixture
@@ -236,9 +236,9 @@ def test_a_cancelled_command_is_not_repeated(fake):
                 await arming
 
     fake.replies["arm"] = LATE
-    asyncio.run(cancelled())  # Cancellation waits for the attempt in progress.
+    asyncio.run(cancelled())  # The cancellation waits for the attempt in progress.
     count, published = len(fake.requests), fake.published
-    until(lambda: fake.published > published + 50)  # This takes half a second.
+    until(lambda: fake.published > published + 50)  # Wait for half a second.
     assert len(fake.requests) == count
 
 
@@ -252,7 +252,7 @@ def test_state_returns_a_current_state(fake, hand):
 
 def test_gaps_are_counted_with_the_step_of_the_topic():
     gaps = Gaps()
-    for seq in (5, 10, 16, 30, 36):  # The publisher sends one of five states, at any phase.
+    for seq in (5, 10, 16, 30, 36):  # The publisher sends every fifth state, starting at any state.
         gaps.take({"seq": seq, "seq_step": 5})
     assert gaps.lost == 2
     gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, which is not a loss.
@@ -454,10 +454,10 @@ def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeyp
     with pytest.raises(SettingsError, match=r"unknown host 'lab7' \(no address for lab7\)"):
         Hand("tcp://lab7")
     with Hand("ipc:///run/a,ipc:///run/b"):
-        pass  # This address has no host.
+        pass  # An IPC address has no host.
     monkeypatch.undo()
     with Hand("tcp://127.0.0.1:0;127.0.0.1:9872", "tcp://[::1]:9873"):
-        pass  # One address includes a source address; the other is numeric.
+        pass  # The first address includes a source address; the second is numeric.
 
 
 @pytest.mark.parametrize("words", [["monitor"], ["send", "stop"], ["status"], ["record", "a.mcap"]])
@@ -539,7 +539,7 @@ def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):
     left, right = fake_daemon.finger(0.0, 0), fake_daemon.finger(0.0, 1)
     fake.changes = {"left": left, "right": right}
     before = fake.published
-    until(lambda: fake.published > before + 1)  # All further states include the changes.
+    until(lambda: fake.published > before + 1)  # All later states include the changes.
     told = inline("status", "--address", fake.state_address)
     assert told.returncode == 0
     line = re.fullmatch(r"(\w+) (\S+) N \(\S+ ± \S+, \S+ ± \S+\), (\S+)°, (\S+) mm\n", told.stdout)

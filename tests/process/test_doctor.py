@@ -144,7 +144,7 @@ def test_boards_are_checked(hands, capsys):
     assert status == 1
     assert "256 cells" in next(line for line in lines if line.startswith("FAIL   tactile left"))
     assert "       → set tactile.rows and tactile.cols" in lines
-    assert scanned(capsys, hand.folder, "--wait", "1") == [  # The servos reply at any rate.
+    assert scanned(capsys, hand.folder, "--wait", "1") == [  # The servos reply at any baud rate.
         f"ID {servo} at 2000000, 1000000 baud: XM430-W350, firmware 48" for servo in (1, 2)
     ]
     assert main(["doctor"]) == 0
@@ -294,7 +294,7 @@ def test_the_process_using_a_port_is_named(terminal, locked):
 
 
 def test_latency_timer_is_checked_and_repaired(tmp_path, monkeypatch):
-    path, sysfs = "/dev/ttyUSB7", tmp_path / "sys"  # This is a fake adapter.
+    path, sysfs = "/dev/ttyUSB7", tmp_path / "sys"  # fake adapter
     timer = sysfs / "ttyUSB7" / "device" / "latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text("16\n")

@@ -197,11 +197,11 @@ def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connec
         """Read the joints at ``count``, which differs from the positions in earlier replies."""
         bus.call(lambda: bus.bus.plant.q.__setitem__(slice(2), count * RADIAN))
         backend.read(reading)
-        if reading.valid:  # The reply was late, and not only because this thread was suspended.
+        if reading.valid:  # The reading may also be invalid because this thread was suspended.
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")
-    # On a busy machine, few late replies are received, so this loop may take many readings.
+    # On a busy machine, few replies count as late, so this loop may need many readings.
     while backend.counters()["late"] <= 20 and reading.seq < 1000:
         at_another_place(reading.seq)
     bus.fault("late=0")
@@ -231,7 +231,7 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
     "what", ["the bus watchdog stopped the servo", "the bus watchdog is off, possibly because"]
 )
 def test_a_servo_that_stopped_by_itself_is_detected_despite_timely_writes(bus, connect, what):
-    # This happens if an adapter delays packets or if power is lost briefly.
+    # A servo may stop by itself if an adapter delays packets or if power is lost briefly.
     backend = connect(bus)
     backend.torque_on()
     goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()

@@ -17,12 +17,12 @@ from tests.soak.rig import Rig
 
 pytestmark = pytest.mark.extended
 FORCE = 6.0  # N
-# Total duration, and final interval used for means, in the emulated hand's time [s].
+# Total duration, and duration of the final interval for means, on the emulated hand's clock [s].
 LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"
 CURRENT = "left:current=2"
-REFUSED = "left:shift-x=3"  # fault after which the hand lets go
+REFUSED = "left:shift-x=3"  # fault after which the hand releases the object
 
 
 @contextlib.contextmanager
@@ -84,7 +84,7 @@ def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
         driven = any(servo["torque"] for servo in report["servos"])
         if report["t"] > begin + seconds or not driven:
             return
-        select.select([], [], [], 0.005)  # Leave the processor to the hand and the daemon.
+        select.select([], [], [], 0.005)  # Yield the processor to the hand and the daemon.
 
 
 def test_arming_while_the_joints_spring_back_on_a_busy_machine_is_no_fault(rig):
@@ -111,7 +111,7 @@ def test_a_sensor_fault_has_a_bounded_effect_and_is_the_only_one_reported(rig, l
     rig.send(lie)
     reports = list(watched(rig))
     assert max(max(report["force"]) for report in reports) < 1.3 * FORCE
-    if lie != GAIN:  # A gain error may be partly accepted, so it need not be reported.
+    if lie != GAIN:  # The estimator may accept part of a gain error without a report.
         until(lambda: any(false in line for line in rig.log()[before:]))
     assert not [line for line in rig.log()[before:] if "consistency." in line and false not in line]
     if lie == REFUSED:

@@ -113,7 +113,7 @@ def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues
         process.popen.send_signal(signal.SIGSTOP)
         assert servos.silent(7)
         process.popen.send_signal(signal.SIGCONT)
-        assert servos.ping(7) == 1200  # One of the two pings received this reply.
+        assert servos.ping(7) == 1200  # The emulator has answered one of the two earlier pings.
         servos.close()
         assert process.end(signal.SIGHUP) == (0, "", "")
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
@@ -239,7 +239,7 @@ def test_a_scene_creates_only_the_ports_it_needs(tmp_path):
 
 @pytest.mark.parametrize(("backend", "full"), [("glove", 1023), ("cobs", 65535)])
 def test_each_serial_framing_is_supported(tmp_path, backend, full):
-    # Without servos, the object is pressed against the tips periodically.
+    # Without servos, the emulator periodically presses the object against the tips.
     (tmp_path / "one.toml").write_text(
         f"""scene.fingers = ["left"]
 servos.backend = "none"
@@ -292,7 +292,7 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
             assert servos.ping(1) == 1020
         servos.close()
         assert capsys.readouterr().err == ""
-        # One invalid word invalidates the whole message.
+        # If one fault name is invalid, the emulator ignores the whole message.
         assert send(tmp_path, "silent=2 sillent=2") == 1
         assert "'sillent=2'" in capsys.readouterr().err
         assert SdkServos(tmp_path).ping(2) == 1020
@@ -329,7 +329,7 @@ def test_injected_faults_change_measurements_but_not_the_hand(tmp_path):
     log: list[str] = []
     faults = "right:drift=0.2@0.5..1", "left:current=3@0.5"
     with emulated(tmp_path, *faults, tell=log.append) as made:
-        until(lambda: board_mean(tmp_path, 1) > 48)  # The maximum is 255.
+        until(lambda: board_mean(tmp_path, 1) > 48)  # The full count is 255.
         assert board_mean(tmp_path, 0) < 10
         left, right = made.hand.measurement_faults
         assert (left("current", 9.0), right("current", 9.0)) == (3.0, 1.0)
@@ -355,7 +355,7 @@ def board_mean(folder: Path, finger: int) -> float:
 
 def test_an_object_is_put_back_and_moved_by_a_load(tmp_path):
     with emulated(tmp_path) as made:
-        made.hand.object_pose[:] = 0.07, 0.02, 1.2  # The object has slipped out of the grip.
+        made.hand.object_pose[:] = 0.07, 0.02, 1.2  # Place the object outside the grip.
         assert made.request("place report").startswith("{")
         until(lambda: np.allclose(made.hand.object_pose, (0.0, 0.08, 0.0), atol=1e-3))
         made.request("push=5")

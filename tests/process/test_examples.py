@@ -23,7 +23,7 @@ def test_grasp_and_turn_example(start, profile, addresses, tmp_path):
     assert re.sub(r"no .* from .* yet; waiting up to .* s\n", "", done.stderr) == ""
     ((states, lost),) = re.findall(r"(\d+) states, (\d+) lost", done.stdout)
     assert int(states) > 50
-    assert int(lost) < int(states)  # A gateway without processor time drops messages.
+    assert int(lost) < int(states)  # The gateway drops messages if it gets no processor time.
     force = float(re.findall(r"while holding: ([\d.]+) N", done.stdout)[0])
     assert force == pytest.approx(8.0, rel=0.1)
     pixels = imread(picture)[..., :3]

@@ -37,7 +37,7 @@ def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
     return found
 
 
-# Timing by the doctor
+# Timing measured by the doctor
 
 
 def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running):
@@ -51,7 +51,7 @@ def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running)
     assert found.text.startswith("50 read and write cycles: p50 ")
     until(lambda: len(re.findall(rb"\xff\xff\xfd\x00\xfe..\x83", heard, re.DOTALL)) == 50)
     reads = re.findall(rb"\xff\xff\xfd\x00\xfe..\x8a", heard, re.DOTALL)
-    assert len(reads) == 54  # The doctor first tests each of the four spans.
+    assert len(reads) == 54  # The doctor first reads each of the four register spans.
     assert [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)] == before
 
 
@@ -81,7 +81,8 @@ def test_assessment_of_exchange_times():
     assert near.text.endswith(
         "this takes most of a tick of 2 ms (loop.rate = 500), so ticks will be late"
     )
-    both = judged(0.0028, 0.003)  # This time is shorter than reply_timeout and longer than a tick.
+    # Both times are longer than a tick and shorter than reply_timeout.
+    both = judged(0.0028, 0.003)
     assert (both.status, both.fix.split(",")[0]) == ("FAIL", "set loop.rate = 260")
     assert (
         "expected at most 2 ms, the period of a tick (loop.rate = 500), and at most 4 ms"
@@ -99,7 +100,7 @@ def test_assessment_of_exchange_times():
     assert judge_exchanges(ExchangeTimes(1.0, 1.0, 1.0, 1.0), Settings(), "50").status == "FAIL"
 
 
-# Tests on connecting
+# Checks during connection
 
 
 def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bus):
@@ -159,7 +160,7 @@ def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
     until(connects)
     assert len(opened) == 1
     backend.close()
-    connected(bus).close()  # The port has been released.
+    connected(bus).close()  # The doctor has released the port.
 
 
 def test_doctor_waits_as_long_as_run(running):

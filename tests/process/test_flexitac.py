@@ -78,15 +78,15 @@ def test_frames_are_received_through_a_port_with_their_times(own_threads, board)
     first = tactile.latest()
     until(lambda: tactile.latest().seq >= first.seq + 20)
     now = tactile.latest()
-    # Wait for a frame that was read alone. A frame that was read together with later frames arrived
-    # earlier.
+    # Wait for a frame that was read on its own. If several frames are read together, the earlier
+    # frames arrived before the read.
     until(lambda: (n := tactile.latest()).t_arrival - n.t_sample == pytest.approx(LATE))
     assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1
     counters = tactile.counters()
     assert counters["resyncs"] == counters["port_lost"] == 0
     tactile.close()
-    assert len(own_threads()) == 1  # The board's thread is the only thread.
+    assert len(own_threads()) == 1  # Only the board's own thread remains.
 
 
 def test_a_frame_is_delivered_before_the_next_one_arrives(board):

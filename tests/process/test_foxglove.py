@@ -37,7 +37,7 @@ TOPICS = {
     "hand/tactile/left": "foxglove.RawImage",
     "hand/tactile/right": "foxglove.RawImage",
 }
-WAIT = 60.0  # time-out for one message [s]
+WAIT = 60.0  # timeout for one message [s]
 
 
 class Client:
@@ -108,7 +108,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
             assert (log["level"], log["message"], log["name"]) == (3, early["text"], "start")
             assert log["timestamp"]["sec"] == int(early["timestamp"])
             client.unsubscribe("hand/state")
-            client.subscribe("hand/event")  # The reply follows once the subscription is active.
+            client.subscribe("hand/event")  # An event arrives once the subscription is active.
             client.next("hand/event")
             rest: set[str] = set()
             while not rest >= {"hand/scene", "hand/tactile/left", "hand/tactile/right"}:
@@ -172,7 +172,7 @@ def check_scene(client: Client) -> None:
 def stranger() -> Iterator[tuple[FakeDaemon, str]]:
     """Yield a fake daemon and the address of its Foxglove server."""
     with FakeDaemon() as fake, served(fake) as (address, _):
-        # Connecting here avoids a warning at exit that no state has arrived.
+        # Connect once, because otherwise the server warns at exit that no state has arrived.
         with connected(address) as line:
             client = Client(line)
             client.subscribe("hand/state")

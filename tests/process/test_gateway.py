@@ -144,7 +144,7 @@ sys.exit(gateway.main(sys.argv[1:]))
     [
         ("STEP_CPU_TIME_MAX", "while True: pass", -signal.SIGPROF),
         ("STEP_TIME_MAX", "select.select([], [], [])", -signal.SIGALRM),
-        # This stall resembles a stopped or starved process.
+        # The gateway stalls like a process that is stopped or gets no processor time.
         ("STEP_CPU_TIME_MAX", "select.select([], [], [], 0.5)", 0),
     ],
 )
@@ -187,7 +187,7 @@ def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses)
         publisher = Publisher(gateway.link)
         gateway.link.look()
         os.kill(gateway.process.pid, signal.SIGSTOP)
-        for k in range(50_000):  # The loop would never end if it waited for the gateway.
+        for k in range(50_000):  # This loop would never end if publishing waited for the gateway.
             publisher.event(0.0, 0.0, "info", "test", f"event {k}")
         assert len(gateway.link._channel._unsent) < 1000, "the queue exceeds its limit"
         with suppress(ProcessLookupError):  # A slow gateway may have been replaced.
@@ -210,9 +210,8 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
     ):
         hand.arm()
         page.shows("ARMED")
-        os.kill(
-            ticking.gateway.process.pid, signal.SIGSTOP
-        )  # The gateway no longer serves clients.
+        # A stopped gateway does not serve clients.
+        os.kill(ticking.gateway.process.pid, signal.SIGSTOP)
         try:
             assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
             assert ticking.loop.state.mode == "disarmed"

@@ -151,7 +151,7 @@ def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
             assert not any(each["watchdog_fired"]["count"] for each in rig.report()["servos"])
             hand.arm()
             hand.wait_for(lambda state: state.torque, 120.0)
-        daemon.kill()  # The hand does not wait for a dead daemon.
+        daemon.kill()  # The hand does not wait for a daemon that has exited.
         until(rig.stopped)
     finally:
         rig.close()
@@ -192,7 +192,7 @@ def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
 
 
 def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
-    # The daemon refuses to start if the size of the boards differs from the profile.
+    # The daemon refuses to start if the board size differs from the profile.
     where = ("--config", str(rig.config), "--dir", str(rig.folder))
     done = softfinger("run", *where, "--set", "tactile.rows=16")
     assert done.returncode == 1
@@ -278,7 +278,8 @@ def test_lost_packets_do_not_keep_torque_on(rig):
     )
     send_words(rig.folder, "well")
     until(lambda: not rig.status()["torque"])
-    if rig.status()["mode"] == "fault":  # The mode depends on when torque off was confirmed.
+    # The mode depends on the time at which torque off was confirmed.
+    if rig.status()["mode"] == "fault":
         rig.does("clear")
     rig.works()
 

@@ -182,7 +182,7 @@ def ask(
         if socket is subscriber:
             socket.subscribe(b"")
         socket.connect(address)
-    # The daemon ignores the client name in this request.
+    # The daemon ignores the client name in the request.
     commander.send(msgpack.packb({"command": "arm", "client": "local"}))
     return subscriber, commander
 
@@ -223,7 +223,7 @@ def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addr
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.link.fence()  # Every stop raises a fence.
+        guarded.served.link.fence()  # The loop raises a fence after every stop.
         guarded.step()
         return stopper.poll(0)
 

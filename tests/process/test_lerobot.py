@@ -87,7 +87,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     with pytest.raises(Refused, match=r"left: found 515.7° \(9 rad\), expected"):
         robot.send_action({"left.pos": 9.0, "right.pos": 0.0})
     robot._hand.disarm()
-    # A hand that another client has disarmed is not armed again.
+    # The robot does not rearm a hand that another client has disarmed.
     with pytest.raises(Refused, match="arm first"):
         robot.send_action(goal)
     robot.disconnect()
@@ -134,7 +134,7 @@ def test_the_environment_has_the_features_and_actions_of_the_robot(plugin):
     env = made(task="Rotate-v0")
     seen, _ = env.reset(seed=[1])
     goal = float(seen["environment_state"][0, 0])
-    for _ in range(100):  # The robot's actions are in N and rad.
+    for _ in range(100):  # The action consists of a force [N] and an angle [rad].
         seen, reward, *_, info = env.step(np.array([[6.0, goal]], np.float32))
     observed = preprocess_observation(seen)
     for name, feature in env_to_policy_features(kind()).items():

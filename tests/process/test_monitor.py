@@ -39,7 +39,7 @@ def test_page_shows_the_hand_and_the_state_of_its_stream(fake):
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
         fake.silent.set()
-        # The page first shows a stale state for at most 1.5 s.
+        # For at most 1.5 s, the page shows the stream as stale.
         page.shows("○ lost", "the stream has stopped")
         fake.changes = {}
         fake.silent.clear()
@@ -89,7 +89,7 @@ sys.exit(monitor.run(parser.parse_args()))
 def test_a_signal_ends_it_while_the_terminal_is_blocked(fake):
     with TerminalProcess(command(fake)) as page:
         page.shows("HOLDING")
-        termios.tcflow(page.slave, termios.TCOOFF)  # This call has the effect of Ctrl-S.
+        termios.tcflow(page.slave, termios.TCOOFF)  # Suspend the output, as Ctrl-S does.
         # Wait for several redraws with different noise in the maps.
         until_later = fake.published + 50
         until(lambda: fake.published >= until_later)
@@ -124,7 +124,7 @@ def test_keys_command_the_hand(fake):
         page.shows("LEFT contact")
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 10.0°")
-        # The key steps from the target, although the object is still at 4.98°.
+        # The key changes the target, although the object angle is still 4.98°.
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 15.0°")
         page.type(b"\x1bOD")
@@ -132,7 +132,7 @@ def test_keys_command_the_hand(fake):
         assert [r["command"] for r in fake.requests[-3:]] == ["rotate"] * 3
         assert fake.requests[-1]["angle"] == pytest.approx(0.17418, abs=1e-4)
         fake.replies["rotate"] = {"ok": False, "error": "rotate: angle: too much"}
-        # A refused turn does not count, so the next turn starts at the object's angle.
+        # A refused turn does not count, so the next turn starts at the measured object angle.
         for _ in range(2):
             count = len(fake.requests)
             page.type(b"\x1b[D")
@@ -140,7 +140,8 @@ def test_keys_command_the_hand(fake):
             page.shows("✗ rotate: angle: too much")
         assert fake.requests[-1]["angle"] == pytest.approx(-0.00035, abs=1e-4)
         count = len(fake.requests)
-        page.type(b"\x1b[200~gado \x1b[201~zZ\x1b[A\x1b[15~")  # These are a paste and unused keys.
+        # The page ignores a paste and unused keys.
+        page.type(b"\x1b[200~gado \x1b[201~zZ\x1b[A\x1b[15~")
         page.type(b" ")
         page.shows("✓ stop: ok")
         assert [r["command"] for r in fake.requests[count:]] == ["stop"]
@@ -168,7 +169,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         page.type(b"++")
         page.shows("+- 12 N")
         page.type(b"+")
-        page.shows("+- 12.6 N")  # The page shows nine tenths of the force limit.
+        page.shows("+- 12.6 N")  # The displayed force is nine tenths of the force limit.
         page.type(b"-" * 10)
         page.shows("+- 4 N")  # Below 5 N, the steps are smaller.
         assert fake.requests == []

@@ -11,8 +11,8 @@ from tests.harness.daemon_process import python
 from tests.harness.golden_recording import machine_class
 from tests.harness.paper_tip import MEASURED, TIP
 
-# Each kind of kernel has one test: SIMD lanes and selected callees in the tables, reorderable sums
-# in the estimator, inlined cells of a frame, and nested records in the grip.
+# The script tests each kind of kernel: SIMD lanes and selected callees in the tables, reorderable
+# sums in the estimator, inlined loops over the cells of a frame, and nested records in the grip.
 SCRIPT = """
 import sys
 import numba
@@ -35,8 +35,8 @@ sys.exit(failed)
 """
 
 
-# Both compilers produce bit-identical results on this processor. On other processors, they may
-# choose different products for fused multiply-add.
+# Both compilers produce bit-identical results on this processor. On other processors, the compilers
+# may choose different products for fused multiply-add.
 SAME_BITS = "znver3"
 
 

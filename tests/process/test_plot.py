@@ -82,7 +82,7 @@ def test_command_line_writes_every_page_in_print_quality(path, inline):
     assert [Path(line).name for line in done.stdout.splitlines()] == names
     for name in names:
         pixels = imread(folder / name)
-        assert pixels.shape[1] >= 1400  # The picture has 7 inches at 200 dpi.
+        assert pixels.shape[1] >= 1400  # The picture is 7 inches wide at 200 dpi.
         ink = (pixels[..., :3].min(axis=2) < 0.9).mean()
         assert 0.01 < ink < 0.7
 
@@ -113,14 +113,14 @@ def test_model_page_has_points_near_the_model_curves(run):
     model = run.models[0].table(depths * 1e-3, np.radians(points[:, 0])).force
     firm = points[:, 1] > 1.0
     assert firm.sum() > 100
-    # The modulus factor limits the accuracy.
+    # The error of the modulus factor limits the accuracy.
     assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.06
 
 
 def test_landscape_shows_the_local_minimum_and_the_path(run):
     figure = drawn(run, "landscape")
     (theta, d) = lines(figure, "local minimum over θ")[0]
-    assert np.abs(theta).max() < 0.2  # The table reproduces this claim of the paper.
+    assert np.abs(theta).max() < 0.2  # According to the paper, the minimum is at θ = 0.
     assert d.max() > 3.0
     (angle, depth) = lines(figure, "left finger")[0]
     known = np.isfinite(depth)

@@ -110,7 +110,8 @@ def test_a_client_may_reconnect_and_leave_the_terminal_in_cooked_mode(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     wire.client.close()
     for _ in range(3):
-        # Without pyserial, a client that sets nothing must find the terminal in raw mode.
+        # A client without pyserial, which sets no terminal mode, must find the terminal in raw
+        # mode.
         end = os.open(wire.port.path, os.O_RDWR | os.O_NOCTTY)
         assert not termios.tcgetattr(end)[tty.LFLAG] & (termios.ECHO | termios.ICANON)
         os.write(end, PING)
@@ -124,7 +125,7 @@ def test_a_client_may_reconnect_and_leave_the_terminal_in_cooked_mode(wires):
 def test_a_client_that_never_reads_does_not_block_the_bus(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     request = frame(1, framing.READ, b"\x00\x00\x93\x00")
-    for _ in range(400):  # The number of bytes is far more than a terminal buffer holds.
+    for _ in range(400):  # A terminal buffer holds far fewer bytes.
         wire.send(request)
     assert wire.port.bus.packets == 400
 

@@ -18,8 +18,8 @@ from softfinger.tools.benchmarks.measuring import Report, attempt
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE, python
 
-# Script that prints how the system sees a process before, during and after it requests all
-# measures.
+# Script that prints the real-time properties of its process before, during and after the use of all
+# real-time measures.
 HELD = """
 import json, os, sys, threading
 from pathlib import Path
@@ -60,7 +60,7 @@ finally:
     over.set()
 """
 
-# Script that does the same as HELD for a user without permissions.
+# Script that does the same as HELD, but for a user without permissions.
 REFUSED = """
 import json, os, resource
 from softfinger.daemon.loop.realtime import RealTime

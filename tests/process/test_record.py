@@ -245,7 +245,8 @@ def test_messages_lost_while_recording_a_daemon_are_counted(start, profile, addr
     assert not recording.truncated
     seqs = [m["seq"] for _, m in recording.messages([schema.STATE])]
     assert len(seqs) > 10
-    # A gateway without processor time loses messages. The reported number must then be exact.
+    # A gateway without processor time loses messages. The reported number of lost messages must be
+    # exact.
     told = re.search(rf"(\d+) of {schema.STATE}", out)
     assert seqs[-1] - seqs[0] + 1 - len(seqs) == (int(told[1]) if told else 0)
     kinds = {message["kind"] for _, message in recording.messages([schema.EVENT])}

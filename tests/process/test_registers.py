@@ -21,7 +21,8 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 LEFT = "servo 1 (left)"
 FIX = "`softfinger doctor --fix`"
-# Values that another program may leave: register, value, and status and text of the finding.
+# Values that another program may leave in a servo: register, value, and the status and text of the
+# finding.
 EEPROM = [
     (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, expected at most 50 µs"),
     (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: the servo also executes commands for the servo"),

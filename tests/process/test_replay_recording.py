@@ -128,7 +128,8 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_p
     ticks = re.search(r"(\d+) ticks, ", told.stdout)
     assert ticks is not None
     assert int(ticks[1]) > 100
-    # Different settings give differences even if a slow machine never reached the grip.
+    # Different settings give different results, even if the grip was never reached on a slow
+    # machine.
     other = tmp_path / "other.toml"
     other.write_text(profile("safety.current_move = 0.3\n", "base.toml").read_text())
     told = inline("replay", path, "--recompute", "--config", other)

@@ -183,7 +183,7 @@ def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     gears = "gear friction consumes 25% of the transmitted torque, so a grip may never settle"
     assert [each.text for each in backend.notices] == 2 * [constant, gears]
     backend.close()
-    for name in ("hil", "small"):  # The forces in these profiles suit the profiles' servos.
+    for name in ("hil", "small"):  # The servos in these profiles can produce the requested forces.
         settings = load(find(Path(name)), Path("/tmp"))
         assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 
@@ -194,14 +194,14 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     place = tmp_path / name / "device" / "latency_timer"
     place.write_text("16\n")
     monkeypatch.setattr(checks, "latency_file", lambda path: latency_file(path, tmp_path))
-    # Low-latency mode is unavailable, as on this pseudo-terminal.
+    # A pseudo-terminal has no low-latency mode.
     text = "16 ms, expected 1 ms: every read waits for this timer"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     assert refusal(bus.port, reply_timeout=0.004)[0] == f"{bus.port} latency timer: {text}: {fix}"
-    backend = connected(bus)  # The timeout is longer than the latency timer.
+    backend = connected(bus)  # The reply timeout is longer than the latency timer.
     assert (backend.notices[0].text, backend.notices[0].fix) == (text, fix)
     backend.close()
-    # The port has a low-latency mode, so a driver sets the timer to 1 ms by itself.
+    # If a port has a low-latency mode, the driver sets the timer to 1 ms.
     asked = []
 
     def low(_: serial.Serial, on: bool) -> None:

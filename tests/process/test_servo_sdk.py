@@ -94,7 +94,7 @@ def test_error_bytes_of_a_group_read_are_kept(bus, line):
         group = kind(*line, reg.PRESENT_POSITION, 4, [1, 2])
         assert group.exchange() == OK
         assert group.errors == {1: 0x80, 2: 0}
-        # These addresses are beyond the control table.
+        # These addresses are beyond the end of the control table.
         assert kind(*line, 660, 4, [1, 2]).exchange() != OK
 
 

@@ -20,7 +20,7 @@ def test_the_real_time_soak_checks_wire_memory_and_streams(monkeypatch):
     # Allow 30 MB, because all processes are still warming up.
     monkeypatch.setattr(hil, "_FLAT", 30.0)
     account = hil.soak(4.0)
-    # A busy machine may delay the emulated hand itself, whose watchdog then trips late.
+    # On a busy machine, the emulated hand may be late, and its watchdog then trips late.
     assert [each for each in account.wrong if "without a packet" not in each] == []
     assert account.ticks > 0
     assert {"daemon", "hand", "recorder", "subscriber 3"} <= account.memory.keys()

@@ -47,7 +47,7 @@ def test_a_required_package_that_is_missing_is_named(tmp_path, missing, words, t
     assert not (tmp_path / "new.mcap").exists()
 
 
-# This program sends Ctrl-C during the import of a module.
+# Program that sends Ctrl-C to itself during the import of a module.
 _AT = """
 import builtins, os, signal, sys
 from softfinger.tools import cli
@@ -67,7 +67,8 @@ sys.exit(cli.main(sys.argv[2:]))
         ("argparse", ["limits"], -signal.SIGINT),
         ("pydantic", ["run"], -signal.SIGINT),
         ("softfinger.tools.terminal.stream_state", ["monitor"], -signal.SIGINT),
-        ("softfinger.daemon.safety.limits", ["limits"], 130),  # KeyboardInterrupt is raised again.
+        # While a subcommand is running, Ctrl-C raises KeyboardInterrupt.
+        ("softfinger.daemon.safety.limits", ["limits"], 130),
     ],
 )
 def test_ctrl_c_during_import_ends_a_subcommand_like_any_process(module, words, status):

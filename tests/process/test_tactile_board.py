@@ -85,7 +85,8 @@ def test_the_next_event_is_the_next_frame_delivery():
     source = Source()
     made = board(source, rate=100.0, delay=0.004)
     assert made.next_event() == -np.inf
-    # If rounding puts the due time just before the frame, the event must not be repeated at once.
+    # If rounding places an event just before its frame, the board must not repeat the event
+    # immediately.
     times = (0.0, 0.004, np.nextafter(0.014, 0.0), 0.0561)
     for seq, (t, due) in enumerate(zip(times, (0.004, 0.014, 0.024, 0.064), strict=True)):
         source.make(seq)

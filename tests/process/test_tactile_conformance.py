@@ -119,7 +119,7 @@ def test_incomplete_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
 def test_a_silent_board_keeps_the_last_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="silent@0.2") as rig:
         rig.sensor.open()
-        rig.wait(lambda frame: rig.images.number > 60)  # Of these frames, 40 were sent.
+        rig.wait(lambda frame: rig.images.number > 60)  # The board sends only the first 40 images.
 
         def silent() -> bool:  # Earlier frames may still be in transit.
             last, number = rig.sensor.latest(), rig.images.number
@@ -146,7 +146,8 @@ def test_a_frozen_board_has_new_numbers_and_times_but_the_same_image(backend, tm
         until(still)
 
 
-# The glove-style board behaves in the same way after 40 unanswered requests of 0.1 s each.
+# The glove-style board is not tested here, because it gives an invalid frame only after 40
+# unanswered requests of 0.1 s each.
 @pytest.mark.parametrize("backend", ["flexitac", "cobs"])
 def test_a_board_that_changes_its_grid_gives_an_invalid_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="wrong-size@0.2") as rig:

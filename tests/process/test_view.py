@@ -146,7 +146,7 @@ def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
             # The viewer waits.
             assert any("no reply to arm" in line for line in viewed.process.stderr)
             viewed.process.send_signal(signal.SIGINT)
-            assert viewed.process.wait(WAIT) == 1  # The viewer has displayed nothing.
+            assert viewed.process.wait(WAIT) == 1  # The viewer never displayed a picture.
 
 
 def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
@@ -157,14 +157,14 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             page.connect((host, int(port)))
             page.settimeout(WAIT)
             page.sendall(WATCH.format(host=viewed.host).encode())
-            wish = bytes([0x81, 0x80, 0, 0, 0, 0])  # This is an empty text frame.
+            wish = bytes([0x81, 0x80, 0, 0, 0, 0])  # empty text frame
             page.setblocking(False)
             begun = fake.published
 
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
                     page.send(wish)
-                return fake.published > begun + 500  # The page's queue holds 5 s of pictures.
+                return fake.published > begun + 500  # The queue of the page holds 5 s of pictures.
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)
@@ -244,7 +244,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
 def test_images_of_tips_without_contact_are_blank() -> None:
     kept = Kept()
     noise = np.random.default_rng(1).normal(0.0, Settings().tactile.noise / 4.0, (44, 44))
-    counts = np.clip(noise, 0.0, None).astype("<u2")  # one count corresponds to 4 Pa
+    counts = np.clip(noise, 0.0, None).astype("<u2")  # One count corresponds to 4 Pa.
     kept.pictures.take(schema.TACTILE, {**frame(0.0, 0), "data": counts.tobytes()})
     kept.pictures.take(schema.STATE, state(0.0, 1))
     kept.pictures.draw()
@@ -498,7 +498,7 @@ def test_a_recording_is_saved_as_a_moving_picture(recorded, tmp_path):
     lines = [each for each in ElementTree.parse(path).getroot().iter() if "values" in each.attrib]
     counts = {len(each.attrib["values"].split(";")) for each in lines}
     assert counts == {1 + math.ceil(Recording(recorded).duration / 0.1)}
-    assert len(lines) >= 6 + 5  # The lines show fingers and tips, and contacts, arrows and object.
+    assert len(lines) >= 6 + 5  # The lines show the fingers, tips, contacts, arrows and object.
 
 
 def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline):

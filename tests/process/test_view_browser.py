@@ -30,7 +30,7 @@ pytestmark = [
 LEASE = 10.0  # s
 SHIM = Path(__file__).parents[2] / "docs" / "iframe-worker.js"
 PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
-# Fraction of a canvas's pixels that have nearly the given colour.
+# Fraction of the canvas pixels with approximately the given colour.
 FRACTION = """((selector, colour) => {
   const canvas = document.querySelector(`${selector} canvas`);
   const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
@@ -39,7 +39,7 @@ FRACTION = """((selector, colour) => {
     count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
   return 4 * count / data.length;
 })"""
-# Visible texts with a contrast below WCAG AA, which is 4.5, or 3 for large letters.
+# Visible texts with a contrast below the WCAG AA limit of 4.5, or 3 for large text.
 PALE = """(() => {
   const linear = part => part <= 10.31 ? part / 3294.6 : ((part / 255 + 0.055) / 1.055) ** 2.4;
   const parts = colour => colour.match(/[\\d.]+/g).map(Number);
@@ -63,7 +63,7 @@ PALE = """(() => {
   }
   return found;
 })()"""
-# Numbers of the headline that its age covers.
+# Headline numbers that are covered by the age label.
 OVER_NUMBERS = """(() => {
   const age = document.querySelector(".headline .age").getBoundingClientRect();
   return [...document.querySelectorAll(".headline :is(h2, span, small):not(.age)")].filter(each => {
@@ -245,7 +245,7 @@ def test_stale_data_are_marked(page, fake):
             return set(" ".join(page(names)).split()) - {"old", "card"}
 
         assert page.text(".mode") == "holding"
-        # Time after which a state without a successor counts as stale.
+        # A state counts as stale after this time.
         assert page("picture.patience.state + scene.period") <= 0.5
         fake.dead.add("left")
         until(lambda: old() == {"left"})
@@ -378,7 +378,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         fake.replies["grasp"] = {"ok": False, "error": "grasp: too hot for that"}
         page.key("Equal", "+", text="+")
         until(lambda: page.text("#force output") == "✗ grasp: too hot for that")
-        until(lambda: page("settings.force.wanted") is None)  # The hand did not adopt this force.
+        until(lambda: page("settings.force.wanted") is None)  # The page discards the refused force.
         del fake.replies["grasp"]
         until(lambda: page("document.querySelector('#force [type=number]').value") == "7.3")
 
@@ -415,14 +415,14 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
 
         os.killpg(page.browser.process.pid, signal.SIGSTOP)
         asleep = fake.published
-        # This wait corresponds to 10 s of the stream.
+        # Wait for 10 s of states.
         until(lambda: fake.published > asleep + 1000)
         os.killpg(page.browser.process.pid, signal.SIGCONT)
         until(lambda: page.lag() < 0.5)
         rows = page("past.rows.map(row => row[0])")
-        # The rows include the states during sleep.
+        # The rows include the states that were published while the browser was suspended.
         assert rows == [*range(rows[0], rows[0] + len(rows))]
-        page.click("[name=stop]")  # The stop is sent although the connection was closed in between.
+        page.click("[name=stop]")  # The page sends the stop, although its connection was closed.
         until(lambda: fake.requests[-1]["command"] == "stop")
 
         page("location.reload()")
@@ -482,7 +482,7 @@ def test_colours_labels_and_keys_are_accessible(page, fake):
             assert page(PALE) == []
         page.click("#theme")
         until(lambda: page("document.documentElement?.dataset.theme") == "light")
-        page.open(viewed.commanding)  # This browser keeps its selection.
+        page.open(viewed.commanding)  # The browser stores the selected theme.
         assert page("document.documentElement?.dataset.theme") == "light"
 
         tree = page.browser.ask("Accessibility.getFullAXTree")["nodes"]

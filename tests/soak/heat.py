@@ -26,14 +26,14 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 LIMIT = 70.0  # °C
 _DT = 0.5  # s
 _MODELS = ("XM430-W350", "XL330-M288")
-_LONG = 8000.0  # duration long enough to reach steady state [s]
+_LONG = 8000.0  # duration that is long enough to reach the steady state [s]
 
 
 class Foreseen(NamedTuple):
     """Result of the prediction for one hold."""
 
     warned: float  # time from the warning until the reading reached the limit [s]
-    told: float  # predicted time when 60 s remained [s]
+    told: float  # remaining time that was predicted 60 s before the end [s]
     lasted: float  # total duration [s]
 
 

@@ -36,8 +36,9 @@ from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0
 SUBSCRIBERS = 3
-_LOOK = 5.0  # time between checks of the bus and of the memory [s]
-# Length of the compared windows at both ends [s]. Each window is at most a third of the run.
+_LOOK = 5.0  # time between two checks of bus and memory [s]
+# Duration of the windows that are compared, at the start and at the end of the run [s]. Each window
+# takes at most a third of the run.
 _WINDOW = 600.0
 _FLAT = 2.0  # maximum memory growth of a process [MB]
 _FAULT_EVERY = 40.0  # average time between faults [s]
@@ -45,11 +46,12 @@ _FAULT_FOR = 0.3
 _SETPOINT = 0.02  # time between setpoints [s]
 _STREAM = 3.0  # duration of a setpoint stream [s]
 _SPLIT = 300  # time per recorder file [s]; the recorder keeps an index until the file is closed
-# These faults leave the object tilted after a stop. The soak test then uprights the object.
+# After a stop, these faults leave the object tilted, and the soak test then puts the object
+# upright.
 _ASKEW = ("hand.angle", "tip.tilt")
 _DROPPED = 20.0  # time without a grip after which the test puts a lost object back [s]
-_HELD = 0.3  # minimum fraction of grasps that must settle
-_MANY = 50  # number of grasps above which _HELD is required
+_HELD = 0.3  # minimum fraction of grasps that settle
+_MANY = 50  # number of grasps above which `_HELD` is checked
 _BEGUN = 1500  # maximum difference between the numbers of states received by any two listeners
 
 
@@ -74,7 +76,7 @@ class Account:
     memory: dict[str, list[float]] = field(default_factory=dict)
     # Delay of each state's tick [s].
     late: array[float] = field(default_factory=lambda: array("f"))
-    # Pairs of time [s] and number of `late` values so far.
+    # Pairs of time [s] and current number of values in `late`.
     looked: list[tuple[float, int]] = field(default_factory=list)
 
     def growth(self) -> dict[str, float]:

@@ -27,15 +27,16 @@ from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError
 from softfinger.tools.processes.emulate import emulator_process
 
-_PATIENCE = 300.0  # time-out for the start of a process, including kernel compilation [s]
+_PATIENCE = 300.0  # timeout for the start of a process, including kernel compilation [s]
 _STATE_RATE = 250.0  # Hz
-# These settings affect only startup. A busy machine may delay the first bytes of the emulated hand.
+# These settings affect only the startup, because a busy machine may delay the first bytes of the
+# emulated hand.
 _PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
 _POLL = 0.003  # time between polls of the stream [s]
 _SLACK = 0.05  # tolerated delay of a process [s]
 _RESOLUTION = 0.0016  # one encoder count [rad]
 _CURRENT_UNIT = 0.0027  # A
-_ROOM = 1 << 18  # number of bytes that the daemon may still allocate while its memory is limited
+_ROOM = 1 << 18  # number of bytes that a daemon with limited memory may still allocate
 
 
 class Rig:

@@ -54,17 +54,18 @@ _WARM = 2  # number of memory checks excluded as warm-up: ten minutes of eight h
 _FLAT = 2.0  # maximum memory growth after the warm-up [MB]
 _STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # message rates in a long sequence [Hz]
 _SPLIT = 16e6  # file size limit for the recording of the long sequence [bytes]
-# With "deaf", written data are lost but readings arrive. With "jumped", the angle is off by 0.2
-# rad. With "numb", angle, velocity and current stay constant.
+# "deaf": the servo receives no data but still sends readings. "jumped": the angle is off by 0.2
+# rad. "numb": angle, velocity and current stay constant.
 SERVO_FAULTS = (
     *("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed"),
     *("jumped", "numb"),
 )
-# Faults in which the joint angle also contradicts the frames.
+# Faults in which the joint angle contradicts the frames.
 _ENCODER = ("fast", "strayed", "jumped", "numb")
-_UNHEARD = ("silent", "gone", "deaf")  # faults in which the servo does not receive torque off
+# faults in which the servo does not receive the torque-off command
+_UNHEARD = ("silent", "gone", "deaf")
 _WATCHDOG = 100  # number of ticks until the servo watchdogs stop the motors (0.2 s)
-_LOST = 20  # number of consecutive lost goals that is sufficient for detection
+_LOST = 20  # number of consecutive lost goals after which the loss is reported
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
 # Faults of a sensor or of a current measurement, each with its range of values and the channel that
 # may be named.
@@ -79,13 +80,13 @@ LIES = {
 }
 LOADS = ("push", "twist")
 _TOO_LONG = 0.05  # maximum time for which a tip force may exceed its bound [s]
-_TOO_MUCH = 1.3  # maximum ratio to the requested force if nothing justifies a higher force
-_UNSURE = 1.2  # maximum ratio to the raised force, because tip forces differ under load
+_TOO_MUCH = 1.3  # maximum ratio of tip force to requested force without a load or fault
+_UNSURE = 1.2  # maximum ratio of tip force to raised force; tip forces differ under load
 _REMEMBERED = 5.0  # maximum time for which a grip stays raised after a load or fault [s]
 _RETARGETED = 0.5  # maximum time for which the previously requested force may persist [s]
 _UNCOVERED = 1.0  # time after which a tip near the object's edge is ignored [s]
 
-# Requirements. The checks of each requirement are counted.
+# Requirements. The test counts the checks of each requirement.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
 OFF = "no torque after disarm or fault"
 WATCHDOG = "no torque 0.2 s after a stop that no servo hears"
@@ -319,13 +320,13 @@ class Account:
     modes: Counter[str] = field(default_factory=Counter)  # number of ticks in each mode
     faults: Counter[str] = field(default_factory=Counter)  # number of latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
-    # Channels named as faulty, with the actual fault.
+    # Channels that were reported as faulty, with the actual fault.
     named: Counter[str] = field(default_factory=Counter)
     commands: Counter[str] = field(default_factory=Counter)  # accepted commands
     refused: int = 0
     failures: list[str] = field(default_factory=list)
-    broken: Counter[str] = field(default_factory=Counter)  # violations in a long sequence, in ticks
-    published: tuple[int, int] = 0, 0  # messages of a long sequence: published, lost
+    broken: Counter[str] = field(default_factory=Counter)  # number of ticks with violations
+    published: tuple[int, int] = 0, 0  # number of messages published, and lost
     memory: list[float] = field(default_factory=list)  # resident memory after the warm-up [MB]
 
     @property
@@ -410,7 +411,8 @@ class Soak:
         self._lie = ""  # kind of the current measurement fault
         self._false: set[str] = set()  # channels that have been faulty and may be named
         self._loaded = 0.0  # N along the faces
-        # Most recent time of each of these conditions [s].
+        # Last time [s] with a load, with a wrong measurement, and with a tip near the object's
+        # edge.
         self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
         # Pairs of time [s] and force [N], empty outside grips.
         self._asked: list[tuple[float, float]] = []
@@ -491,7 +493,7 @@ class Soak:
         if name == "grasp" or (name == "hold" and ("force" in request or mode not in _GRIPPING)):
             force = request.get("force", self.settings.control.force_default)
             t = self.daemon.clock.now()
-            if not self._asked:  # A motion may have applied a higher force.
+            if not self._asked:  # A motion may already apply a higher force.
                 self._asked.append((t, max(self.hand.force.tolist())))
             self._asked.append((t, force))
         elif name in ("arm", "move", "release", "stop", "disarm"):
@@ -639,7 +641,7 @@ class Soak:
         if self._lie or any(sensor.fault for sensor in self.sensors):
             self._lied_t = t
         force = max(self.hand.force.tolist())
-        # The measured force has the relative error of the torque constant.
+        # The measured force has the same relative error as the torque constant.
         self._must_end_soon(MOST, MOST, force, (1.0 + control.torque_error) * most, t)
         while len(self._asked) > 1 and self._asked[1][0] < t - _RETARGETED:
             del self._asked[0]
@@ -653,7 +655,7 @@ class Soak:
         bound = _TOO_MUCH * asked
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
-        bound += 2.0 * friction  # Allow for the compensation and for static friction.
+        bound += 2.0 * friction  # Allow for friction compensation and static friction.
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)

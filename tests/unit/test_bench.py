@@ -184,7 +184,7 @@ def test_a_held_load_slides_and_a_lost_load_is_reported():
     assert 0.0 < held.answer < 0.022
     assert 0.0 < held.slid < 0.02
     assert not held.lost
-    # A joint that still sticks moves only a quarter as far as the other joint.
+    # A joint that still sticks moves a quarter as far as the other joint.
     sticking = reflex.overloaded({"simulation": {"object_mass": 0.5}}, 6.0, 15.0, 1)
     assert (sticking.answer < 0.022, sticking.slid < 0.012, sticking.lost) == (True, True, False)
     weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}
@@ -219,7 +219,7 @@ def test_a_watch_measures_forces_times_and_positions():
         place = (0.0, 0.08 + (0.02 if k == 6 else 0.001 * k))
         watch.see(0.1 * k, (force, 10.0), place, torque=k != 6)
     assert watch.peak == 1.5
-    assert watch.above == pytest.approx(0.1)  # The force is above the limit from 0.1 to 0.2 s.
+    assert watch.above == pytest.approx(0.1)  # The force exceeds the limit from 0.1 s to 0.2 s.
     assert watch.slid == pytest.approx(0.005)
     assert watch.settled() == pytest.approx((1.25 + 1.1 + 1.175 + 0.95 + 0.95) / 5)
 

@@ -91,7 +91,7 @@ def test_cells_above_the_saturation_pressure_of_the_header_are_excluded(
     press, tmp_path, unit, pascal, digits, told
 ):
     frames, full = clipped(press)
-    name = f" {unit}" if told else ""  # Without a unit, the value has the unit of the readings.
+    name = f" {unit}" if told else ""  # A value without a unit has the unit of the readings.
     line = f"SATURATION_PRESSURE {full / pascal:.6f}{name}"
     path = tmp_path / "a.asf"
     path.write_bytes(export(frames, unit, 1.0 / pascal, digits=digits, header=[line]))
@@ -207,7 +207,7 @@ def test_a_cell_that_is_nan_in_all_frames_is_dead(press, tmp_path):
     check(tmp_path / "a.asf")
 
 
-# Exports of other locales
+# Exports from other locales
 
 LOCALES = {
     "decimal commas, semicolons": {"point": ",", "separator": ";"},

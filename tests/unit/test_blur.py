@@ -70,8 +70,8 @@ def test_cells_beyond_the_reach_of_the_tip_are_unused_for_any_blur(reading):
     frame = grid.pressure(TIP, LINEAR, 0.012, 0.25, 0.25)
     estimator = ContactEstimator(TIP, LINEAR, grid, noise)
     usual = estimator(frame)
-    # This cell is outside the rim by more than three standard deviations, but inside the box around
-    # the footprint.
+    # This cell is more than three standard deviations outside the rim, but inside the bounding box
+    # of the footprint.
     frame[39, 39] = reading
     found = estimator(frame)
     assert usual.valid

@@ -132,7 +132,7 @@ def test_the_material_of_each_tip_reaches_estimate_table_and_prediction(settings
 
 
 PASCAL_PER_COUNT = 150.0
-FULL = 255  # full count, 38 kPa, which is less than the contact's peak pressure of 46 kPa
+FULL = 255  # full count; corresponds to 38 kPa, below the peak pressure of 46 kPa
 
 
 def counting(**tactile: object) -> Settings:

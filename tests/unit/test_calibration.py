@@ -66,7 +66,7 @@ def test_a_tare_measures_noise_correlation_and_common_drift():
     found = tare(shared + 0.7 * rng.standard_normal((100, 1, 1)))
     assert found.correlation.shape == (1, 2)
     np.testing.assert_allclose(found.correlation, [[1.0, 0.5]], atol=0.02)
-    # With 100 frames, the estimate has a relative scatter of 0.07.
+    # With 100 frames, the relative scatter of the estimate is 0.07.
     assert found.drift == pytest.approx(0.7, rel=0.3)
 
 
@@ -85,7 +85,8 @@ def test_equilibration_equalises_cells_and_finds_dead_ones():
 
 @pytest.mark.parametrize("kind", ["power", "cubic"])
 def test_the_curve_is_recovered_from_known_weights(kind):
-    # The sensor's response is p = p(x), where x is interpolated from the model's pressure.
+    # The response curve gives the pressure as a function of the reading x. Each reading is
+    # interpolated from the pressure of the model.
     x = np.linspace(0, 1000, 4001)
     true = 0.9 * x**1.4 if kind == "power" else 60 * x + 0.08 * x**2 + 5e-5 * x**3
     depths = (0.001, 0.0015, 0.002, 0.003, 0.004)
@@ -113,7 +114,7 @@ def test_centre_and_rotation_are_recovered_from_tilted_loads(rotation):
     assert found.centre == pytest.approx(true.centre, abs=2e-5)
     assert found.rotation == pytest.approx(rotation, abs=5e-3)
     assert found.residual < 3e-5
-    assert 2e-5 < found.std < 2e-4  # The loads are upright to within half a degree.
+    assert 2e-5 < found.std < 2e-4  # The fit assumes a tilt error of half a degree.
 
 
 def test_upright_loads_determine_the_centre_but_not_the_rotation():

@@ -61,7 +61,7 @@ def faulted(daemon: Daemon) -> Daemon:
     return daemon
 
 
-# Settings, state of the hand, and numbers for each command and reason.
+# Settings, hand state, and numbers for each command and reason.
 REFUSED: dict[tuple[str, Reason], tuple[Any, Callable[[Daemon], Daemon], dict[str, float]]] = {
     ("arm", Reason.SCENE): ({"servos": {"backend": "none"}}, lambda it: it, {}),
     ("arm", Reason.STATE): ({}, hot, {}),

@@ -106,7 +106,7 @@ def test_malformed_multipart_messages_and_disconnecting_clients_have_no_effect(
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
 
 
-# The second request waits in the queue or on the link.
+# The second request waits either in the queue or on the link.
 @pytest.mark.parametrize("under_way", [1, 16])
 def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
     context, addresses, monkeypatch, under_way
@@ -302,7 +302,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         elif meanwhile:
             other = Asking(context, served, addresses[1], meanwhile)
             until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
-        # Enough time has passed since the stop to tell requests apart.
+        # Wait until new requests can be distinguished from requests before the stop.
         until(lambda: served._is_open())
         count = len(aged.ages)
         asking.send(keyed())
@@ -382,7 +382,7 @@ def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
                     found.append(msgpack.unpackb(stream.recv()))
             return all(len(found) == 20 for found in replies)
 
-        # All setpoints have been received before the loop continues.
+        # Receive all setpoints before the loop continues.
         commands = served.service.commands
         until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
         until(lambda: [served.serve(note), collected()][1])
@@ -471,7 +471,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             return {}
 
         until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
-        served.serve(note)  # The gateway is processing the flood.
+        served.serve(note)  # Let the gateway process part of the flood.
         carried_out = len(order)
         assert carried_out > 0
         stopper = context.socket(zmq.DEALER)
@@ -516,7 +516,7 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
         clock.sleep_until(clock.now() + 1.0)
         flood.sockets[0].send(msgpack.packb({"command": "move"}))
         last: list[dict[str, Any]] = []
-        # This reply follows the remaining requests of the flood.
+        # Wait for this reply, which follows the last replies to the flood.
         answer = {"ok": True, "heard": "move"}
         until(lambda: [served.serve(echo), flood.collect(last), answer in last][2])
 
@@ -530,7 +530,7 @@ def test_flooding_clients_leave_room_for_others(context, addresses):
 
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
-        # The gateway's buffers are full.
+        # Fill the buffers of the gateway.
         until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
         other = Asking(context, served, addresses[1], "grasp").socket
         until(lambda: [served.serve(note), other.poll(0)][1])

@@ -27,7 +27,7 @@ from softfinger.tools.cli import main
 
 ROOT = Path(__file__).parents[2]
 E, A = 0.25e6, 0.020
-LATE, LOAD = 1.35e-3, 0.21  # zero offsets of the machine for d [m] and F [N]
+LATE, LOAD = 1.35e-3, 0.21  # zero offsets of the test machine in d [m] and F [N]
 UNIT = Material.constant(1.0)
 Force = Callable[[float, float], float]  # force [N] as a function of d [m] and θ [rad]
 WORDS = ["--config", "hil", "--no-plot"]
@@ -81,7 +81,7 @@ def test_correlated_noise_increases_the_standard_deviation():
         return float(np.mean(np.square(errors)))
 
     smooth = found(np.full(8, 8**-0.5))
-    assert 0.3 < smooth < 3.0  # Without the correlation, this value would be about 8.
+    assert 0.3 < smooth < 3.0  # Without the correlation, the mean would be about 8.
 
 
 def test_the_toe_region_is_excluded(monkeypatch):
@@ -122,7 +122,7 @@ def rubber(base: str) -> Force:
     with np.load(ROOT / "tests" / "golden" / "solid_frames.npz") as file:
         used = (file["base"] == base) & (file["theta"] == 0.0)
         d, push = file["d"][used], file["push"][used]
-    # For d → 0, the limit is Hertz contact.
+    # In the limit d → 0, the contact is Hertzian.
     curve = CubicSpline([0.0, *np.sqrt(d)], [4.0 / 3.0 / (1.0 - 0.49**2), *(push / d**1.5)])
     return lambda d, _: E * A**2 * float(curve(math.sqrt(d / A))) * (d / A) ** 1.5
 
@@ -296,7 +296,7 @@ def test_a_depth_dependent_modulus_is_stored_as_points(tmp_path, capsys):
     assert main(["calibrate", "law", str(out), *WORDS, "--compression", str(file)]) == 0
     step = load_calibration(out).modulus
     law = step.material()
-    # Compute F at the stored points by the integral over the strain.
+    # Compute F from the stored law by integration over the strain.
     deep = 5e-3
     found = 2.0 * math.pi * (A - deep) ** 2
     found *= quad(lambda e: float(law.stress(e)) / (1.0 - e) ** 3, 0.0, deep / A)[0]

@@ -94,7 +94,7 @@ def test_every_erratum_is_listed(site):
     text = site[1]["model.md"].replace("\\|", "|")
     for page in pages().values():
         assert all(each.holds in text for each in page.errata)
-    assert "15.8197516322" in text  # This number is F at 4 mm and 15°.
+    assert "15.8197516322" in text  # F at d = 4 mm and θ = 15°
 
 
 def test_model_values_on_pages_are_computed(site):

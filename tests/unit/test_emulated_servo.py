@@ -45,8 +45,8 @@ def client(**options: Any) -> BusClient:
         (reg.GOAL_CURRENT, 1194, 2, framing.DATA_RANGE),
         (reg.MIN_POSITION_LIMIT, 4095, 4, framing.OK),
         (reg.LED, 1, 1, framing.OK),
-        (660, 7, 1, framing.OK),  # These are indirect data of the second block.
-        (661, 0, 2, framing.ACCESS),  # past the end
+        (660, 7, 1, framing.OK),  # This address is in the second block of indirect data.
+        (661, 0, 2, framing.ACCESS),  # past the end of the table
     ],
 )
 def test_status_errors_of_writes(address: int, value: int, size: int, error: int) -> None:
@@ -78,7 +78,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     ("instruction", "parameters"),
     [
         (0x77, b""),
-        (0x05, b""),  # No write is registered.
+        (0x05, b""),  # No registered write precedes this action.
         (0x20, b"\x01CTRL"),  # control table backup
     ],
 )
@@ -130,7 +130,7 @@ def test_protocol_1_if_configured() -> None:
     assert c.bus.feed(bytes.fromhex("FFFF010201FA"), c.t) == b""  # The checksum is wrong.
 
 
-# Registers that affect how a goal is followed.
+# Registers that affect the motion to a goal.
 
 
 def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
@@ -287,7 +287,7 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     c.write(reg.BUS_WATCHDOG, 5, 1)
     c.write(reg.GOAL_CURRENT, 40, 2)
     c.write(reg.GOAL_POSITION, 4000, 4)
-    for _ in range(20):  # Regular packets prevent a trip of the watchdog.
+    for _ in range(20):  # Regular packets keep the watchdog from tripping.
         c.later(0.09)
         assert c.read(reg.BUS_WATCHDOG, 1) == 5
     assert c.bus.plant.dq[0] > 0.0

@@ -129,7 +129,7 @@ def misplaced(by):
     return lambda tip, d, x, y, sign: pressed(tip, d, x, y, replace(FLAT, **by(sign)))
 
 
-# Defects of real cells that the sensor model omits, each with the uncertainty to declare.
+# Sensor defects that the model does not include, each with the uncertainty that covers it.
 IMPERFECTIONS = {
     "unloading": (Uncertainty(gain=0.1, smooth=0.04), unloading),
     "crosstalk": (Uncertainty(gain=0.02, smooth=0.01), crosstalk),
@@ -155,7 +155,7 @@ IMPERFECTIONS = {
 }
 
 
-# Harmless defects, or defects that are flagged as invalid.
+# Defects that are harmless, or that invalidate the frame.
 HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")
 
 
@@ -185,11 +185,12 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
 def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]
     tip = Fingertip(0.020, physics)
-    # 32 frames of three values per depth give a scatter of ± 0.14. A solid tip's tilt includes the
-    # error of its data, but these frames are made from the same data.
+    # With 32 frames of three values per depth, the scatter is ± 0.14. For a solid tip, the
+    # covariance includes an error of the tip data. The simulated frames come from the same data, so
+    # the lower limit is smaller.
     least, most = (0.6, 1.5) if physics == "springs" else (0.2, 1.5)
-    # With springs, an offset of 0.5 mm changes d by more than the differences between neighbouring
-    # cells reveal.
+    # With spring tips, an offset of 0.5 mm causes an error in d that exceeds the estimated
+    # uncertainty of d.
     most = 3.0 if (name, physics) == ("centre", "springs") else most
     assert least < worst_nees(known, tip, imperfect) < most
     request.getfixturevalue("exact_solid_data")
@@ -197,7 +198,7 @@ def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
         assert worst_nees(Uncertainty(), tip, imperfect) > 5.0
 
 
-# One hand has all defects that a profile can declare, each with its own magnitude.
+# The last hand has all defects that a profile can declare, each with its own magnitude.
 SECTIONS = {
     "sim": {},
     "velostat": load(Path("velostat")).model_dump(exclude_unset=True),
@@ -282,14 +283,15 @@ def test_errors_match_the_covariance_with_all_declared_imperfections(profile, ph
             slopes = c.force_theta * np.array([e.tilt_x, e.tilt_y]) / total
             slopes = np.array([c.force_d, *slopes])
             variance = slopes @ covariance @ slopes
-            # With springs, the force also depends on the modulus. The frames of a solid tip show
-            # the product of both.
+            # With spring tips, the modulus error adds to the force error. The frames of a solid tip
+            # determine the force without the modulus.
             variance += (known.modulus * c.force) ** 2 if physics == "springs" else 0.0
             true_force = modulus_factor * float(table(d, tilt).force)
             forces.append(abs(c.force - true_force) < 1.96 * math.sqrt(variance))
             inside.append(np.abs(error) < 1.96 * np.sqrt(covariance.diagonal()))
     assert len(squares) > 0.6 * frames
-    # Errors that all frames of a hand share are drawn 60 times. Other draws give 0.63 to 1.1.
+    # The errors that all frames of a hand share are drawn 60 times. With other seeds, the mean is
+    # 0.63 to 1.1.
     assert (0.55 if physics == "springs" else 0.35) < np.mean(squares) < 1.3
     assert (np.mean(inside, axis=0) > 0.9).all()
     assert np.mean(forces) > 0.9

@@ -28,8 +28,8 @@ from tests.harness.paper_tip import (
 @pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
 @pytest.mark.parametrize("free_gain", [True, False])
 def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain):
-    # The azimuths, and the tip positions relative to the cells, are random. The bias is compared
-    # with a noise of 0.2 %.
+    # The azimuths and the tip positions relative to the cells are random. The bias is compared with
+    # a noise of 0.2 % of the modulus.
     rng = np.random.default_rng(7)
     noise = 0.002 * material.reference_modulus
     for _ in range(60):
@@ -42,7 +42,8 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
         assert e.valid
         n = 4 if free_gain else 3
         sigma = np.sqrt(np.diag(e.covariance))[:n]
-        assert np.all(np.abs(errors(e, truth)[:n]) < 0.4 * sigma)  # Other positions give 0.34.
+        # With other tip positions, the maximum ratio is 0.34.
+        assert np.all(np.abs(errors(e, truth)[:n]) < 0.4 * sigma)
         assert abs(e.d - d) < 2e-3 * d
 
 
@@ -51,7 +52,7 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
     ("d", "degrees", "share"), [(0.008, 25.0, 0.35), (0.008, 30.0, 1.0), (0.008, 33.5, 5.0)]
 )
 def test_the_bias_is_small_where_the_footprint_nearly_reaches_the_rim(d, degrees, share, free_gain):
-    # In this case, the outermost cells average 1/√(a² − x² − y²), which has a singularity at the
+    # The outermost cells average the function 1/√(a² − x² − y²), which has a singularity at the
     # rim.
     rng = np.random.default_rng(1)
     noise = 0.002 * E
@@ -113,7 +114,7 @@ def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percen
     # The tolerance is four standard deviations of χ² with 800 n degrees of freedom, plus a model
     # error of 5 %.
     assert abs(nees.mean() / n - 1.0) < 4.0 * math.sqrt(2.0 / (frames * n)) + 0.05
-    # The reported covariance equals the bound.
+    # The reported covariance equals the Cramér-Rao bound.
     np.testing.assert_allclose(
         np.sqrt(np.diag(e.covariance))[:n], np.sqrt(np.diag(bound)), rtol=0.12
     )
@@ -188,7 +189,7 @@ def test_update_reuses_one_result_and_skips_a_repeated_frame():
     newer = estimator.update(GRID.pressure(TIP, LINEAR, 0.005), seq=5)
     assert newer is first
     assert newer.d == pytest.approx(0.005, rel=1e-4)
-    # A direct call neither reads nor changes the state of `update`.
+    # A direct call of the estimator neither reads nor changes the state of `update`.
     covariance = newer.covariance.copy()
     alone = estimator(GRID.pressure(TIP, LINEAR, 0.002))
     assert alone.d == pytest.approx(0.002, rel=1e-4)
@@ -232,9 +233,11 @@ def test_all_frame_types_and_layouts_give_the_same_estimate():
         np.asfortranarray(counts.astype(np.uint16)),
         wide[:, ::2],
     ):
-        # Each type has its own machine code, whose sums may use other SIMD lanes.
+        # Each frame type has its own machine code, which may add the numbers in different SIMD
+        # lanes.
         assert estimator(frame, scale).d == pytest.approx(reference.d, abs=1e-3 * reference.d_std)
-    # Float frames can be negative and have no quantum, so they are treated slightly differently.
+    # Frames of floats may contain negative values and have no quantum, so the estimator treats them
+    # slightly differently.
     for kind in (np.float32, np.float64):
         e = estimator(counts.astype(kind), scale)
         assert e.d == pytest.approx(reference.d, rel=1e-4)
@@ -252,7 +255,7 @@ def test_quantisation_increases_the_covariance():
 
 @pytest.mark.parametrize("free_gain", [True, False])
 def test_counts_clipped_at_zero_cause_no_bias(free_gain):
-    # The negative half of the noise is clipped, so weak cells at the outline read too high.
+    # The sensor clips the negative half of the noise, so weak cells at the outline read too high.
     noise = 1520.0
     rng = np.random.default_rng(9)
     estimator = ContactEstimator(TIP, MEASURED, GRID, noise, free_gain=free_gain)
@@ -309,7 +312,7 @@ def test_a_footprint_cut_off_by_the_sensor_edge_is_estimated():
 
 @pytest.mark.parametrize("degrees", [36.0, 40.0, 50.0])
 def test_the_tilt_is_estimated_at_and_beyond_the_limit(degrees):
-    # At d = 8 mm, the limit is 36.87°. Larger tilts must be reported as such.
+    # At d = 8 mm, the tilt limit is 36.87°. The estimator must also report larger tilts correctly.
     estimator = ContactEstimator(TIP, MEASURED, GRID, 300.0, free_gain=False)
     e = estimator(GRID.pressure(TIP, MEASURED, 0.008, math.radians(degrees)))
     assert e.valid

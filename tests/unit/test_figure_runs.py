@@ -26,7 +26,7 @@ def test_compression_reaches_8_mm_at_every_angle(compression):
         assert run["d"].max() == pytest.approx(8.0, abs=0.1)
         touching = run["d"] > 0.0
         np.testing.assert_allclose(run["theta"][touching], tilt, atol=1e-9)
-        # The plant gives the true values, which equal the closed form at the frame times.
+        # The true values from the plant equal the closed form at the frame times.
         expected = np.pi * 0.304 * run["d"] ** 2 / np.cos(np.radians(tilt))
         np.testing.assert_allclose(run["F"], expected, rtol=1e-9, atol=1e-12)
 

@@ -67,8 +67,8 @@ def test_checkpoints_of_force_and_energy_versus_displacement(folder, d, theta, f
 
 
 def test_double_integrals_equal_the_one_dimensional_form() -> None:
-    # This is a different evaluation of eqs. 3 and 10. It integrates over y analytically and over x
-    # by Gauss quadrature in t, with a tilt close to the limit of 36.87°.
+    # The reference evaluates eqs. 3 and 10 differently: analytical integration over y, and Gauss
+    # quadrature in t for the integral over x. The tilt is close to the limit of 36.87°.
     a, d, theta, modulus = 0.02, 0.008, np.radians(34.0), 0.304e6
     points, weights = np.polynomial.legendre.leggauss(200)
     t = points * np.pi / 2
@@ -161,8 +161,8 @@ def test_with_shear_the_minimum_is_before_upright(folder: Path) -> None:
     assert felt["least U [deg]"] == pytest.approx(
         minima["least U [deg]"][minima["share [%]"] == 5.0], abs=0.01
     )
-    # The plant's equilibrium includes the springs at the rim, which are sheared from the first
-    # contact.
+    # In the plant, the equilibrium includes the springs at the rim, which are sheared from the
+    # first contact onwards.
     balance = felt["least N cos theta + T sin theta [deg]"]
     assert (balance < minima["least F on the base [deg]"][minima["share [%]"] == 5.0]).all()
     model, plant = read(folder / "fig10_shear.csv"), read(folder / "fig10_shear_plant.csv")
@@ -201,7 +201,8 @@ def test_compression_with_the_sensor_model(folder: Path) -> None:
         # The quadrature over the cells is less accurate. The paper gives the readings to three
         # digits.
         np.testing.assert_allclose(sensed, model, rtol=1e-4)
-        # The bounds are the forces for the minimum and the maximum modulus below full compression.
+        # The bounds are the forces for the minimum and the maximum modulus, up to but not including
+        # full compression.
         assert np.all(law[1:] > 0.135 / 0.304 * model[1:])
         assert np.all(law[1:] < 0.255 / 0.304 * model[1:])
 

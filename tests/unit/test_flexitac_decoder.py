@@ -14,7 +14,7 @@ CELLS = ROWS * COLS
 STRIDE = CELLS + 2
 
 payloads = st.binary(min_size=CELLS, max_size=CELLS)
-# Images that often contain the marker, which may also be split over a frame's first or last byte.
+# Images that often contain the marker, which may also include the first or last byte of a frame.
 nasty = st.lists(
     st.sampled_from([b"\xaa", b"\x55", b"\xaa\x55", b"\x00", b"\x01"]), min_size=CELLS
 ).map(lambda parts: b"".join(parts)[:CELLS])
@@ -80,7 +80,8 @@ def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
         decoded = decoder.feed(frame(images[k]), 0.01 * k)
         assert decoded.data[0, 0] == k
         assert decoded.t == 0.01 * k
-    # Two pieces arrive within the frame time, followed by two pieces with a gap in between.
+    # The two pieces of the first frame arrive within the frame time. Between the two pieces of the
+    # second frame, there is a gap.
     assert decoder.feed(frame(images[5])[:7], 0.05) is None
     assert decoder.feed(frame(images[5])[7:], 0.052) is not None
     assert decoder.feed(frame(images[6])[:7], 0.06) is None
@@ -147,7 +148,8 @@ def test_frames_do_not_depend_on_how_the_stream_is_split(images, start, cuts):
 )
 def test_no_wrong_frame_for_any_images(images, start):
     """From any starting point in images full of AA 55, only sent frames are decoded, in order."""
-    # Append two frames without a common AA 55, so that a constant image cannot remain ambiguous.
+    # Append two frames without AA 55 in the image, so that a constant image cannot remain
+    # ambiguous.
     images = [*images, *numbered(2)]
     stream = b"".join(frame(image) for image in images)[start:]
     found = decode(FlexiTacDecoder(ROWS, COLS), [stream, MARKER])
@@ -182,7 +184,7 @@ def test_a_quiet_line_does_not_confirm_a_frame_that_could_be_incomplete():
     decode(decoder, [frame(image) for image in numbered(3)])
     assert decoder.settle() is not None
     torn = frame(bytes(CELLS))[:-1]
-    # One byte is missing, followed by the first half of the next marker.
+    # The last byte is missing, and the first half of the next marker follows.
     decoder.feed(torn + MARKER[:1], 0.0)
     assert decoder.pending
     assert decoder.settle() is None

@@ -57,8 +57,8 @@ def test_friction_is_measured_by_a_sweep(tmp_path, capsys, friction, more, expec
     assert calibrate("friction", tmp_path) == 0
     told = capsys.readouterr().out
     found = load(tmp_path / "my.toml").control.joint_friction
-    # The additional static friction falls by a factor of e per 0.12 rad/s. At these velocities, a
-    # tenth of it remains.
+    # The additional static friction falls by a factor of e per 0.12 rad/s. At the velocities of
+    # this test, a tenth of this friction remains.
     assert found == pytest.approx(expected, abs=2 * COUNT)
     assert f"control.joint_friction = {found:g}" in told
     assert ("at break-away" in told) == (at_rest is not None)
@@ -165,8 +165,8 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
     record_hand(tmp_path / "run.mcap", FORCES, 4.4, profile=path, hand=plant)
     assert calibrate("latency", tmp_path) == 0
     told = capsys.readouterr().out
-    # Cells with a response time of 60 ms hide part of the latency. With other cells, the latency is
-    # found to within a few ms.
+    # A cell response time of 60 ms hides part of the latency. For all other cells, the latency is
+    # accurate to within a few ms.
     tolerance = 6e-3 if profile == "velostat" else 3e-3
     assert load(tmp_path / "my.toml").tactile.latency == pytest.approx(latency, abs=tolerance)
     assert float(told.split(" ± ")[1].split(" ms")[0]) < 1e3 * tolerance

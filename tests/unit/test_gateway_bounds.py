@@ -99,7 +99,8 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
 ):
     """A repeated message goes to all subscribers, so 50 repeated events would flood them."""
     served.publisher.event(0.0, 0.0, "info", "test", "told again")
-    # Send the event before anyone subscribes, so that it cannot reach an unregistered reader later.
+    # Send the event before the first subscription, so that the event cannot reach an unregistered
+    # reader later.
     served.settle()
     reader = connect(context, zmq.SUB, addresses[0])
     reader.subscribe(EVENT)

@@ -81,13 +81,13 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
     q, d, angle = (0.12, 0.21), (3e-3, 4e-3), -0.1
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a = HAND.tip_radius
-    middle = tips.mean(axis=0)  # Any point of the object is suitable.
+    middle = tips.mean(axis=0)  # Any reference point on the object is suitable.
     w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
     arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
     for dq in ((1.0, 0.0), (0.0, 1.0), (0.3, -0.8)):
-        # The unknowns are (Gx, Gy, φ). The equations keep d_t of both tips constant and change both
-        # d equally.
+        # The unknowns are (Gx, Gy, φ). The equations keep d_t of both tips constant and change d of
+        # both tips by the same amount.
         left = np.array(
             [
                 [*t[0], -w[0]],
@@ -126,7 +126,7 @@ def test_holding_forces_balance_a_tapered_object(grasp, taper):
     felt = [sheared_gradient(looked_up[i], d[i], theta[i], shear[i]) for i in range(2)]
     for i, each in enumerate((normal1, normal2)):
         assert felt[i][0] - shear[i] * math.tan(theta[i]) == pytest.approx(each, rel=1e-4)
-    # Sum the forces on the object at the contacts, and the moments that the tips apply to it.
+    # Sum the contact forces on the object, and the moments that the tips apply to the object.
     forces = [pressed[0] * n[0] - shear[0] * t[0], -pressed[1] * n[1] + shear[1] * t[1]]
     assert sum(forces) == pytest.approx([0.0, 0.0], abs=1e-12)
     touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]
@@ -192,7 +192,7 @@ def test_load_from_torques_equals_the_load_on_the_tips(table, load, delta):
     rolled = 0.5 * (shear[0] + shear[1])
     found, slope = found_load(table, state, rolled)
     assert found == pytest.approx(0.5 * load, rel=0.02, abs=0.01)
-    # The slope converts a torque error into a load error.
+    # The slope relates a torque error to the load error.
     more = 1e-5  # N·m
     again, _ = found_load(table, state, rolled, more)
     assert again - found == pytest.approx(more / slope, rel=0.02)
@@ -230,7 +230,7 @@ def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, tap
     _, _, mean, normal1, normal2 = holding_moment_arms(data, data, d, theta, taper, motion)
     out = 0.5 * lean * (normal1 + normal2)
     rolled = (mean - out, mean + out)
-    # Torques from the energies of both tips, each with its own shear.
+    # Compute the torques from the energies of both tips, each with its own shear.
     v, torques = HAND.tip_jacobian(q), []
     for i, shear in enumerate((rolled[0] + load, rolled[1] - load)):
         at = (i - 0.5) * taper
@@ -333,7 +333,8 @@ def test_symmetric_grasp_values(d, degrees, normal, moment):
     np.testing.assert_allclose(forces.tangential, 0, atol=1e-12)
     lever = 0.080 * np.cos(state.q)
     np.testing.assert_allclose(forces.normal * lever * 1e3, moment, rtol=1e-8)
-    # A joint also carries the moment of the tilted tip, which is 0.1 to 0.4 % here.
+    # Each joint also carries the moment of the tilted tip, which is 0.1 to 0.4 % of the torque
+    # here.
     turning = forces.turning * [1, -1]
     np.testing.assert_allclose(forces.torque, forces.normal * lever + turning, rtol=1e-12)
     np.testing.assert_allclose(grasp.gradient(state)[2:], 0, atol=1e-12)

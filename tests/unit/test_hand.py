@@ -67,10 +67,10 @@ def test_quasi_static_steering_gain(degrees, gain):
 
 
 def test_load_dependent_friction_equals_the_gear_efficiency():
-    # With a friction of a fraction μ of motor and contact torque, the transmitted fraction is (1 −
-    # μ)/(1 + μ). When the gears are backdriven, the fraction is the inverse.
-    # Friction as a fraction of the torque, and a constant term [N·m], half of which acts only at
-    # standstill.
+    # If the friction is a fraction μ of the motor torque and of the contact torque, the gears
+    # transmit the fraction (1 − μ)/(1 + μ). If the contact drives the gears, the fraction is the
+    # inverse. ``share`` is the friction as a fraction of the torque. ``rest`` is a constant
+    # friction torque [N·m], half of which acts only at standstill.
     share, rest = 0.25, 0.02
     simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
     simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}
@@ -99,7 +99,7 @@ def test_gravity_accelerates_a_free_object_and_a_grasp_holds_it():
     start = grasp.symmetric(0.004)
     place(held, start.q, start.pose)
     settled(held, (0.9, 0.9), 0.7, 1.0)
-    # The y components of the tip forces carry the weight to within 1 %, without slip.
+    # The y components of the tip forces equal the weight to within 1 %, and the tips do not slip.
     along = held.tangential * np.cos(held.object_pose[2]) * [-1, 1]
     assert abs(along.sum()) == pytest.approx(0.3 * 9.80665, rel=0.01)
     place_before = held.object_pose[1]
@@ -123,7 +123,7 @@ def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
         run(hand, 0.005)
         ratio = np.abs(hand.tangential) / hand.normal
         assert (ratio <= friction * (1 + 1e-9)).all()
-    # Both tips slip at Coulomb's limit, and only inertia balances the rest of the push.
+    # Both tips slip at the Coulomb limit, and only inertia balances the rest of the push.
     np.testing.assert_allclose(ratio, friction, rtol=1e-6)
     assert push == pytest.approx(2 * friction * hand.normal.mean(), rel=0.15)
 
@@ -217,7 +217,8 @@ def test_end_stops_and_no_load_speed_limit_the_joints():
         run(hand, 0.002)
         fastest = max(fastest, np.abs(hand.dq).max())
     assert fastest < hand.plant.parameters.no_load_speed
-    # The stop yields to 5.4 N·m with 500 N·m/rad, after the clearance of 0.05 rad.
+    # After a clearance of 0.05 rad, the joint stop yields to 5.4 N·m with a stiffness of 500
+    # N·m/rad.
     assert 1.05 < hand.q[0] < 1.07
     assert -0.57 < hand.q[1] < -0.55
 
@@ -287,8 +288,8 @@ def test_samples_are_interpolated_at_the_frame_times():
     for number in range(hand.sample_count - 5, hand.sample_count):
         sample, exact = hand.sample(number), finer.sample(number)
         assert sample.t == number / 130.0
-        # The motion per tick is 1e-4 rad and 4e-6 m. Without interpolation, a sample would have an
-        # error of this size.
+        # Per tick, the finger moves by 1e-4 rad and 4e-6 m. Without interpolation, a sample would
+        # have an error of this size.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):

@@ -114,11 +114,11 @@ def test_systematic_errors_do_not_average_out():
             first = replace(contacts[0])
     contact = contacts[0]
     assert first.d_std == pytest.approx(math.hypot(5e-5, 2e-5), rel=1e-3)
-    # The error must not decrease, because the zero offset can drift.
+    # The standard deviation must not fall below 2e-5 m, because the zero offset can drift.
     assert 2e-5 < contact.d_std < 1.2 * first.d_std
     assert 4e-3 < contact.theta_std < first.theta_std
-    # The force error follows from d by ∂F/∂d = 2F/d and from θ by F tan θ. The modulus is known to
-    # within 20 %.
+    # The force error has three parts: an error in d times ∂F/∂d = 2F/d, an error in θ times F tan
+    # θ, and a modulus error of 20 %.
     by_d, by_theta = 2.0 * contact.force / contact.d * contact.d_std, contact.force * 0.1 * 4e-3
     by_modulus = 0.2 * contact.force
     assert contact.force_std == pytest.approx(math.hypot(by_d, by_theta, by_modulus), rel=0.02)
@@ -200,7 +200,7 @@ def test_joint_motion_compensates_for_slow_cells(response):
     estimator = HandEstimator(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     d, q = 0.003, 0.15
-    # Distances below the tip's apex [m], in equal steps of area.
+    # Distances below the tip's apex [m], with equal steps in area.
     below = np.linspace(0.0, 0.01, 400)
     pressure, shown, fitted = np.maximum(d - below, 0.0), q, (d, 1.0)
     follows = -math.expm1(-0.002 / response)

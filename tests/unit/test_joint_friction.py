@@ -51,7 +51,7 @@ def test_a_constant_load_below_static_friction_causes_no_creep(share):
 
 
 def test_an_oscillating_load_below_static_friction_causes_no_drift():
-    # In this case, a LuGre joint would creep in each period (Dupont et al., 2002).
+    # With the LuGre model, the joint would creep in each period (Dupont et al., 2002).
     hand = joint()
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
     phases = np.arange(0.0, 60.0, 0.02) * 2.0 * math.pi
@@ -61,7 +61,8 @@ def test_an_oscillating_load_below_static_friction_causes_no_drift():
 
 
 def test_very_stiff_bristles_also_stick():
-    # Presliding [rad] and inertia [kg·m²], with a period of 0.3 ms and steps of 0.25 ms.
+    # Presliding [rad] and inertia [kg·m²]. The period of the oscillation is 0.3 ms, and the time
+    # step is 0.25 ms.
     presliding, inertia = 1e-6, 1e-4
     hand = joint(2.5e-4, joint_presliding=presliding, joint_inertia=inertia)
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
@@ -105,8 +106,8 @@ def test_friction_reverses_over_twice_the_presliding_distance():
     closing, opening = torque[turn - 200 : turn].mean(), torque[-200:].mean()
     assert closing == pytest.approx(FRICTION, rel=0.01)
     assert closing - opening == pytest.approx(2.0 * FRICTION, rel=0.01)
-    # The transition is a straight line. Its slope would reveal a presliding distance that is wrong
-    # by a factor of two.
+    # The transition is a straight line. A presliding distance that is wrong by a factor of two
+    # would change the slope.
     within = slice(turn + 20, turn + 80)
     slope, _ = np.polyfit(angle[within], torque[within], 1)
     assert slope == pytest.approx(FRICTION / PRESLIDING, rel=0.02)

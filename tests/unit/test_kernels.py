@@ -105,7 +105,7 @@ def test_an_unknown_field_is_an_error():
 
 
 def test_array_aliases_of_every_numpy_version_are_recognised():
-    # This is NDArray[np.float64] in NumPy 2.5.
+    # NumPy 2.5 defines NDArray[np.float64] as this alias.
     of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))
     for alias in (NDArray[np.float64], of_2_5):
         assert _kind(Annotated[alias, 3]) == (None, np.float64, (3,))

@@ -148,10 +148,10 @@ def test_long_work_is_also_named_except_for_commands(on_late_machine):
 
     def slowly() -> None:
         really()
-        machine.work(0.3)  # This delay represents a slow bus.
+        machine.work(0.3)  # This delay simulates a slow bus.
 
     servos.torque_on = slowly
-    advance_to(daemon, "fault", 2.0)  # The task arms the hand.
+    advance_to(daemon, "fault", 2.0)  # The demo task arms the hand.
     assert (state.fault_name, state.timing.busy_s) == ("servos.bus", 0.0)
     assert state.fault.startswith("the bus watchdog")
     servos.torque_on = really
@@ -204,7 +204,7 @@ def test_the_time_of_a_hand_is_constant_between_sleeps_and_ends_them_on_time():
     assert clock.sleep_until(100.002) == pytest.approx(0.0015)
     assert clock.now() == 100.002
     assert clock.host() == pytest.approx(100.0035)
-    clock.sleep_until(100.004)  # The rest of the period compensates the delay.
+    clock.sleep_until(100.004)  # The rest of the period compensates for the delay.
     assert (clock.now(), clock.host()) == (100.004, 100.004)
     assert clock.behind == 0.0
 

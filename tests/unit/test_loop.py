@@ -243,7 +243,7 @@ def test_a_tare_reports_the_change_of_the_zero(make):
         f"the left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa); "
         "the largest change was +80.0 counts"
     )
-    # The warning compares with the last zero offset, not with the first one.
+    # The reference of the warning is the last zero offset, not the first zero offset.
     assert tared(-10, -60).endswith("the largest change was -150.0 counts")
 
 
@@ -297,7 +297,7 @@ def test_a_frozen_sensor_is_a_fault_until_it_recovers(make):
     assert daemon.loop.state.fault_name == "tactile.frozen"
     assert "the left sensor has sent the same frame" in daemon.loop.state.fault
     assert "clear: tactile: the left sensor has sent the same frame" in refusal(daemon, "clear")
-    del left.sensor.latest  # This line restores the method of the class.
+    del left.sensor.latest  # Restore the method of the class.
     daemon.loop.advance(0.2)
     command(daemon, "clear")
     command(daemon, "arm")

@@ -93,7 +93,7 @@ def test_declared_cell_uncertainties_are_part_of_the_errors(law, name, d):
         assert found.valid
         off = np.array([found.d - d, found.tilt_x - theta, found.tilt_y])
         off_by.append(np.abs(off) / np.sqrt(found.covariance.diagonal()[:3]))
-    # Curves that were fitted with other noise give 1.1 to 1.65 at the smallest depths.
+    # With other noise in the fitted curves, the maximum is 1.1 to 1.65, at the smallest depths.
     assert 0.5 < np.max(off_by) < 2.0
 
 

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.extended
 PAGE = Path(__file__).parents[2] / "docs" / "mujoco.md"
 SETTINGS = checked({"loop": {"clock": "virtual"}})
 RADIUS, FRICTION = SETTINGS.tip.radius, SETTINGS.simulation.tip_friction
-# This tip points along x at a wall whose face is tilted about z.
+# The tip points along x towards a wall, whose face is tilted about z.
 SCENE = """<mujoco><option timestep="0.002" gravity="0 0 0" integrator="{integrator}"/>
 <default><geom contype="0" conaffinity="0"/><joint type="slide" damping="5"/></default><worldbody>
 <body><joint axis="1 0 0"/>{joints}
@@ -73,7 +73,7 @@ def test_friction_is_a_cone_including_the_lateral_direction(used):
         bears = 2.0 * float(tips.table(d, 0.0).force) / d
         assert slid == pytest.approx(push / bears, rel=1e-3)
         assert data.qpos[2] / data.qpos[1] == pytest.approx(4.0 / 3.0, rel=1e-3)
-    else:  # The excess push moves the face against a damping of 5 N·s/m.
+    else:  # The excess of the push moves the face against a damping of 5 N·s/m.
         speed = (push - FRICTION * press) / 5.0
         assert math.hypot(*data.qvel[1:]) == pytest.approx(speed, rel=0.01)
 

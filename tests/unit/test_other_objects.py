@@ -131,7 +131,7 @@ def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts():
         assert rig.state.fault == ""
         tips = HAND.tips(rig.plant.q)
         line = math.atan2(*(tips[1] - tips[0])[::-1])
-        # A curved contact appears slightly less tilted than it is.
+        # The estimator underestimates the tilt of a curved contact slightly.
         assert rig.state.object.angle == pytest.approx(0.95 * line, abs=0.01)
-        # The disc itself has rolled further between the tips.
+        # The disc has rolled further between the tips.
         assert rig.plant.object_pose[2] > 2.0 * line

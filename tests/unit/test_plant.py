@@ -116,8 +116,9 @@ def test_bristles_carry_shear_at_any_tilt_with_the_normal_force_of_the_springs(t
 
 @pytest.mark.parametrize("trial", range(24))
 def test_energy_never_increases_without_input(trial):
-    # The test uses random scenes, masses, moduli and friction, with fingers thrown at the object,
-    # even beyond the rim. One trial in three uses a step that is ten times too long.
+    # Scenes, masses, moduli and friction are random. The fingers start at random angles and speeds,
+    # in some trials with a contact beyond the rim. One trial in three uses a time step that is ten
+    # times too long.
     generator = np.random.default_rng(trial)
     hand = random_hand(generator, trial % 3 == 0)
     held = hand.plant.parameters.object_held
@@ -145,8 +146,8 @@ def test_energy_never_increases_without_input(trial):
 
 @pytest.mark.extended
 def test_the_state_stays_finite_for_random_commands_and_extreme_parameters():
-    # Two in three trials use the plant's own step, and the others a step that is ten times too
-    # long.
+    # Two in three trials use the plant's own time step. The other trials use a step that is ten
+    # times too long.
     assert [wrong for wrong in map(abuse, range(12)) if wrong] == []
 
 
@@ -187,9 +188,9 @@ def test_creep_relaxes_a_stuck_shear_exponentially():
 
 
 def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
-    # The expected values are integrals of the springs' own friction. At first, they follow 1 − (1 −
-    # u/μd)². After each reversal, they follow twice this value for half the distance. Around a
-    # closed path, the value returns to its start.
+    # The expected force is the integral of the friction of the springs. The first loading follows 1
+    # − (1 − u/μd)². After each reversal, the change is twice this function at half the distance.
+    # After a closed path, the force returns to its initial value.
     def virgin(u: float) -> float:
         return 1.0 - (1.0 - min(u / (MU * DEPTH), 1.0)) ** 2
 

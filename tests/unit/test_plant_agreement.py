@@ -104,7 +104,7 @@ def on_face(finger, point, angle):
 def wedge(width, taper=0.0, height=0.060):
     """Return a wedge's contacts; the width refers to half the height, not the centre of mass."""
     lean = 0.5 * taper
-    slope = height * math.tan(lean)  # half the difference in length between the parallel faces
+    slope = height * math.tan(lean)  # half the difference in length between the two parallel faces
     middle = height * slope / (6.0 * width)
     return [
         on_face(0, np.array([-0.5 * width, middle]), -lean),
@@ -148,10 +148,10 @@ class Equations:
     currents: np.ndarray
     loss: float
     weight: np.ndarray
-    # Corners in the object's frame, resting on a palm at y = ``palm``.
+    # Corners in the frame of an object that rests on a palm at y = ``palm``.
     corners: np.ndarray | None = None
     palm: float = 0.0
-    coupling: float = 1.0  # coupling of a shear with d and θ, 0 for bristles
+    coupling: float = 1.0  # coupling of the shear with d and θ; 0 for bristles
 
     def __call__(self, _t, y):
         x, v = y[:5], y[5:10]
@@ -278,7 +278,7 @@ def test_second_order_agreement_with_an_adaptive_solver(name, loss):
         hand = start(scene, loss, count)
         hand.advance(hand.t + SECONDS)
         errors.append(np.abs((compared(hand, scene) - exact) / scale).max())
-        # The motion is smooth, so only the method matters.
+        # The motion is smooth, so the errors depend only on the integration method.
         assert hand.plant.limited_step_count == 0
         assert hand.d.min() > 0.001
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)

@@ -56,12 +56,12 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
             [servo(1, 57600), servo(2, 57600)],
             ["0: 57600 → 2000000 baud", "1: 57600 → 2000000 baud"],
         ),
-        # If one servo is missing and one servo is unexpected, both are the same servo.
+        # If one servo is missing and one servo is unexpected, they are the same servo.
         (BOTH, [servo(1), servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
         (BOTH, [servo(1), servo(7)], ["1: ID 7 → 2"]),
         (OTHER_IDS, [servo(1, 57600)], ["0: ID 1 → 11, 57600 → 2000000 baud"]),
-        # A servo whose finger is not in the scene cannot be the missing servo. With factory
-        # settings at another baud rate, it cannot be assigned.
+        # A servo whose finger is not in the scene cannot be the missing servo. A servo with factory
+        # settings at another baud rate may belong to any finger, so it can be the missing servo.
         (ONLY_LEFT, [servo(2)], ["missing 0", "stranger 2@2000000"]),
         (ONLY_RIGHT, [servo(1)], ["missing 1", "stranger 1@2000000"]),
         (ONLY_RIGHT, [servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),

@@ -75,7 +75,7 @@ def test_rates_are_measured_over_the_last_second():
     assert rates.left == pytest.approx(80.0, abs=1.01)
     assert rates.right == pytest.approx(80.0, abs=1.01)
     assert rates.state == pytest.approx(50.0, abs=0.1)
-    assert rates.tactile == pytest.approx(40.0, abs=2.01)  # Each finger has 20 Hz.
+    assert rates.tactile == pytest.approx(40.0, abs=2.01)  # The frame rate is 20 Hz per finger.
 
 
 @pytest.mark.parametrize(

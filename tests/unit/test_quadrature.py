@@ -134,7 +134,7 @@ def test_values_outside_the_domain():
 radii = st.floats(1e-4, 1.0)
 moduli = st.floats(1.0, 1e9)
 fractions = st.floats(5e-8, 0.9999)  # fraction of the radius
-# Fraction of θ's limit. Tilts close to denormal numbers have no relative precision.
+# Fraction of the θ limit. Tilts close to denormal numbers have no relative precision.
 shares = st.floats(-1.0, 1.0).map(lambda share: share if abs(share) > 1e-150 else 0.0)
 
 

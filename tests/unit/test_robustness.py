@@ -73,8 +73,8 @@ def test_joint_friction_is_estimated_during_the_approach(friction, stiction):
         grip.loop.advance(0.1)
         grip.command("grasp", force=6.0)
         assert grip.until("holding", 4.0)
-        # Static friction that remains while the joint starts to move, plus the damping of the
-        # joint.
+        # The estimate includes joint damping, and the static friction that remains when a joint
+        # starts to move.
         shown = grip.estimator.grasp.free_torque
         assert (shown > friction + 0.5 * stiction).all()
         assert (shown < friction + stiction + 0.025).all()

@@ -28,8 +28,8 @@ def counts(model, contact, t=0.0):
 def test_without_defects_the_forward_model_is_rounded():
     model = sensor()
     for contact in CONTACTS:
-        # A cell between two counts may be rounded either way. The model has fewer points, which
-        # gives an error of 1e-4 of the modulus at the outline.
+        # A reading between two counts may be rounded up or down. The sensor model averages over
+        # fewer points, which causes an error of 1e-4 of the modulus at the outline.
         signal = 0.2 * model.grid.pressure(TIP, LINEAR, *contact)
         np.testing.assert_allclose(counts(model, contact), signal, rtol=0, atol=0.5 + 6.0)
     assert not counts(model, (0.0, 0.2, -0.1)).any()
@@ -40,8 +40,8 @@ def test_noise_has_the_configured_deviation_and_is_clipped_at_zero():
     clean = 0.2 * model.grid.pressure(TIP, LINEAR, *CONTACTS[2])
     strong = clean > 4000.0
     rest = np.concatenate([(counts(model, CONTACTS[2]) - clean)[strong] for _ in range(20)])
-    # For n numbers, the standard deviation scatters by a fraction of 1/√2n, and the mean by 1/√n
-    # standard deviations.
+    # For n numbers, the relative scatter of the standard deviation is 1/√(2n), and the scatter of
+    # the mean is 1/√n standard deviations.
     assert rest.std() == pytest.approx(600.0, rel=4.5 / np.sqrt(2 * rest.size))
     assert abs(rest.mean()) < 4.0 * 600.0 / np.sqrt(rest.size)
     free = counts(model, (0.0, 0.0, 0.0))
@@ -90,7 +90,7 @@ def test_hysteresis_affects_only_unloading_and_loops_close():
     assert force(0.004) == pytest.approx(1.0, abs=1e-9)
     assert force(0.0038) > 1.03
     assert force(0.002) == pytest.approx(1.1, abs=0.005)
-    assert 1.0 < force(0.0021) < 1.07  # The sensor is loaded again within the loop.
+    assert 1.0 < force(0.0021) < 1.07  # The sensor is loaded again within the hysteresis loop.
     assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # The hysteresis loop is closed.
     assert force(0.006) == pytest.approx(1.0, abs=1e-9)
     assert not counts(model, (0.0, 0.0, 0.0)).any()

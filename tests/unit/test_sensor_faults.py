@@ -16,9 +16,9 @@ FORCE = 6.0
 BOTH = {"consistency.left_sensor", "consistency.right_sensor"}
 
 # Each fault has a kind, a value, a duration [s], the affected fingers, the expected events, and the
-# mode expected afterwards. A falling zero offset hides a light touch completely. The joints then
-# hold their position. If only one tip seems to let go, its frames are rejected instead. A rising
-# zero offset is visible next to the footprint.
+# mode expected afterwards. A falling zero offset completely hides a light touch, and the joints
+# then hold their position. If only one tip seems to let go, the daemon rejects the frames of this
+# tip instead. A rising zero offset is visible next to the footprint.
 LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
     "one zero sinks": ("drift", -0.1, 1.0, (0,), {"consistency.left_sensor"}, "armed"),
     "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, "armed"),
@@ -195,7 +195,7 @@ def test_real_loads_and_turns_are_not_measurement_faults(load: tuple[float, floa
 
 
 def given(repeats: RepeatDetector, frames: list[float]) -> bool:
-    for number in frames:  # An increase by a tenth affects only one cell.
+    for number in frames:  # An increase by 10 % affects only one cell.
         repeats.update(np.array([number, number, number, 10.0 * number]).astype(np.uint16))
     return repeats.is_fault
 

@@ -49,8 +49,8 @@ def test_the_grip_force_decreases_after_the_load_is_removed():
         hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
-        # If the load is removed while the fingers are closing, part of the change is attributed to
-        # a stiffer tip.
+        # If the load is removed while the fingers are closing, the estimator attributes part of the
+        # change to a stiffer tip.
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.1)
 
 
@@ -77,8 +77,8 @@ def test_an_object_that_twists_in_the_grip_is_gripped_with_more_force():
         with Hand({"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             start = hand.plant.object_pose[2]
-            # With the object's width as the lever arm, the friction at both tips resists about
-            # 0.25 N·m.
+            # With the object width as the moment arm, the friction at both tips resists about 0.25
+            # N·m.
             for k in range(1, 76):
                 hand.plant.apply_load(0.0, 0.0, 0.4 * k / 75)
                 hand.watch(0.02)
@@ -152,7 +152,7 @@ GIVES_WAY = -0.024  # one velocity count [rad/s]
 
 def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     watched = at_rest()
-    # Without joint motion, a jump is a frame error. A load within the friction is harmless.
+    # A jump without joint motion is a frame error. A load within the friction is harmless.
     assert watched.run(3.0 * FRICTION, 1) == FORCE
     watched = at_rest()
     assert watched.run(0.8 * FRICTION, 1, speed=GIVES_WAY) == FORCE
@@ -160,7 +160,7 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
     assert state.grip_force > 1.15 * (FORCE + 10.0), "must take effect on the same tick"
-    # The limit adds torque constant error, friction and load.
+    # The limit is the force with torque constant error, plus friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9
     # The measured force rises, so the controller now holds the force that the reflex has set.
@@ -224,7 +224,7 @@ def test_current_noise_is_not_a_load_but_does_not_hide_one(force):
     noise = 0.030 * 1.78 * rng.standard_normal((30_000, 2))
     for tick, pair in enumerate(noise.tolist()):
         watched.held.torque_residual = pair
-        # The load was present before the grip.
+        # The load is present before the grip.
         watched.grip.torques(Reading(), ObjectPose(), tick > 500)
         assert watched.grip.target == force
     watched.held.torque_residual = [0.35, 0.35]
@@ -272,7 +272,7 @@ def test_friction_identified_during_the_approach_limits_load_detection():
         for load in np.linspace(0.0, 5.5, 500):
             watched.run(load, 1)
         assert (watched.run(5.5, 100) > FORCE) == raised
-        # The approach current of 0.15 A bounds the torque.
+        # The approach current of 0.15 A limits the torque.
         assert watched.grip.slip.friction == pytest.approx(min(shown, 0.15 * 1.78))
 
 

@@ -71,7 +71,7 @@ def test_torque_after_a_stop_is_detected(soak):
     control = soak.daemon.loop._control
     before = control.state
     soak.daemon.loop.command({"command": "stop"})
-    control.state = before  # This line simulates a missed stop.
+    control.state = before  # Simulate a missed stop.
     soak._carried_out({"command": "stop"}, "holding")
     with pytest.raises(AssertionError, match="after a stop while holding: a motor is driven"):
         soak.run(3)

@@ -39,7 +39,7 @@ class Scene:
         self.arrived: deque[list[zmq.Frame]] = deque()
         self.replies: list[dict[str, Any]] = []
         self.served = Served(commands=f"ipc://{folder}/c", per_second=1e6, clock=self.clock)
-        # Time per message read [s], with which a step reads few messages.
+        # Simulated time per message read [s], so that each step reads few messages.
         self.reading = 0.4 * bounds.TURN_TIME
         self.now = 0
         self.stopped_at = 0
@@ -116,7 +116,7 @@ def test_no_request_from_before_a_stop_is_executed(actions):
     with played() as scene:
         for what, client in actions:
             scene.act(what, client)
-        for _ in range(100):  # The loop reads everything that was sent, including stops.
+        for _ in range(100):  # Let the loop read all requests, including stops.
             scene.act("gateway")
             scene.act("loop")
         asked = scene.asked

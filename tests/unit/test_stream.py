@@ -110,7 +110,7 @@ def test_a_stuck_subscriber_blocks_no_others_and_its_queue_is_bounded(context, a
         for seq in range(10_000):
             state.seq = seq
             publisher.send(STATE, state, BOTH)
-            # This call never returns if it waits for the stuck subscriber.
+            # This call would never return if it waited for the stuck subscriber.
             served.service.step(0.0)
             while reading.poll(0):
                 reading.recv_multipart()
@@ -155,7 +155,7 @@ def test_late_subscribers_receive_settings_and_events_again(context, addresses, 
     publisher.settings(98.0, 0.5, HandInfo("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
-    served.settle()  # Otherwise, the first subscription could arrive earlier.
+    served.settle()  # Otherwise, the subscription could arrive before the events.
     early = subscribe(context, addresses[0])
     told: list[tuple[bytes, dict[str, Any]]] = []
 
@@ -189,7 +189,7 @@ def test_a_long_message_is_sent_in_pieces_and_received_whole(context, addresses,
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorInfo(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     served.publisher.settings(98.0, 0.5, facts)
-    served.settle()  # Otherwise, the first subscriber would receive it twice.
+    served.settle()  # Otherwise, the first subscriber would receive the message twice.
     socket = subscribe(context, addresses[0])
     assert receive(socket, served)[1]["settings"] == facts.settings
     served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)

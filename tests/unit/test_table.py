@@ -30,7 +30,7 @@ HARD = {
     "s-shaped": Material.from_points(Y, 1e5 * (Y + 0.12 * np.sin(6.0 * Y))),
     "root": Material.from_points(Y, 1e5 * Y**0.7),
 }
-# The compiler may fuse different multiply-adds in a loop than in a function call.
+# In a loop, the compiler may fuse different multiply-adds than in a function call.
 FUSED = 1e-12
 OUTPUTS = ("force", "energy", "force_d", "force_theta", "energy_d", "energy_theta")
 
@@ -43,7 +43,7 @@ def table() -> ContactTable:
     return ContactTable.build(TIP, TABLE_I, 1e-9)
 
 
-# Each number of pieces has a law and a tolerance.
+# Maps the number of pieces to a material law and a tolerance.
 SPLITS = {
     1: (TABLE_I, 1e-6),
     2: (TABLE_I, 1e-9),
@@ -212,7 +212,7 @@ def test_values_outside_the_domain_are_clamped_and_flagged(table):
         for sign in (1, -1):
             c = table(0.008, sign * theta)
             assert not c.inside
-            # The limit is computed separately here and in the lookup.
+            # The test and the lookup compute the limit separately.
             assert c.force == pytest.approx(edge.force, rel=FUSED)
             assert c.energy_theta == pytest.approx(sign * edge.energy_theta, rel=FUSED)
     for theta in (0.0, 0.1, -0.12):

@@ -147,7 +147,7 @@ def test_a_stall_that_trips_the_servo_watchdog_is_a_fault(make):
 def test_stop_and_disarm_always_turn_torque_off(make):
     daemon = make()
     for name, more in (("stop", {}), ("disarm", {}), ("stop", {"client": 5, "why": "smoke"})):
-        daemon.loop.torque.servos.torque_on()  # Another program might switch torque on.
+        daemon.loop.torque.servos.torque_on()  # Simulate another program that switches torque on.
         assert command(daemon, name, **more)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
         assert not torque_of(daemon).any()

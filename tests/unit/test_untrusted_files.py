@@ -26,7 +26,7 @@ from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
 
-ROOM = 200e6  # number of bytes in addition to those already mapped
+ROOM = 200e6  # number of additional bytes that may be mapped
 
 
 @pytest.fixture(autouse=True)

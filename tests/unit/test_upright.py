@@ -12,7 +12,7 @@ from softfinger.kinematics.hand.upright import upright_spring
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
-# Half the distance between the pivots, finger length, finger offset and tip radius.
+# Half the pivot distance, finger length, finger offset and tip radius.
 LENGTHS = (0.05, 0.08, 0.0, 0.02)
 START = math.radians(5.0)
 DEPTH, FORCE = 0.0032, 10.0  # The paper's tip has this force at this depth.
@@ -95,8 +95,8 @@ def test_the_upright_law_does_not_use_the_angle(sense, angle_known, simulation):
 
 
 def test_solid_tips_bring_the_object_upright() -> None:
-    # Bonded rubber has no local minimum. The control law therefore uses a different spring, from
-    # the tips' own table.
+    # Bonded rubber has no local minimum. The control law therefore uses a different stiffness,
+    # computed from the contact table of these tips.
     sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
     simulation = {"object_angle": START}
     with SimulatedDaemon(

@@ -52,8 +52,8 @@ def test_the_footprint_matches_the_forward_model(grid, contact):
     centroid = (pressure * cols).sum(), (pressure * rows).sum()
     outline, middle = shown
     assert middle == pytest.approx(np.array(centroid) / pressure.sum(), abs=0.05)
-    # Every loaded cell has a corner inside the outline, and the cells at the ends of the outline
-    # are loaded.
+    # Every loaded cell has a corner inside the outline. The cells at the ends of the outline are
+    # loaded.
     pressed = np.column_stack((cols[pressure > 0.0], rows[pressure > 0.0]))
     low, high = outline.min(axis=0), outline.max(axis=0)
     assert (pressed >= low - 0.5).all()
@@ -185,7 +185,7 @@ def test_colours_are_steps_of_the_cube_root_of_energy() -> None:
         np.minimum(root, 1.0), abs=0.6 / (LEVELS - 1.0)
     )
     assert (np.abs(theta) <= TIP.theta_limit(d) + 1e-3).all()
-    assert (shown.levels == LEVELS).any()  # The picture contains levels without a contact.
+    assert (shown.levels == LEVELS).any()  # The picture contains impossible contacts.
 
 
 # Settings of the hand

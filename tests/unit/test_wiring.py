@@ -125,7 +125,7 @@ def test_the_tilt_shows_whose_motion_a_tip_follows_despite_a_light_contact(follo
 
 
 def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
-    # The approach of a centred object is the same with and without a swap.
+    # With a centred object, the approach is the same with and without swapped servos.
     daemon = make("swapped")
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 2.0)

@@ -86,7 +86,7 @@ def _one_of_many(arguments: argparse.Namespace, settings: Settings, path: Path) 
 
 
 def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> str:
-    path = path if path.name else path.resolve()  # The path "." has no name.
+    path = path if path.name else path.resolve()  # The name of Path(".") is empty.
     table = arguments.csv or path.with_name(path.name + ".contacts.csv")
     own = arguments.config is None and not arguments.set
     source = open_source(path, settings, own)
@@ -110,7 +110,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 
 _EIGHT_BITS = 255
-_NOISE_RATIO = 1.5  # noise divided by tactile.noise, above which the noise is reported
+_NOISE_RATIO = 1.5  # ratio of measured noise to tactile.noise above which the noise is reported
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:

@@ -53,7 +53,7 @@ LINES: dict[str, dict[str, Any]] = {
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
 _POINTS = 700  # maximum number of points per finger and panel; more points would overlap
-# Label, factor, field of the fingers or the object, and field of the goal.
+# Axis label, scale factor, field of the value, and field of the goal.
 _AGAINST_TIME = (
     ("force F [N]", 1.0, "force", "goal_force"),
     ("object angle [°]", DEGREES, "angle", "goal_angle"),
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     require("plot")  # Report a missing package before reading a long recording.
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
-    # Reject files that are not recordings before loading the kernels.
+    # Before loading the kernels, reject files that are not recordings.
     recording = Recording(path, to_stderr("plot"))
     from softfinger.daemon.loop.warm_up import FRAMES
     from softfinger.tools.processes.compile import build_kernels, print_event
@@ -119,7 +119,7 @@ class RecordedRun:
     models: tuple[FingerModel, FingerModel] | None
     why_no_model: str
     states: dict[str, NDArray[Any]]
-    zero: int  # daemon clock at t = 0 [ns]
+    zero: int  # daemon clock time at t = 0 [ns]
 
     @cached_property
     def t(self) -> FloatArray:
@@ -332,7 +332,7 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     low = [level for level in levels[1:-1] if level < 0.65 * largest]
     panel.clabel(lines, low, fmt=lambda level: f"{level:.3g} mJ", fontsize=6.5)
     minima = theta[np.argmin(energy, axis=1)]
-    # The energy of a bonded solid tip decreases towards the sides.
+    # The energy of a bonded solid tip decreases with |θ|, so there is no local minimum.
     local = np.abs(minima) < 0.99 * widest
     if local.any():
         panel.plot(

@@ -32,14 +32,14 @@ MEASUREMENTS = {
     "faults": "true grip force with faulty measurements (15 minutes)",
     "robustness": "true grip force of hands that differ from their settings",
 }
-# These benchmarks run on virtual time, so other load on the machine does not affect them.
+# These benchmarks run on virtual time, so other programs do not affect their results.
 SWEPT = ("reflex", "faults", "robustness")
 PAGE = ("estimator", "tick")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
 _CASES = ("faults", "robustness")
 # Options that apply only to some measurements.
 _OWN = {"full": ("reflex",), "trials": _CASES, "only": _CASES}
-FAILED = 1  # exit status of a failed benchmark; 2 is for invalid arguments
+FAILED = 1  # exit status of a failed benchmark; 2 means invalid arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

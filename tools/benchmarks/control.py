@@ -33,10 +33,10 @@ _FORCE = 10.0  # N
 _ANGLE_STD = math.radians(5.0)
 _DRAW_COUNT = 12
 _READ_TIME = 5.0  # time from the grasp command to the final angle measurement [s]
-_STEERING_TIME = 2.0  # final part of the reading time, in which the angle is controlled to 0 [s]
+_STEERING_TIME = 2.0  # duration of angle control before the final angle measurement [s]
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
-# Bandwidths of the angle integral [Hz]. The slow bandwidth is stable for all these delays, because
-# ω × delay < π/2. The fast bandwidth is the default of `control.rotate_bandwidth`.
+# Bandwidths of the angle integrator [Hz]. The slow integrator is stable at every delay in `DELAYS`,
+# because ω × delay < π/2. The fast bandwidth is the default of `control.rotate_bandwidth`.
 _SLOW_BANDWIDTH, _FAST_BANDWIDTH = 0.5, 4.0
 
 
@@ -103,7 +103,7 @@ class Way(NamedTuple):
     is_steered: bool = False  # True if the measured angle is controlled to 0
     law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's control law
     force: float = _FORCE
-    # Load along x and y that is applied once the grip is established [N].
+    # Load along x and y after the grip is established [N].
     weight: tuple[float, float] = (0.0, 0.0)
 
 
@@ -163,8 +163,9 @@ LATE_LIMITS = {
     for name, (control, law) in _STEERED_LAWS.items()
     for delay in DELAYS
 }
-# At the energy minimum, relaxed tips without coupling have four times the curvature of spring tips.
-# Tips with less than three quarters of the tangential stiffness have an energy maximum instead.
+# Compared with relaxed spring tips, tips without tangential coupling have four times the energy
+# curvature at θ = 0. If the tangential stiffness is less than three quarters of the default, the
+# energy has a maximum at θ = 0.
 _TIPS: dict[str, Sections] = {
     "solid": SOLID,
     "without tangential coupling": {"simulation": {"tip_law": "bristles"}},
@@ -235,7 +236,7 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float:
             hand.run(hand.loop.period)
         hand.plant.apply_load(*way.weight)
         hand.run(begun + _READ_TIME - _STEERING_TIME - hand.now)
-        if way.is_steered:  # Do not wait for a force, because not every control law measures it.
+        if way.is_steered:  # Do not wait for the force: some laws do not measure it.
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERING_TIME)
         is_held = min(hand.plant.force) > 0.0

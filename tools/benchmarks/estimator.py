@@ -55,7 +55,7 @@ _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
 _D_MAX, _TILT_MAX = 0.008, math.radians(30.0)  # [m], [rad]
-_SINGLE_POINT_COUNT = 16  # number of points through which calls with floats cycle
+_SINGLE_POINT_COUNT = 16  # number of points for separate calls with scalar arguments
 _CALL_AIM_NS = 800.0  # target duration of one call [ns]
 
 
@@ -150,7 +150,7 @@ def frames_to_contacts(rounds: int) -> Report:
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
     times = {name: taken / _FRAME_COUNT for name, taken in interleave(subjects, rounds).items()}
-    # Use the minimum, which is least affected by other load on the machine.
+    # Use the minimum, which is affected least by other programs on the machine.
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
     for name, (run, truth, aim) in cases.items():
@@ -188,7 +188,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
             trace -= (cells.pitch_x**2 + cells.pitch_y**2) / 12.0
             for _ in range(4):
                 square = (m_x * m_x + m_y * m_y) / (a - d / 3.0) ** 2
-                # The trace is (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
+                # The trace of the pressure covariance is (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
                 b, c = a * (24.0 - 12.0 * square), 6.0 - 5.0 * square
                 d = float((b - math.sqrt(max(b * b - 144.0 * c * trace, 0.0))) / (2.0 * c))
             s_x, s_y = m_x / (a - d / 3.0), m_y / (a - d / 3.0)

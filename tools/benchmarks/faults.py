@@ -34,7 +34,7 @@ SETTLES = "settles at 0.8 to 1.2 without a force increase"
 BOUNDED = "≤ 50 ms above 1.3, reported within 0.3 s"
 _SETTLED_RANGE = (0.8, 1.2)
 _EXCESS_TIME_MAX = 0.05  # maximum time during which the force may exceed 1.3 times the request [s]
-_REPORT_TIME_MAX = 0.3  # time limit for a report [s], counted from half of the final error
+_REPORT_TIME_MAX = 0.3  # time limit for a report once half of the error has developed [s]
 _SLIDE_MAX = 0.010  # m
 
 # Phases of a trial.
@@ -44,8 +44,8 @@ _OBSERVATION_TIME = 5.0  # observation time after the fault [s]
 _REPEATED_LAG = 1.0  # time from the fault to the second force request [s]
 
 _SENSORS = ("left_sensor", "right_sensor")
-# Full scale of 127.5 kPa, as on real tactile boards. The default of the simulated sensor is 262
-# kPa.
+# Real tactile boards have a full scale of 127.5 kPa, and the simulated sensor has 262 kPa by
+# default.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
@@ -120,8 +120,8 @@ class GripTrial:
 
     false: tuple[str, ...]  # channels that may be reported as faulty
     held: bool = True  # True if the hold was established
-    settled: float = math.nan  # final mean force over both tips, or NaN if the object was released
-    peak: float = 0.0  # maximum force over both tips
+    settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released
+    peak: float = 0.0  # maximum force of either tip
     above: float = 0.0
     slid: float = 0.0  # m
     end: str = ""  # fault or mode at the end

@@ -23,7 +23,7 @@ from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-# Tips with an ideal sensor, followed by spring tips with sensor defects.
+# Three kinds of tips with an ideal sensor, and spring tips with defective sensors.
 TIPS: dict[str, Sections] = {
     "springs": {},
     "bristles": {"simulation": {"tip_law": "bristles"}},
@@ -38,16 +38,16 @@ _FORCE = 10.0  # N
 _TRIAL_COUNT = 3  # number of trials per case
 _RESPONSE_AIM, _REPORT_AIM = 22.0, 200.0  # ms
 _GRIP_TIMEOUT = 5.0  # time limit for establishing the hold [s]
-# Duration of the standing load's ramp, and of the constant standing load after the ramp [s].
+# Durations of the standing-load ramp, and of the constant standing load that follows [s].
 _LOAD_TIME, _STANDING_TIME = 1.0, 1.5
-_LOAD_STEP_COUNT = 50  # number of steps in the ramp of the standing load
-_OBSERVATION_TIME = 1.0  # duration of the larger load, and time limit for reporting a loss [s]
+_LOAD_STEP_COUNT = 50  # number of steps in the standing-load ramp
+_OBSERVATION_TIME = 1.0  # duration of the overload, and time limit for reporting a loss [s]
 
 
 class Overload(NamedTuple):
     """Outcome of one trial."""
 
-    answer: float  # response time [s]; NaN without slip, infinity without reaction
+    answer: float  # response time [s]; NaN if no tip slipped, infinity if the daemon did not react
     slid: float  # maximum displacement while the object was between the tips [m]
     lost: bool
     said: float = math.nan  # time from the loss to its report [s]

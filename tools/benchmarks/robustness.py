@@ -26,18 +26,18 @@ from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
 # Time limit for establishing the hold, duration of the undisturbed hold, and observation time [s].
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
-# Relative force errors, and displacement [m].
+# Two limits of the relative force error, and the displacement limit [m].
 _ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01
 _REPORT_TIME_MAX = 2.0  # time limit for reporting a force error above `_ERROR_MAX` [s]
-# Limits without a load: force divided by the requested force, and time above that ratio [s].
+# Limits without a load: ratio of force to requested force, and time above this ratio [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
 _EVENT_PREFIX = "consistency."
-# Logarithm of the gain error. For larger errors, reporting a faulty sensor is correct.
+# Logarithm of the gain error above which the daemon may report a faulty sensor.
 _GAIN_ERROR_MIN = math.log(1.3)
-_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which no object may be lost
+_LOAD_FRACTION = 0.8  # fraction of the friction limit below which the object must not be lost
 
-# Full scale of 127.5 kPa, as on real tactile boards. The default of the simulated sensor is 262
-# kPa.
+# Real tactile boards have a full scale of 127.5 kPa, and the simulated sensor has 262 kPa by
+# default.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 _LATENCY = Settings().tactile.latency
 
@@ -160,7 +160,7 @@ def drawn(seed: int) -> HandCase:
         * pushed,
         within=chance.choice((0.0, 0.3, 2.0)),
         turn=span(-0.14, 0.14) * turned,
-        # A drift of the zero offset is also a sensor fault.
+        # Zero-offset drift also counts as a sensor fault.
         false=tuple(
             f"{side}_sensor"
             for side, wrong in zip(FINGERS, off, strict=True)
@@ -174,12 +174,12 @@ class Outcome:
     """Outcome of a grip. Forces are relative to the requested force, times are in s."""
 
     held: bool = False  # True if the hold was established
-    settled: float = math.nan  # final mean force over both tips, or NaN if the object was released
-    peak: float = 0.0  # maximum force over both tips without a load
+    settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released
+    peak: float = 0.0  # maximum force of either tip without a load
     above: float = 0.0  # longest time above `_EXCESS_RATIO` without a load [s]
     first_off: float = math.inf  # time when the mean error first rose above `_ERROR_MAX` [s]
     named: float = math.inf  # time of the first diagnosis [s]
-    accused: tuple[str, ...] = ()  # channels that were wrongly diagnosed
+    accused: tuple[str, ...] = ()  # channels that were wrongly diagnosed as faulty
     raised: bool = False  # True if the force was increased without a load
     lost: bool = False
     end: str = ""  # fault or mode at the end

@@ -31,7 +31,7 @@ from softfinger.tools.processes.emulate import emulator_process
 _PRIORITY = 40  # SCHED_FIFO priority
 # Bits per cycle for a fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6 bytes.
 _BITS = 10 * (16 + 36 + 28)
-_IN_TURN = 20  # number of cycles per turn
+_IN_TURN = 20  # number of cycles before switching between ticks and exchanges
 
 
 def measure(brief: bool = False) -> list[Report]:

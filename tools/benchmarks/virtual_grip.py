@@ -18,9 +18,9 @@ from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 
-EXCESS_RATIO = 1.3  # force relative to the requested force
+EXCESS_RATIO = 1.3  # ratio of force to requested force above which the force is excessive
 LOST_SLIDE = 0.1  # displacement along the faces above which the object counts as lost [m]
-_TORQUE_ERROR = 0.1  # maximum relative torque constant error
+_TORQUE_ERROR = 0.1  # maximum relative error of the torque constant
 # Goal current that counts as a reaction, relative to the current during the hold.
 _INCREASED_RATIO = 1.25
 _AVERAGING_TIME = 0.5  # final part of the hold over which the force is averaged [s]
@@ -32,13 +32,13 @@ class Watch:
 
     def __init__(self, asked: float, too_much: float = EXCESS_RATIO) -> None:
         self.asked = asked  # requested force [N]
-        self.too_much = too_much  # limit relative to the requested force
+        self.too_much = too_much  # force limit relative to the requested force
         self.peak = 0.0  # maximum force relative to the requested force
         self.above = 0.0  # longest time above `too_much` [s]
         self.slid = 0.0  # object displacement while torque is on [m]
         # Pairs of time [s] and force relative to the requested force.
         self._mean: list[tuple[float, float]] = []
-        self._below = math.inf  # start of the current period above the limit [s]
+        self._below = math.inf  # time at which the force last rose above the limit [s]
         self._place: Sequence[float] = ()
 
     def see(self, t: float, forces: Sequence[float], place: Sequence[float], torque: bool) -> None:
@@ -77,7 +77,7 @@ class VirtualGrip(SimulatedDaemon):
         ``hand`` contains the hand's settings if they differ from the daemon's settings. ``torque``
         is the true torque constant divided by the configured value.
         """
-        self.alarms: list[tuple[float, str]] = []  # time [s] and kind of warnings and errors
+        self.alarms: list[tuple[float, str]] = []  # time [s] and kind of each warning or error
         super().__init__(merged(daemon, {}), None if hand is None else merged(hand, {}))
         self.plant.plant.parameters.torque_constant *= torque
         self.look: Callable[[], None] = lambda: None

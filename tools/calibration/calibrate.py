@@ -33,11 +33,10 @@ STEPS = (
     "scales",
 )
 _OF_PROFILE = STEPS[: STEPS.index("tare")]  # All other steps calibrate a single tip.
-# Fraction of the prior standard deviation of a sensor's gain. If the standard deviation is larger
-# than this fraction, the gain has never been measured in a grip.
+# If the standard deviation of a sensor gain exceeds this fraction of its prior value, the gain has
+# never been measured in a grip.
 _LEARNT = 0.8
-# Minimum relative standard deviation of each factor, because rubber and joints change from day to
-# day.
+# Minimum relative standard deviation of each factor. Rubber and joints change from day to day.
 _LEAST = 0.02
 _EPILOG = """\
 steps of a hand; FILE is a profile, copied from that of --config if it does not exist:
@@ -132,7 +131,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "{finger} and {pose} are replaced (pose: closed, open or zero)",
     )
     parser.add_argument("--no-plot", action="store_true", help="do not plot the result")
-    add_daemon(parser, addresses)  # The steps friction, latency and scales use this option.
+    add_daemon(parser, addresses)  # The `friction`, `latency` and `scales` steps use this option.
 
 
 def run(arguments: argparse.Namespace) -> int:

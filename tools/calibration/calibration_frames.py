@@ -31,7 +31,7 @@ from softfinger.tools.arguments import to_stderr
 
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
 _PATIENCE = 10.0  # maximum interval without a new frame [s]
-_WAIT = 60.0  # time limit for --move [s]
+_WAIT = 60.0  # time limit for `--move` [s]
 _BEFORE = 4000  # maximum number of frames stored before a hold
 
 
@@ -77,7 +77,8 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
                 raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
-            # If one recording contains the whole run, each frame with a contact counts as a load.
+            # If a single recording contains the whole run, each frame with a contact counts as a
+            # load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
             frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
             return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
@@ -130,7 +131,7 @@ def _live(
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
                 bring(arguments, told, {"load": k + 1, **load})
-            # Frames that were scanned earlier may still show the load before this one.
+            # Frames that were scanned earlier may still show the previous load.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads

@@ -26,12 +26,12 @@ from softfinger.tools.recordings.reader import read_recording
 # break-away friction; fast sweeps determine the other friction parameters.
 _SWEEPS = ((0.05, 0.06, 2), (0.3, 0.4, 2), (0.6, 0.4, 2))
 _WIDEST = max(wide for _, wide, _ in _SWEEPS)
-_FROM_ENDS = 0.05  # margin to each end of the joint range [rad]
-# Tolerance for the start of a sweep, because friction may stop a joint before its goal [rad].
+_FROM_ENDS = 0.05  # margin at each end of the joint range [rad]
+# Angle tolerance at the start of a sweep [rad]. Friction may stop a joint before its goal.
 _ARRIVED = 0.05
-_REST = 0.3  # pause between two strokes, in addition to the setpoint's smoothing time [s]
-_TOUCHED = 0.2  # time discarded before and after each contact [s], because detection takes time
-# Break-away friction is reported if it exceeds sliding friction by this number of standard
+_REST = 0.3  # pause between two strokes, in addition to the setpoint smoothing time [s]
+_TOUCHED = 0.2  # time discarded before and after each contact [s]; contact detection takes time
+# The break-away friction is reported if it exceeds the sliding friction by this number of standard
 # deviations.
 _SEEN = 2.0
 

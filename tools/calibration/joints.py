@@ -36,9 +36,9 @@ _POSES = {
     "open": "open the finger fully",
     "zero": "point the finger straight away from the palm",
 }
-_LEAST = 0.2  # minimum rotation between open and closed [rad]
-_ALONE = 0.25  # maximum motion of the other finger, as a fraction of the rotation
-_MARGIN = 0.03  # margin between the stops and the commanded range [rad]
+_LEAST = 0.2  # minimum joint rotation from open to closed [rad]
+_ALONE = 0.25  # maximum rotation of the other joint, as a fraction of this joint's rotation
+_MARGIN = 0.03  # margin between each joint stop and the commanded range [rad]
 _Counts = dict[int, int]  # The keys are servo IDs.
 
 
@@ -106,7 +106,8 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
                 f"servo {servo}: torque is on: stop `softfinger run`, or send `disarm`"
             )
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # After power-up, a servo's position is its encoder count, which is less than one turn.
+        # After power-up, the position of a servo is its encoder count, which is always less than
+        # one turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder

@@ -29,12 +29,13 @@ FloatArray = NDArray[np.float64]
 _STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, divided by the first force
 _HELD = 0.5  # hold time per force [s]
 _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
-# Accepted ratio of d from frames to d from joints. A ratio outside this range means that the frames
-# do not follow the joints.
+# Accepted range for the ratio of d from frames to d from joints. A ratio outside this range means
+# that the frames do not follow the joints.
 _SCALE = 0.5, 2.0
-_MISFIT_MAX = 0.3e-3  # RMS limit [m]; larger values indicate sliding, tilting or a second contact
-# Relative errors of d from frames: the first applies if d is estimated from the frame's shape, the
-# second if d is estimated from its amplitude.
+# Maximum rms residual [m]. Larger values indicate sliding, tilting or a second contact.
+_MISFIT_MAX = 0.3e-3
+# Relative errors of d from frames. The first error applies if d is estimated from the frame shape,
+# and the second error applies if d is estimated from the frame amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 

@@ -19,7 +19,7 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import client_keys
 
 _MOST = 1000  # maximum number of messages per read
-_WITHIN = 20.0  # time limit for each command on the hand's clock [s]
+_WITHIN = 20.0  # time limit for each command, measured on the hand's clock [s]
 
 
 class LiveHand:
@@ -35,7 +35,7 @@ class LiveHand:
         self._address, self._keys = arguments.address, arguments.keys
         self._taken: list[tuple[bytes, dict[str, Any]]] = []
         self._disarm = False
-        self._commanded = False  # True once a command in this context has been accepted
+        self._commanded = False  # True once the daemon has accepted a command
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:

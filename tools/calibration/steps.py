@@ -64,10 +64,10 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-# Minimum softening after the first loads that is worth reporting, as a fraction. Test plates and
-# noise cause less softening.
+# A warning is given if the rubber softens by more than this fraction after the first loads. The
+# test plate and noise cause smaller changes.
 _SOFTENS = 0.03
-# New calibration, summary line, and panels of the plot.
+# New calibration, summary line, and plot panels.
 Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 
@@ -212,7 +212,7 @@ def _curve(step: Step) -> Done:
         d = truths.get("d")
         if d is None:
             raise CalibrationError("curve: expected --force or --d, or a run that contains them")
-        # Compute the force from the profile's material over the whole footprint.
+        # Compute the force on the whole footprint from the material in the profile.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
         pressures = [
             step.plain_grid.pressure(tip, material, float(x), float(theta))

@@ -31,7 +31,7 @@ parser.add_argument("--picture", default="grasp_and_turn.png")
 where = parser.parse_known_args()[0]  # Ignore the arguments of a notebook kernel.
 
 FORCE = 8.0  # N on each tip
-ANGLES = (12.0, -12.0, 0.0)  # angles in this order [degrees]
+ANGLES = (12.0, -12.0, 0.0)  # successive object angles [degrees]
 DEGREES = math.degrees(1.0)
 
 
@@ -68,7 +68,7 @@ touching = {name: columns[f"{name}.contact"] for name in ("left", "right")}
 held = columns["mode"] == "holding"
 print(f"force while holding: {columns['left.force'][held].mean():.2f} N, commanded {FORCE:g} N")
 
-# %% Compute the energy landscape of the built-in hand's fingertip, and its minimum over θ
+# %% Compute the energy landscape of the built-in hand's fingertip, and the minimum energy over θ
 tip, material = Fingertip(radius=0.020), Material.table_i()
 table = ContactTable.build(tip, material)
 deepest = 1.25 * max(columns[f"{name}.d"][touching[name]].max() for name in touching)

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 PITCH = 0.058 / 44  # m
 GRID = SensorGrid(rows=44, cols=44, pitch=PITCH)
 
-TILTED = -11.5  # relative angle after the finger has rotated [degrees]
-ROLLED = 9.2  # relative angle after the object has rolled by 20.7° [degrees]
+TILTED = -11.5  # angle between finger and object after the finger rotation [degrees]
+ROLLED = 9.2  # angle between finger and object after rolling by 20.7° [degrees]
 
 
 def _force(d: Numbers, theta: Numbers) -> FloatArray:
@@ -216,7 +216,7 @@ def integrated_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def _appendix() -> tuple[Sheet, ...]:
-    d = np.arange(1, 81) / 10.0  # At d = 0, the terms cancel.
+    d = np.arange(1, 81) / 10.0  # Exclude d = 0, where all terms are zero.
     metres = d * MILLI
     columns = {"d [mm]": d}
     for how, terms in (

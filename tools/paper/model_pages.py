@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 TIP = Fingertip(radius=0.020)
-MODULUS = TABLE_I_MAXIMUM  # the paper's choice [Pa]
+MODULUS = TABLE_I_MAXIMUM  # modulus used in the paper [Pa]
 MILLI = 1e-3
 MPA = 1e-6
 _NODES = 64  # number of Gauss nodes per double integral
-_STEEP_TILT = 25  # tilt at which the slope is reported [degrees]
-_FITTED = slice(10, None)  # rows from 1 to 8 mm, to which the exponents are fitted
+_STEEP_TILT = 25  # tilt at which the page states the slope [degrees]
+_FITTED = slice(10, None)  # rows for d = 1 mm to 8 mm, from which the exponents are fitted
 _STEP = 1e-4  # finite-difference step, relative or in rad
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
@@ -141,7 +141,7 @@ class Plotted:
     unit: str
     scale: float  # factor from SI to this unit
     row: int  # row in closed_forms and double_integrals
-    slope: int  # row of the derivative with respect to d in closed_forms
+    slope: int  # row of the d derivative in closed_forms
     exponent: int
     equation: int
     power: str  # power law in d at θ = 0

@@ -52,7 +52,7 @@ _HALF_SEPARATION = 0.050
 _ROLL_STEPS = 104  # number of frames during rolling
 _LATE_FRAME_COUNT = 2  # number of frames in transit
 _RELATIVE_D_MIN = 1.0  # displacement above which the page shows relative errors [mm]
-_ROLLED_AT = 4  # displacement in the figure of the whole path [mm]
+_ROLLED_AT = 4  # displacement in the whole-path figure [mm]
 _PATH = -12.5, 10.5
 _SCALES = {"d": 1e3, "theta": 1.0}  # factors for displayed errors
 

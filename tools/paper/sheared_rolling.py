@@ -46,9 +46,9 @@ from softfinger.tools.style import GREY, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHARES = (0.0, 0.02, 0.05, 0.1)  # values drawn
+SHARES = (0.0, 0.02, 0.05, 0.1)  # shares shown in the figure
 _EACH = tuple(k / 100.0 for k in range(11))
-DEPTH, SHARE = 6, 0.05  # depth [mm] and share of the case that the plant also simulates
+DEPTH, SHARE = 6, 0.05  # displacement d [mm] and share of the case that is also simulated
 _STEPS = 208
 _FORCE, _SLOPE, _ENERGY = "F on the base", "dU/dd", "U"
 

@@ -80,13 +80,13 @@ class Erratum:
 class Panel:
     """Axes in a figure: drawing function, labels, limits and legend."""
 
-    content: Callable[..., None]  # function that is called with the axes and all sheets
+    content: Callable[..., None]  # drawing function, called with the axes and all sheets
     xlabel: str
     ylabel: str
     title: str = ""
     x: Ends | None = None
     y: Ends | None = None
-    legend: str | dict[str, Any] = ""  # location, or keyword arguments for matplotlib
+    legend: str | dict[str, Any] = ""  # legend location, or keyword arguments of `Axes.legend`
 
     def draw(self, axes: Axes, sheets: Sequence[Sheet]) -> None:
         self.content(axes, *sheets)

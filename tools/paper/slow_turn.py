@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 FORCE, WIDTH = 10.0, 0.040  # force per tip base [N] and object width [m]
 REACH = math.radians(8.0)  # maximum object angle per side
 ANTISYMMETRIC_ANGLES = (-4, -2, 0, 2, 4)  # degrees
-_SWING_TIME = 4.0  # time of a swing from 0 to REACH [s]
+_SWING_TIME = 4.0  # duration of a swing from 0 to REACH [s]
 _SIDE_ANGLES = np.radians(np.linspace(-2.5, 2.5, 41))
 _STEPS = 64
 _FRICTION = 0.6

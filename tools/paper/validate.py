@@ -35,7 +35,7 @@ TILTS = np.radians(np.linspace(0.0, 20.0, 41))
 FIGURES = {"agree": "✓", "disagree": "✗", "unknown": "?"}
 _TRIALS = 5
 _FRAMES = 64
-_PRESSED = 0.005, 0.2  # contact in the sensor frames [m, rad]
+_PRESSED = 0.005, 0.2  # displacement d [m] and tilt [rad] in the sensor frames
 
 
 class PublishedValue(NamedTuple):

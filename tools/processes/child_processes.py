@@ -21,7 +21,7 @@ from softfinger.daemon.errors import SoftfingerError
 
 # This sequence restores the terminal if the monitor was killed.
 RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
-_RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe or to close its file [s]
+_RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe, and to close its file [s]
 
 
 class RecorderError(SoftfingerError):
@@ -95,7 +95,7 @@ class MonitorProcess:
                 break
             except subprocess.TimeoutExpired:
                 end()
-        # If the monitor was killed, the screen still shows its page.
+        # If the monitor was killed, the monitor page is still on the screen.
         if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)

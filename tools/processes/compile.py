@@ -134,12 +134,12 @@ class _Build:
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
         self._head = f"{settings.model_dump_json()}\n"
         self._missing = missing
-        self._at: dict[str, str] = {}  # kernel that each part is compiling
+        self._at: dict[str, str] = {}  # kernel that is being compiled for each part
         self._total, self._begun = _kernels(missing), 0
         self._started = time.monotonic()
         self._bar, self._tell = bar, tell
         self._processes: list[subprocess.Popen[str]] = []
-        self._own = threading.local()  # Each thread has one process.
+        self._own = threading.local()  # Each thread uses its own process.
         self.failed = self._over = False
 
     def run(self) -> None:

@@ -23,7 +23,8 @@ from typing import Any, TextIO
 
 from softfinger.daemon.own_files import write_text
 
-# Maximum number of lines queued for a slow reader. The oldest lines are dropped.
+# Maximum number of lines queued for a slow reader. If the queue is full, the oldest line is
+# dropped.
 _LINE_COUNT_MAX = 1000
 _PRIORITIES = {"error": "<3>", "warning": "<4>", "": "<6>", "info": "<6>"}  # see sd-daemon(3)
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
@@ -99,7 +100,7 @@ class EventLog:
             shown = text
         else:
             shown = f"{level:7} {kind:8} {text}"
-            if not self._journal:  # The journal adds the time itself.
+            if not self._journal:  # The systemd journal adds the time.
                 date = "%H:%M:%S" if self._file is None else "%Y-%m-%d %H:%M:%S"
                 shown = f"{_clock(date, timestamp)} {shown}"
         if self._journal:

@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.no_task:
         settings = settings.model_copy(update={"task": TaskSettings()})
     signals = Signals()
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # Ignore the signal until the loop runs.
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # Ignore SIGUSR1 until the loop runs.
     try:
         log = EventLog(arguments.log, arguments.log_file)
     except OSError as error:
@@ -211,7 +211,7 @@ def _numbers(state: State) -> dict[str, Any]:
     """Return the numbers to log with an event; ``seq`` identifies the event in a recording."""
     numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
     real = {
-        name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON lacks NaN.
+        name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON has no NaN.
         for name, pair in numbers.items()
     }
     return {"seq": state.seq, "mode": state.mode, **real}

@@ -168,7 +168,7 @@ def export(
     OSError, MissingExtra
     """
     tables: dict[bytes, Table] = {}
-    grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts of each finger
+    grids: dict[str, tuple[list[float], list[Any]]] = {}  # scan times and counts of each finger
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):

@@ -33,10 +33,11 @@ __all__ = ["Recording", "read_recording"]
 _MESSAGE_SIZE_MAX = 1 << 20  # maximum message size [bytes]; a frame of the largest grid has 0.2 MB
 _SETTINGS_SIZE_MAX = 4 << 20  # maximum settings size [bytes], including per-cell calibrations
 _CHUNK_SIZE_MAX = 64 << 20  # unpacked chunk size limit [bytes]; chunks usually have 1 to 8 MB
-# Minimum size counted per channel or message [bytes], because reading each record takes time.
+# Each channel or message counts as at least this number of bytes, because reading a record takes
+# time.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
-_OTHERS_NAMED_MAX = 3  # maximum number of other programs' channels listed in a warning
+_OTHERS_NAMED_MAX = 3  # maximum number of other programs' channels in a warning
 _FIELD_COUNT_MAX = 500  # maximum number of fields per message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # record header with kind and content size
@@ -101,12 +102,12 @@ class Recording:
         self.damage = ""  # description of the first defect found so far
         self._say = say
         self.counts: dict[str, int] = {}
-        self.others: dict[str, int] = {}  # number of messages in each channel of other programs
+        self.others: dict[str, int] = {}  # number of messages in each channel from other programs
         self.start = math.nan
         self.end = math.nan
         self.chunks = 0
         self._first = 0  # log time of the earliest message [ns]
-        self._left = 0  # remaining limit for unpacked data [bytes]
+        self._left = 0  # number of bytes that may still be unpacked
         self._names: dict[int, str] = {}  # maps channel numbers to channel names
         self._other_names: dict[int, str] = {}
         try:
@@ -162,14 +163,14 @@ class Recording:
     @cached_property
     def zero(self) -> int:
         """Daemon clock time of the first message [ns], which is the origin of all times ``t``."""
-        state = self._left, self.chunks  # Loops over messages use these variables.
+        state = self._left, self.chunks  # Save the variables that the loop changes.
         for _, message in self.messages():
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
             if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):
-                # A frame's clock time is its scan time, but its timestamp is its arrival time.
+                # A frame's mono_ns is the scan time, but its timestamp is the arrival time.
                 after = stamp - self.start - float(message.get("delay_s", 0.0))
                 self._left, self.chunks = state
-                # The Unix time is a float with a resolution of 0.2 µs.
+                # The timestamp is a float with a resolution of 0.2 µs.
                 return mono - round(after * 1e6) * 1000
         return 0
 
@@ -265,7 +266,7 @@ class Recording:
             for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
                 if (message := self._take_record(kind, content)) is not None:
                     yield message
-        # The exceptions for format errors and compression errors have no common base class.
+        # Format errors and compression errors raise exceptions without a common base class.
         except Exception as error:
             self._damaged(error)
 
@@ -309,7 +310,7 @@ class Recording:
     def _damaged(self, error: Exception | None) -> None:
         first = not self.damage
         usual = "the end of the file is missing" if self.truncated else "a chunk can't be read"
-        # The MCAP library's messages about lengths and checksums would not help the user.
+        # The messages of the MCAP library about lengths and checksums would not help the user.
         self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
         if first and self._say is not None:
             what = "cut short" if self.truncated else "damaged"

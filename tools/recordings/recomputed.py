@@ -28,7 +28,7 @@ from softfinger.tools.recordings.reader import MessageSource, Recording
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
-# Fields that depend on the machine's timing rather than on the loop's inputs.
+# Fields that depend on the timing of the machine rather than on the inputs of the loop.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of hand/settings
@@ -40,7 +40,7 @@ class Difference:
 
     count: int = 0
     first_tick: int = 0
-    recorded: Any = None  # value at the first difference
+    recorded: Any = None  # recorded value at the first difference
     recomputed: Any = None
     worst: float = 0.0  # largest numerical difference
     worst_tick: int = 0
@@ -53,7 +53,7 @@ class Comparison:
     ticks: int = 0
     states: int = 0
     fields: int = 0
-    from_start: bool = False  # True if the recording contains the first tick
+    from_start: bool = False  # True if the recording starts with the daemon's first tick
     missing_ticks: int = 0
     missing_frames: int = 0
     differences: dict[str, Difference] = field(default_factory=dict)
@@ -160,7 +160,7 @@ def _run(
     calibrations: list[str],
     progress: Callable[[int], None] | None,
 ) -> None:
-    # Importing the loop is slow, so reject recordings without settings or inputs first.
+    # Importing the loop is slow, so first reject recordings without settings or inputs.
     from softfinger.daemon.loop.process_replay import ProcessReplay
     from softfinger.daemon.loop.publishing import parts
 
@@ -202,8 +202,7 @@ def _run(
             _compare(result, state, again)
 
 
-# Tick input, numbers of recent frames by (finger, seq), commands, and state (None if the state is
-# missing).
+# Tick input, recent frames by (finger, seq), commands, and state, which is None if it is missing.
 _Tick = tuple[
     dict[str, Any], dict[tuple[int, int], Any], list[dict[str, Any]], dict[str, Any] | None
 ]

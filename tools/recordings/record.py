@@ -50,17 +50,18 @@ With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mc
 `replay --recompute` requires --topics all; `run --record` records all topics from the first tick.
 Exit status: 0 everything was written, 1 something was not written, with the reason."""
 
-_SILENCE_TIME = 2.0  # time without messages before a notice is printed [s]
-# Time between socket reads [s]. Waking up for each message would take longer than processing it.
+_SILENCE_TIME = 2.0  # time without messages after which a notice is printed [s]
+# Time between socket reads [s]. Waking up for each message would take longer than processing the
+# message.
 _POLL_INTERVAL = 0.1
 _BACKLOG_TIMEOUT = 10.0  # time limit for processing queued messages at the end [s]
 _TRANSIT_TIME = 0.5  # time allowed at the end for messages that are still in transit [s]
-_PROGRESS_INTERVAL = 0.5  # time between progress lines and between flushes [s]
+_PROGRESS_INTERVAL = 0.5  # time between two progress lines, and between two flushes [s]
 _BATCH_SIZE = 1000  # number of messages between time checks
 
 
-# If the recorder is killed, only the incomplete chunk is lost. The chunk contains the messages
-# since the last flush.
+# If the recorder is killed, only the incomplete chunk is lost. The incomplete chunk contains the
+# messages since the last flush.
 CHUNK_SIZE = 256 * 1024  # chunk size before compression [bytes], 0.2 s of state at 1 kHz
 
 
@@ -82,12 +83,12 @@ class RecordingWriter:
         self._dumps = orjson.dumps
         self._added = 0  # number of messages, including those in the incomplete chunk
         self._filled = 0  # number of bytes in the incomplete chunk
-        # The key is the topic or, for tactile frames, the channel name.
+        # Each key is a topic or, for tactile frames, a channel name.
         self._channels: dict[bytes | str, tuple[int, Converter]] = {}
         self._schemas: dict[bytes, int] = {}
         self._ended = False
         self._newest = math.nan  # time of the newest message [s]
-        # Repeated messages that arrived before any other message.
+        # Repeated messages that arrived before the first new message.
         self._early: list[tuple[bytes, dict[str, Any]]] = []
         try:
             # The buffer is large enough to hold a chunk in one write.
@@ -101,7 +102,7 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
-            # This chunk size is above the limit at which `add` ends a chunk.
+            # This chunk size is larger than the size at which `add` ends a chunk.
             self._mcap = Writer(self._file, 2 * CHUNK_SIZE)
             self._mcap.start(PROFILE, LIBRARY)
             self._wrote()
@@ -148,7 +149,7 @@ class RecordingWriter:
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._wrote()
             self._file.close()
-            # Free the index of all chunks, which occupies most of the writer's memory.
+            # Free the chunk index, which occupies most of the writer's memory.
             del self._mcap
         except OSError as error:
             raise self._failed(error) from None
@@ -166,7 +167,7 @@ class RecordingWriter:
             channel, convert = self._channels[key]
             try:
                 data = self._dumps(convert(message))
-            except TypeError:  # orjson also raises this for values that JSON cannot represent.
+            except TypeError:  # orjson raises TypeError for values that JSON cannot represent.
                 return
             sequence = message.get("seq")
             sequence = sequence & 0xFFFFFFFF if isinstance(sequence, int) else 0
@@ -243,7 +244,7 @@ class _Recorder:
     def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
         self._ending = ending
-        self._keys = client_keys(arguments.keys)  # Errors must occur before a file is created.
+        self._keys = client_keys(arguments.keys)  # Report key errors before a file is created.
         self._gaps: dict[bytes, Gaps] = {}
         # The last writer in this list is the active writer.
         self._writers = [RecordingWriter(arguments.file)]
@@ -296,8 +297,8 @@ class _Recorder:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)
                 shown = now
-        # Messages sent before a signal may arrive after the signal. The daemon's last messages are
-        # an example.
+        # Some messages that were sent before a signal, such as the daemon's last messages, arrive
+        # after the signal.
         self._read_remaining(
             socket, _TRANSIT_TIME if ending.is_requested or not ending.is_met else 0.0
         )
@@ -320,7 +321,7 @@ class _Recorder:
                     return
                 began = time.monotonic()
                 socket.poll(int(_POLL_INTERVAL * 1e3))
-                # If the process stalls, the stall counts as one poll interval.
+                # If the process stalls, count the stall as one poll interval.
                 quiet -= min(time.monotonic() - began, _POLL_INTERVAL)
 
     def _take(self, frames: list[bytes]) -> None:

@@ -120,7 +120,7 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     from softfinger.tools.recordings.recomputed import recompute, recorded_settings
     from softfinger.tools.sweep import Progress
 
-    # Check that the recording contains settings before the kernels are loaded.
+    # Before loading the kernels, check that the recording contains settings.
     recorded, _ = recorded_settings(recording)
     from softfinger.tools.processes.compile import build_kernels, print_event
 
@@ -188,7 +188,7 @@ class Wire:
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
         """Publish one message as soon as the gateway can accept it."""
-        if topic not in schema.TOPICS:  # The topic comes from another version.
+        if topic not in schema.TOPICS:  # Another version of softfinger uses this topic.
             return
         give_up = time.monotonic() + _SEND_TIMEOUT
         while not self._link.look() and time.monotonic() < give_up:

@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     shapes = tuple(arguments.shape or SHAPES)
     axes = (
         tuple(sorted(arguments.friction or FRICTIONS)),
-        tuple(sorted(arguments.mass or MASSES)),  # The reader of the map requires sorted values.
+        tuple(sorted(arguments.mass or MASSES)),  # The axes of the map must be sorted.
         tuple(sorted(arguments.size or SIZES)),
     )
     print(
@@ -174,7 +174,7 @@ def grasped(
         if hand.mode != "holding":
             return Cell(REFUSED, math.nan)
         before = hand.plant.object_pose.copy()
-        # Table friction opposes the load, so increase the load by the friction.
+        # Table friction opposes the load, so add the friction to the load.
         pull = weight * (1.0 + settings.simulation.table_friction)
         for k in range(_LOAD_STEP_COUNT):
             load, phi = pull * (k + 1) / _LOAD_STEP_COUNT, float(hand.plant.object_pose[2])

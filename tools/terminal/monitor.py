@@ -33,11 +33,11 @@ from softfinger.tools.terminal.status import describe
 from softfinger.tools.terminal.stream_state import Commander, StreamReader, StreamState, printable
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
-STEP_ANGLE = math.radians(5.0)  # object rotation per press of an arrow key [rad]
-# Upper limit of a force range [N], and step in this range [N].
+STEP_ANGLE = math.radians(5.0)  # object rotation per arrow-key press [rad]
+# Upper limit of each force range [N], and force step in this range [N].
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
 _ACCUMULATION_TIME = 1.0  # time within which key presses are combined [s]
-_CONFIRMATION_TIME = 3.0  # time limit for the second d key press, which confirms disarming [s]
+_CONFIRMATION_TIME = 3.0  # time limit for the second press of d, which confirms disarming [s]
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
@@ -51,7 +51,7 @@ class HandKeys:
         self._target: float | None = None  # object angle [rad]
         self._chosen = math.nan  # grasp force [N]
         self._pressed = -math.inf  # time of the last force change made on this page
-        self._asked = -math.inf  # time of the first d key press during a grip
+        self._asked = -math.inf  # time of the first press of d during a grip
 
     def press(self, key: str, now: float) -> None:
         """Send the command assigned to a key; ignore unassigned keys."""

@@ -67,7 +67,7 @@ _KEYS_EXPLAINED = (
     ("+ -", "increase or reduce the force, including that of the current grip"),
 )
 
-# Label, field, factor, decimals, unit, and field of the standard deviation.
+# Label, field, scale factor, number of decimals, unit, and field of the standard deviation.
 _ROWS = (
     ("d", "d", 1e3, 2, "mm", "d_std"),
     ("θ", "theta", math.degrees(1.0), 1, "°", "theta_std"),
@@ -91,7 +91,7 @@ class MonitorPage:
     address: str
     coloured: bool = True  # True if the terminal has more than 16 colours
     keys: bool = True  # True if a keyboard is available
-    guarded: bool = False  # True if the page has subscribed with access keys
+    guarded: bool = False  # True if the page uses access keys
     force: float = math.nan  # force requested when the grasp key is pressed [N]
     explains: bool = False  # True if the page shows explanations instead of numbers
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
@@ -331,7 +331,7 @@ def _named(keys: dict[str, str]) -> Text:
 def _heights(width: int, height: int) -> tuple[int, int]:
     """Return the numbers of lines for each map and for the events at this page size."""
     spare = height - HEIGHT
-    widest = (width - CENTRE - 2) // 4  # A map has twice as many columns as lines.
+    widest = (width - CENTRE - 2) // 4  # Each map has twice as many columns as lines.
     maps = max(MAP_LINES, min(widest, MAP_LINES + (2 * spare + 2) // 3))
     return maps, 5 + spare - (maps - MAP_LINES)
 

@@ -38,7 +38,7 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-RECENT_TIME = 3.0  # time window over which waits for a busy machine are added up [s]
+RECENT_TIME = 3.0  # period over which the waits of a simulated hand are summed [s]
 EVENT_COUNT_MAX = 200  # number of stored events
 GLOSSARY = (  # meanings of the terms on the pages
     ("d", "displacement of the tip by the object's face"),
@@ -123,13 +123,14 @@ class StreamState:
     def __init__(self) -> None:
         self.state = read(schema.HandState, None)
         self.state_time = -math.inf
-        self.mode = self.fault = ""  # from the last state
+        self.mode = self.fault = ""  # mode and fault of the last state
         self.frames: dict[str, ShownFrame] = {}
         self.events: list[ShownEvent] = []
         self._news: deque[ShownEvent] = deque(maxlen=EVENT_COUNT_MAX)
         self._event_times: deque[tuple[float, float]] = deque(maxlen=2 * EVENT_COUNT_MAX)
-        self.times: schema.LoopStatistics | None = None  # statistics of all previous ticks
-        # A warning is shown if a servo will reach its temperature limit within this time [s].
+        self.times: schema.LoopStatistics | None = None  # statistics of all ticks so far
+        # A warning is shown if a servo is predicted to reach its temperature limit within this time
+        # [s].
         self.heat_warning_time = 0.0
         self._lease_holder = "", -math.inf  # holder of the command lease, and end of the lease [s]
         self._lease = math.nan  # lease duration [s]
@@ -193,8 +194,8 @@ class StreamState:
         )
 
     def _read_event(self, event: schema.Event, _: float) -> None:
-        # A late subscriber receives repeated events with their original seq and time. An event from
-        # another daemon has a different time.
+        # A late subscriber receives repeated events with their original seq and time. If the time
+        # differs, the event comes from another daemon.
         name = event.seq, event.timestamp
         if event.again and name in self._event_times:
             return
@@ -314,7 +315,7 @@ class _Pending:
     socket: zmq.Socket[bytes]
     attempts: Attempts
     sent: float
-    # Refusal due to lateness, stored until the command is sent again.
+    # Reply that refused the command because of a delay, stored until the command is sent again.
     late: dict[str, Any] | None = None
     again_at: float = 0.0  # time of the next attempt
     warned: bool = False  # True once the page has reported the missing reply
@@ -329,7 +330,7 @@ class Commander:
     reply to a stop.
     """
 
-    OPEN_LIMIT = 8  # maximum number of open commands; all further commands except stop are dropped
+    OPEN_LIMIT = 8  # maximum number of open commands; further commands are dropped, except stop
 
     def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
         self._context = context
@@ -370,7 +371,7 @@ class Commander:
                 if each.attempts.remaining():
                     each.late = None
                     each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
-                else:  # The process was suspended while it was waiting.
+                else:  # The process was suspended during the wait.
                     self._end(each, now, each.late)
                 continue
             try:
@@ -410,5 +411,5 @@ def judge(now: float, label: str, record: Any) -> ShownReply:
             return ShownReply(now, False, f"{label}: {UNCONFIRMED_TEXT}")
         return ShownReply(now, True, f"{label}: ok")
     why = text(record, "error") or "invalid answer"
-    named = why.split(":")[0] == label.split()[0]  # True if the message contains the command
+    named = why.split(":")[0] == label.split()[0]  # True if the message names the command
     return ShownReply(now, False, why if named else f"{label}: {why}")

@@ -25,7 +25,7 @@ with contextlib.suppress(ModuleNotFoundError):  # On Windows, only `monitor --pl
     import tty
 
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, bracketed paste
-# This sequence begins with CAN, which ends a partial sequence.
+# This sequence begins with CAN, which ends an incomplete escape sequence.
 _LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # synchronised update, if supported by the terminal
 
@@ -89,8 +89,8 @@ class Terminal:
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
             self._attributes = termios.tcgetattr(self._keyboard)
-            tty.setcbreak(self._keyboard)  # This call also discards keys that were typed earlier.
-            # Otherwise, Ctrl-Z would also suspend the daemon while torque is on.
+            tty.setcbreak(self._keyboard)  # This call also discards earlier key presses.
+            # Disable Ctrl-Z, because it would also suspend the daemon while torque is on.
             if not self._suspendable:
                 ours = termios.tcgetattr(self._keyboard)
                 ours[6][termios.VSUSP] = b"\0"

@@ -149,7 +149,7 @@ class Foxglove:
             return
         try:
             data = orjson.dumps(channels.to_json(topic)(dict(message)))  # NaN becomes null.
-        except TypeError:  # orjson also raises this for values that JSON cannot represent.
+        except TypeError:  # orjson raises TypeError for values that JSON cannot represent.
             return
         self._loop.call_soon_threadsafe(partial(self._give, channel, stamp, data, keeps))
 

@@ -25,7 +25,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.viewing.landscape import fingers_of
 
 FloatArray = NDArray[np.float64]
-GOAL, OBJECT = "goal", "object"  # colour names, in addition to the finger names
+GOAL, OBJECT = "goal", "object"  # colour names in addition to the finger names
 
 # Colour-blind users can distinguish these colours on a dark background. The page defines separate
 # colours for each theme.
@@ -36,7 +36,7 @@ COLOURS = {
     OBJECT: (0, 158, 115),
 }
 
-_ARROW_SCALE = 1.6e-3  # length of a force arrow [m/N]
+_ARROW_SCALE = 1.6e-3  # length of a force arrow per newton [m/N]
 _ARROW_MAX = 0.045  # maximum length of a force arrow [m]
 _HALF_TURN = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 _TURN = np.linspace(0.0, 2.0 * np.pi, 61)
@@ -181,10 +181,10 @@ def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
 
 # Picture coordinates are measured in cells from the corner of the first cell, with x along the
 # columns and y along the rows. In the sensor's axes, the footprint for displacement d and outward
-# normal n is an ellipse. With h = a − d and ρ² = 2ad − d², its centre is h·(n_x, n_y), and its
-# semi-axes are ρ n_z along the tilt and ρ across the tilt. The pressure centroid is at (a −
-# d/3)·(n_x, n_y). This position is exact for any constant modulus and a close approximation for a
-# measured material law.
+# normal n is an ellipse. With h = a − d and ρ² = 2ad − d², the centre of the ellipse is h·(n_x,
+# n_y), and the semi-axes are ρ n_z along the tilt and ρ across the tilt. The pressure centroid is
+# at (a − d/3)·(n_x, n_y). The centroid position is exact for any constant modulus, and a close
+# approximation for a measured material law.
 
 
 def grid_of(frame: TactileFrame) -> SensorGrid | None:

@@ -34,11 +34,10 @@ class Landscape(NamedTuple):
     along θ = 0 is visible at every depth. The edges between colours are lines of constant energy.
     """
 
-    # Levels of `heatmap` [HEIGHT, WIDTH]. The level above the highest one marks impossible
-    # contacts.
+    # Levels of `heatmap` [HEIGHT, WIDTH]. The level `LEVELS` marks impossible contacts.
     levels: NDArray[np.uint8]
     d_end: float  # d at the upper edge [m]
-    highest: float  # energy of the last colour [J]
+    highest: float  # energy at the end of the colour scale [J]
 
 
 def landscape(settings: Settings) -> Landscape | None:

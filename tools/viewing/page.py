@@ -45,9 +45,9 @@ from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
-_WAITING_COUNT_MAX = 40  # maximum number of commands awaiting a reply, for all pages together
+_WAITING_COUNT_MAX = 40  # maximum total number of commands awaiting a reply
 _REQUEST_TIMEOUT = 5.0  # timeout for a request's header [s], long enough for a busy browser
-_NAME_LENGTH_MAX = 40  # maximum number of characters of a command name that are displayed
+_NAME_LENGTH_MAX = 40  # maximum number of displayed characters of a command name
 _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
 _BUFFER_SIZE = 256 << 10  # maximum amount of data queued for a page or a Foxglove client [bytes]
 _MESSAGE_SIZE_MAX = 65536  # maximum size of a message from a page or a Foxglove client [bytes]
@@ -105,7 +105,7 @@ class Site:
         # Pages that are waiting for the next picture.
         self.waiting: list[asyncio.Future[_Published]] = []
         self.record: Callable[[], str] = lambda: ""  # function that starts or ends a recording
-        # Function that receives the string with which a page requests each picture.
+        # Function that receives the request string for each picture.
         self.wish: Callable[[str], None] = lambda _: None
         self._routes: dict[str, Callable[[ServerConnection], Awaitable[None]]] = {
             "/pictures": self._show,

@@ -40,17 +40,17 @@ if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
 TOPICS = (*StreamState().topics, schema.TRUTH)
-SECONDS = 60.0  # duration of the history sent to a newly opened page [s]
+SECONDS = 60.0  # duration of the history that a newly opened page receives [s]
 STEP = 0.1  # time between plot rows [s]
-_TRAIL_LENGTH = 60  # number of rows in a trail on the landscape
+_TRAIL_LENGTH = 60  # number of rows in each trail on the landscape
 _EVENT_COUNT = 50  # maximum number of displayed events
 _WARNING_TIME = 5.0  # display time of a warning [s]
 _LIMIT_FRACTION = 0.8  # fraction of a limit above which a value is reported
 _DARK_SIGMA = 2.0  # minimum visible pressure, in standard deviations of the cell noise
 _FULL_SCALE_MIN = 10.0  # minimum full scale, in standard deviations of the cell noise
-_OLD_TIME = 0.35  # age above which the last message is shown as old [s]
-_OLD_PERIODS = 4.0  # age limit in stream periods; the longer of the two limits applies
-_NUMBER_MAX = 1e6  # limit for drawn numbers, because messages may contain any value
+_OLD_TIME = 0.35  # minimum age at which a message is shown as old [s]
+_OLD_PERIODS = 4.0  # minimum age at which a message is shown as old, in stream periods
+_NUMBER_MAX = 1e6  # limit for drawn numbers; messages may contain any value
 _DEGREE = math.degrees(1.0)
 
 
@@ -91,7 +91,7 @@ _HEADLINE = (  # title, decimals and plotted fields
 )
 _SERVOS = ("q", "current")  # fields that are missing in a hand without servos
 _DEVIATED = ("force", "d", "theta")  # finger fields whose {}_std is also drawn
-_OTHERS = {  # names and colours of lines that do not belong to a finger
+_OTHERS = {  # names and colours of lines without a finger
     "object.angle": ("object", OBJECT),
     "object.width": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
@@ -153,9 +153,9 @@ class Pictures:
         self._period = period
         self._number = 0  # number of rows so far
         self._marks: list[Any] = []
-        self.recording: dict[str, Any] = {}  # status that the page's recorder sets
+        self.recording: dict[str, Any] = {}  # status of the page's recorder
         self._settings_text = ""  # last settings message, unparsed
-        self.seen = self.unreadable = 0  # number of states, and number of unreadable messages
+        self.seen = self.unreadable = 0  # number of states; number of unreadable messages
         self.clear()
         self._read_settings(Settings())
 
@@ -188,7 +188,7 @@ class Pictures:
             if number(message, "seq") < self.feed.state.seq:
                 self._begin_rows()  # The daemon was restarted.
             elif self.states and self.time // STEP != stamp // STEP:
-                last = self.feed.state  # last state of the step
+                last = self.feed.state  # last state of the previous time step
                 self._past.append((last, Row(self._number, _packed(_row(self._number, last)))))
                 self._number += 1
             self.time = stamp

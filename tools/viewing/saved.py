@@ -17,8 +17,8 @@ from softfinger.tools.viewing.pictures import Pictures, Row
 from softfinger.tools.viewing.sources import Playback, ViewError, marks_of
 
 _PICTURE_COUNT_MAX = 6000  # maximum number of pictures in the page's memory; each has about 10 kB
-_SCALE = 3000.0  # units of the moving picture per metre
-_ARC = 30  # number of points above which every second point of a line is omitted
+_SCALE = 3000.0  # SVG user units per metre
+_ARC = 30  # lines with more points than this omit every second point
 
 
 def save(path: Path, recording: Recording, period: float, say: Callable[[str], None]) -> None:
@@ -82,7 +82,7 @@ def _moving(scenes: list[tuple[str, list[str]]], period: float) -> str:
     )
     shown = [json.loads(each)["panels"]["hand"]["lines"] for _, kept in scenes for each in kept]
     left, right, top, bottom = (_SCALE * side for side in box)
-    # Each line is identified by its colour and by its place among the lines of this colour.
+    # Each line is identified by its colour and by its index among the lines of this colour.
     lines: dict[tuple[str, int], tuple[float, list[str]]] = {}
     for k, drawn in enumerate(shown):
         places: dict[str, int] = {}

@@ -25,7 +25,7 @@ from softfinger.tools.terminal.stream_state import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
 _SILENCE_TIME = 2.0  # time without messages before a notice is printed [s]
-_DRAW_PAUSE_MAX = 1.0  # maximum time between pictures when drawing is slow [s]
+_DRAW_PAUSE_MAX = 1.0  # maximum time between pictures if drawing is slow [s]
 _MARK_COUNT_MAX = 2_000  # maximum number of marks shown for a recording
 _SPEED_RANGE = 0.1, 10.0
 # Maximum number of messages queued between reads. The queue is long enough for 2 s of states, truth
@@ -67,7 +67,7 @@ def follow(
                 where = waiting(arguments.address, arguments.keys)
                 say(where if silent else "the stream has started")
             pictures.draw()
-            # Even on a slow machine, use at most half of the CPU time.
+            # Even on a slow machine, drawing uses at most half of the CPU time.
             worked = time.thread_time() - worked
             rest = max(
                 1.0 / arguments.rate - (time.monotonic() - began), min(worked, _DRAW_PAUSE_MAX)

@@ -2,8 +2,8 @@
 // Draw plots versus time with a common time axis and cursor. A row is [number, time, mode, values …],
 // where null is a missing value.
 //
-// This module does not use a plotting package. uPlot takes the same time, but the package that
-// contains it requires IPython. Plotly takes seven times as long and has 4.8 MB.
+// This module does not use a plotting package. uPlot takes the same time to draw, but the Python
+// package that contains uPlot requires IPython. Plotly takes seven times as long and has 4.8 MB.
 
 const [TIME, MODE] = [1, 2];
 const KEPT = 6000;  // number of rows, enough for ten minutes
@@ -13,7 +13,7 @@ const inks = new Map();
 const ink = name => inks.get(name)
   ?? inks.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim()).get(name);
 
-// Context of a canvas, and its size in CSS pixels. The size is observed, because reading it would force a layout.
+// Canvas context and size in CSS pixels. An observer reports the size, because reading the size would force a layout.
 class Surface {
   constructor(canvas, changed) {
     [this.canvas, this.pen, this.width, this.height] = [canvas, canvas.getContext("2d"), 0, 0];
@@ -75,7 +75,7 @@ class View {
   constructor(changed) { this.changed = changed; }
 
   get range() {
-    const newest = this.newest?.[TIME] ?? 0;  // The axis does not move during a recording's first seconds.
+    const newest = this.newest?.[TIME] ?? 0;  // In the first seconds of a recording, the axis does not move.
     const end = this.end ?? (this.start === null ? newest : Math.max(newest, this.start + this.span));
     return [end - this.span, end];
   }
@@ -187,7 +187,7 @@ class Chart {
     return rows;
   }
 
-  // Fit the scale to the values. It grows immediately and shrinks once half of it is empty.
+  // Fit the scale to the values. The scale grows immediately, and shrinks once half of it is empty.
   rescale(rows) {
     let [low, high, least] = [Infinity, -Infinity, Infinity];
     for (const { column, spread } of this.plot.lines)
@@ -369,7 +369,7 @@ function make(parent, kind, name = "", text = "") {
   return element;
 }
 
-// Set a text only if it has changed, because the browser lays out and paints each text that is set.
+// Set a text only if it has changed, because the browser lays out and paints every text that is set.
 function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }

@@ -1,5 +1,5 @@
 
-// Only one command of each kind is in transit at a time. Of the commands that follow, only the newest one is sent.
+// At most one command of each kind is in transit at a time. Of the later commands, only the newest is sent.
 const client = "page " + Math.random().toString(16).slice(2, 6);
 const one = selector => document.querySelector(selector);
 const lanes = {}, settings = {};
@@ -47,8 +47,8 @@ function transmit(lane, { message, answered }) {
   };
 }
 
-// A value of the hand with a slider and a field, which follow the hand. After a change on this page,
-// they show the new value until the hand has reached or refused this value.
+// Hand value with a slider and an input field, which follow the hand. After a change on this page,
+// both show the new value until the hand has reached or refused this value.
 class Setting {
   wanted = null;
   accepted = NaN;
@@ -177,7 +177,7 @@ function showControls() {
   put(button, on ? `End recording, ${Math.floor(seconds)} s` : "Record");
 }
 
-// The keys are those of the terminal page. Space always stops, even if the focus is on a button.
+// This page uses the keys of the terminal page. Space always stops the hand, even if a button has the focus.
 const KEYS = {
   a: ["arm", "Arm"], g: ["grasp", "Grasp"], r: ["release", "Release"], d: ["disarm", "Disarm"], c: ["clear", "Clear the fault"],
   "+": ["", "More force"], "-": ["", "Less force"], ArrowLeft: ["", "Turn by −5°"], ArrowRight: ["", "Turn by +5°"],

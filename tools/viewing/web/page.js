@@ -6,7 +6,7 @@ const images = new Map();  // panel images
 
 const seconds = value => value < 10 ? value.toFixed(1) : Math.round(value).toString();
 const elapsed = () => (performance.now() - arrived) / 1000;
-// Return the current value of an age that was sent in a picture. Null means that there was no message.
+// Return the current value of an age that was sent in a picture. A null age means that no message has arrived.
 const aged = age => age === null ? Infinity : scene.live ? age + elapsed() : 0;
 const isOld = () => aged(picture.age) > picture.patience.state + scene.period;
 
