@@ -69,7 +69,7 @@ class StopCondition:
         return [each for each in readable if each in others]
 
     def end(self, *_: object) -> None:
-        """Request the end; may be called from a signal handler."""
+        """Request the end of the subcommand; may be called from a signal handler."""
         self._is_requested = True
         self.wake()
 

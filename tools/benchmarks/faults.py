@@ -1,8 +1,8 @@
 """Measure how grips behave with faulty measurements, using the plant's true state.
 
-Each case is a grip with a faulty measurement or an unusual tip. The seed of a trial determines the
-noise, times, finger, object mass and torque constant error. Trials run on virtual time, so the
-results do not depend on the machine.
+Each case is a grip with a faulty measurement or an unusual tip. A trial's seed determines the
+noise, the times, the affected finger, the object mass and the torque constant error. Trials run on
+virtual time, so the results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class GripTrial:
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
-        """Return (time, channel) of all correct or, if not ``rightly``, all wrong diagnoses."""
+        """Return (time, channel) of the correct or, if not ``rightly``, the wrong diagnoses."""
         names = [
             (t, k.removeprefix(_EVENT_PREFIX))
             for t, k in self.events
@@ -163,7 +163,7 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return one table per criterion with the cases whose name contains ``only``.
+    """Return one table per criterion, for the cases whose names contain ``only``.
 
     ``brief`` runs one trial per case. ``sweep`` maps trials to outcomes in one or more processes.
     """
@@ -250,7 +250,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Summarise the number of trials and the median first time [s] for each event kind."""
+    """Format each event kind with its number of trials and its median first occurrence [s]."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

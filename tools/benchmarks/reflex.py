@@ -4,9 +4,9 @@ A 10 N grip carries a constant load along the object faces, away from the palm. 
 then applied and maintained: either a push, or a twist with the same force at the faces. Trials run
 on virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
 object is no longer between the tips. *Slid*: object displacement along its faces. The displacement
-is measured from the midpoint of both tips, so that leaning fingers do not affect it. *Answer*: time
-from the onset of slip until the goal currents have increased by a quarter. *Said*: time from object
-loss until the hand leaves the grip modes.
+is measured relative to the midpoint between the tips, so that leaning fingers do not affect the
+result. *Answer*: time from the onset of slip until the goal currents have increased by a quarter.
+*Said*: time from object loss until the hand leaves the grip modes.
 """
 
 from __future__ import annotations

@@ -192,7 +192,7 @@ class Outcome:
 
 
 def grip(case: HandCase, seed: int = 1) -> Outcome:
-    """Run one grip; ``seed`` determines the noise and the finger."""
+    """Run one grip; ``seed`` determines the noise and the times."""
     chance, found = random.Random(f"{case.name} {seed}"), Outcome()
     daemon = merged({"simulation": {"seed": seed}}, case.daemon)
     with VirtualGrip(daemon, merged(case.hand, daemon), case.torque) as hand:
@@ -253,7 +253,7 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return one table for the rows and one for the ensemble; ``brief`` runs only a few of each."""
+    """Return a table for the rows and a table for the ensemble; ``brief`` runs only a few cases."""
     trials = trials or (1 if brief else _TRIAL_COUNT)
     hands = [
         drawn(seed) for seed in range(1, (4 if brief else trials * _HAND_COUNT // _TRIAL_COUNT) + 1)

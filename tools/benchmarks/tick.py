@@ -1,10 +1,10 @@
 """Measure tick times: back to back, in place, and with emulated servos over a pty.
 
 Back-to-back ticks follow each other without a pause. Each in-place tick starts after a sleep, as in
-a running daemon. Both kinds of ticks are measured in turn, with the same hand and canned readings.
-In the measurement with emulated servos, another process emulates the servos, either unpaced or with
-the transmission times of a given baud rate. The whole simulated hand is also timed for one second
-of virtual time.
+a running daemon. Both kinds of ticks are measured alternately, with the same hand and canned
+readings. In the last measurement, another process emulates the servos, either unpaced or with the
+transmission times of a given baud rate. The whole simulated hand is also timed for one second of
+virtual time.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _IN_TURN = 20  # number of cycles per turn
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Return tick times while holding an object [µs], and the time per virtual second [ms]."""
+    """Return tick times [µs] while holding an object, and the run time per virtual second [ms]."""
     rounds, turns = (10, 10) if brief else (40, 60)
     parts: dict[str, Callable[[str], Report]] = {
         "tick": partial(_in_turns, rounds=rounds),
@@ -47,7 +47,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def _simulated(title: str, seconds: int) -> Report:
-    """Measure the complete daemon with the simulated hand, per virtual second and per tick."""
+    """Time the complete daemon with the simulated hand, per virtual second and per tick."""
     with virtual_daemon() as daemon:
         hold(daemon)
         second = timed(partial(daemon.loop.advance, 1.0), seconds)

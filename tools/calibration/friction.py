@@ -39,7 +39,7 @@ _SEEN = 2.0
 def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write the joint friction to the profile and return a summary.
 
-    The errors of `LiveHand` may also be raised.
+    Errors raised by `LiveHand` are propagated.
 
     Raises
     ------

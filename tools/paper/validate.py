@@ -75,7 +75,7 @@ def comparisons() -> Iterator[PublishedValue]:
 
 def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
             unit: str = "", why: str = "") -> PublishedValue:  # fmt: skip
-    """Return a row that agrees if ``ours``, rounded to ``form``, is within [low, high]."""
+    """Compare ``ours`` with the published range [low, high]; all numbers are first rounded."""
     shown = [f"{each:{form}}" for each in (low, high, ours)]
     inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
     verdict = "agree" if inside else "disagree"

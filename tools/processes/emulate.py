@@ -1,4 +1,4 @@
-"""Run ``softfinger emulate``, the process of an emulated hand: arguments, signals, exit status."""
+"""Run ``softfinger emulate``: the arguments, signals and exit status of an emulated hand."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
     """Run `softfinger emulate` with the arguments ``words``; yield the process once it is ready.
 
-    Raises NoEmulator if the process ends before it is ready. The process prints its error message
+    Raises NoEmulator if the process exits before it is ready. The process prints its error message
     to standard error.
     """
     from softfinger.daemon.simulation.emulator.folder import NoEmulator
@@ -216,7 +216,10 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def _ready(ports: dict[str, Path]) -> str:
-    """Return a ready emulator's output as one text, because readers may wait for the last line."""
+    """Return the output that announces a ready emulator.
+
+    The lines are printed together, because readers may wait for the last line.
+    """
     return "".join(["ready\n", *(f"{name}: {path}\n" for name, path in ports.items())])
 
 

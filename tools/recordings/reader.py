@@ -84,14 +84,14 @@ class MessageSource(Protocol):
 
 
 class Recording:
-    """Existing recording. Raises RecordingError if the file is not a recording.
+    """Reader for an existing recording. Raises RecordingError if the file is not a recording.
 
     ``counts`` (number of messages by channel), ``start`` and ``end`` (Unix time [s], NaN if empty)
-    are read from the summary at the end of the file. If the summary is incomplete, or if there are
-    other programs' channels, the whole file is read once instead. If the recorder was killed, the
-    file has no end and is marked ``truncated``. Corrupted chunks are skipped. Messages in other
-    programs' channels are ignored; ``others`` counts them. ``say`` is called once for each kind of
-    problem found.
+    are read from the summary at the end of the file. If the summary is incomplete, or if the file
+    contains other programs' channels, the whole file is read once instead. If the recorder was
+    killed, the end of the file is missing, and ``truncated`` is True. Corrupted chunks are skipped.
+    Messages in other programs' channels are ignored; ``others`` counts them. ``say`` is called once
+    for each kind of problem found.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
@@ -316,7 +316,7 @@ class Recording:
             self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
-        """Check the end of the file; return the header's profile, or PROFILE without a header."""
+        """Check the end of the file; return the header's profile, or PROFILE if it is missing."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Header
 
@@ -391,7 +391,8 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
     """Yield the kind and content of each record whose kind is in ``wanted``.
 
     If a message is too long, only its header is returned as the content. Raises EOFError for an
-    incomplete record, and ValueError for an invalid record or another record that is too long.
+    incomplete record, and ValueError for an invalid record or for an overlong record that is not a
+    message.
     """
     while head := file.read(_RECORD.size):
         if len(head) < _RECORD.size:

@@ -47,7 +47,7 @@ _KEY = re.compile(
 
 
 class TerminalGone(SoftfingerError):
-    """The terminal is not writable, or a signal has interrupted a blocked write."""
+    """Error raised if the terminal is not writable or a signal has interrupted a blocked write."""
 
 
 class KeyDecoder:

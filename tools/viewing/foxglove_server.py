@@ -51,7 +51,7 @@ class _Client:
         self.queue: asyncio.Queue[bytes] = asyncio.Queue(_QUEUE_LENGTH)
 
     def give(self, channel: str, stamp: float, data: bytes) -> None:
-        """Queue a message if the client subscribes to its channel and the queue is not full."""
+        """Queue a message if the client has subscribed to its channel and the queue is not full."""
         if channel in self.subscribed and not self.queue.full():
             head = _HEAD.pack(1, self.subscribed[channel], int(stamp * 1e9))
             self.queue.put_nowait(head + data)

@@ -2,8 +2,8 @@
 
 A single thread serves the pages. The main thread reads the stream or plays a recording, and creates
 each picture once for all pages. A page requests the next picture after drawing the last picture, so
-a slow page skips pictures without delaying other pages. The terminal prints a token. Pages with
-this token may send commands, and each page is a separate client.
+a slow page skips pictures without delaying other pages. The command prints a token in the terminal.
+Pages with this token may send commands, and each page is a separate client.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Redirect browsers with the one-time code to the page with the token; refuse others."""
+        """Redirect a browser with the one-time code to the page with the token, or refuse it."""
         if not self._code or not _has(request, "code", self._code):
             said = (
                 "Open this page with the newest address printed by softfinger view; each "

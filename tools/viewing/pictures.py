@@ -55,7 +55,7 @@ _DEGREE = math.degrees(1.0)
 
 
 class _Plot(NamedTuple):
-    """Plot of lines versus time; ``span`` is the minimum height of its scale, in ``unit``."""
+    """Plot of several lines versus time; ``span`` is its minimum axis range, in ``unit``."""
 
     title: str
     unit: str
@@ -396,7 +396,7 @@ class Pictures:
         return grip if "raised" in grip else ""
 
     def _facts(self, now: float) -> list[tuple[str, str]]:
-        """Return names and values for the details: loop times, frames, servos and losses."""
+        """Return names and values for the details panel: loop times, frames, servos and losses."""
         feed, state, times = self.feed, self.feed.state, self.feed.times
         fingers = [state.finger(name) for name in self._fingers]
 
