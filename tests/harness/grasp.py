@@ -1,4 +1,4 @@
-"""Reference model of a grasp: two rotational fingers, two soft tips, an object at equilibrium.
+"""Reference model of a grasp: two rotational fingers, two soft tips, and an object at equilibrium.
 
 The energy is the sum of both tips' energies and the potential energy of gravity. With the shear
 d_t, a tip's energy is
@@ -31,7 +31,7 @@ _STEP = 1e-6  # Step for force differences, in rad for rotations and in tip radi
 
 
 class GraspError(SoftfingerError, ValueError):
-    """A contact opens or leaves its range, or no equilibrium is found."""
+    """Error raised if a contact opens or leaves its range, or if no equilibrium is found."""
 
 
 def sheared_contact(

@@ -63,7 +63,8 @@ class Rig:
     def __init__(
         self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None
     ) -> None:
-        """``source`` makes the frames of a serial board; by default each frame is a new image."""
+        """Set up the backend; ``source`` generates a serial board's frames (default: new
+        images)."""
         self.backend = backend
         self._stack = ExitStack()
         self._stop = threading.Event()

@@ -52,7 +52,7 @@ GOALS = {"goal_force": 9.0, "goal_angle": 0.1}
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record 2.6 s of the simulated hand: it grasps, turns and releases."""
+    """Record 2.6 s of the simulated hand, which grasps, turns and releases the object."""
     path = tmp_path_factory.mktemp("recorded") / "hand.mcap"
     record_hand(path, GRASP, 2.6)
     return path

@@ -52,7 +52,7 @@ class Bench:
         self._watch = HeatWatch(settings, self.state)
 
     def lasting_current(self) -> float:
-        """Find the current [A] at which the plant's case settles at the limit."""
+        """Find the current [A] at which the plant's case temperature settles at the limit."""
         low, high = 0.0, 3.0
         while high - low > 3e-3:
             current = 0.5 * (low + high)
@@ -78,7 +78,7 @@ class Bench:
 
 
 def foreseen(seed: int) -> Foreseen:
-    """Hold an excessive current until the temperature reading reaches the limit."""
+    """Apply an excessive current until the temperature reading reaches the limit."""
     bench = Bench(seed)
     chance = bench.chance
     current = bench.lasting_current() * chance.uniform(1.15, 1.8)
@@ -94,7 +94,7 @@ def foreseen(seed: int) -> Foreseen:
 
 
 def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
-    """Hold half the continuous current; halfway through, the room becomes 8 °C warmer.
+    """Apply half the maximum continuous current; halfway through, the room becomes 8 °C warmer.
 
     Returns the minimum predicted time until the limit [s].
     """

@@ -1,13 +1,13 @@
 """Run a virtual-time soak: random sequences of commands, loads and faults, one per seed.
 
 ``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most sequences grip the object;
-the grips are then loaded, turned, disturbed by faulty measurements and stopped. The daemon runs
-completely, except for its sockets. Requirements are checked against the plant and the data sent to
-the servos, never against the daemon's own reports. The soak counts how often each requirement is
+the grips are then loaded, turned, disturbed by faulty measurements and stopped. The complete daemon
+runs, except for its sockets. Requirements are checked against the plant and the data sent to the
+servos, never against the daemon's own reports. The soak counts how often each requirement is
 checked, and fails if a requirement is never checked. The tests run a few sequences.
 
-``--ticks 14400000`` runs one hand for eight hours of virtual time, with its stream recorded and
-read. Violations are counted and do not end the run. The run fails if memory grows or a state is
+``--ticks 14400000`` runs one hand for eight hours of virtual time and records and reads its stream.
+Violations are counted and do not end the run. The run fails if memory grows or a state is
 inconsistent.
 """
 
@@ -444,7 +444,7 @@ class Soak:
         return 1 + int(self._random.expovariate(1.0 / mean))
 
     def _may_be_disturbed(self) -> bool:
-        """Return True in the mode ``holding``, and occasionally in other modes."""
+        """Return True in the ``holding`` mode, and occasionally in other modes."""
         return self.daemon.loop.state.mode == "holding" or self._random.random() < 1e-3
 
     # Actions

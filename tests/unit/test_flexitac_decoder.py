@@ -23,8 +23,8 @@ nasty = st.lists(
 def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
     """Return the frames decoded when the data are fed byte by byte.
 
-    If the decoder synchronises late, several frames may be completed at once. Only the newest is
-    returned.
+    If the decoder synchronises late, it may complete several frames at once but returns only the
+    newest frame.
     """
     found = []
     for piece in pieces:

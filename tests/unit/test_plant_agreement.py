@@ -102,7 +102,7 @@ def on_face(finger, point, angle):
 
 
 def wedge(width, taper=0.0, height=0.060):
-    """Return a wedge's contacts; the width refers to half the height, not the centre of mass."""
+    """Return a wedge's contacts; the width is measured at half height, not at the mass centre."""
     lean = 0.5 * taper
     slope = height * math.tan(lean)  # half the difference in length between the parallel faces
     middle = height * slope / (6.0 * width)

@@ -1,6 +1,6 @@
 """Test that a stop cancels all earlier requests, in any order of events and clients.
 
-Clients, gateway and loop act one at a time in an order that hypothesis chooses. Requests that
+Clients, gateway and loop act one at a time, in an order that Hypothesis chooses. Requests that
 libzmq has received are kept in a list, from which the gateway reads only a few at a time. When a
 stop is executed, a request may therefore wait in its connection, in the gateway, on the link, or in
 the loop.
