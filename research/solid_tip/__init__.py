@@ -1,4 +1,4 @@
-"""Offline computation of a solid rubber fingertip: finite elements, contact, and the data file.
+"""Offline computation for a solid rubber fingertip: finite elements, contact, and the data file.
 
 ``python -m research.solid_tip LINEAR`` computes the small-strain model. ``python -m
 research.solid_tip.strain LINEAR OUT`` adds the effect of finite strain and writes the data file,

@@ -1,10 +1,10 @@
 """Fit the data in the file to presses: a polynomial for the energy, modes for the base pressure.
 
-The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so
-N = ∂U/∂d holds exactly. The base pressure divided by N is decomposed by singular values, one
-harmonic at a time. The mode amplitudes are polynomials as well. All polynomials are Chebyshev
-series in s = √(d/a), sin²θ and ν; the notes in the file describe their layout. `SolidTip` reads the
-file using only NumPy.
+The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so N =
+∂U/∂d holds exactly. The base pressure divided by N is decomposed by singular values, one harmonic
+at a time. The mode amplitudes are polynomials as well. All polynomials are Chebyshev series in s =
+√(d/a), sin²θ and ν. The notes in the file describe the layout of the coefficients. `SolidTip` reads
+the file using only NumPy.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def chebyshev_nodes(low: float, high: float, count: int) -> FloatArray:
 
 
 class Samples(NamedTuple):
-    """Arrays over all presses of one base at one ν."""
+    """Arrays with one row per press, for one base type and one ν."""
 
     d: FloatArray
     theta: FloatArray
@@ -124,7 +124,7 @@ def over_nu(values: FloatArray) -> FloatArray:
 def fit(
     all_samples: list[Samples], nodes: FloatArray, step: float, tolerance: float
 ) -> dict[str, FloatArray]:
-    """Fit the arrays of one base; ``nodes`` are the ν values of the samples, Chebyshev points."""
+    """Fit the arrays of one base type; ``nodes`` are the samples' ν values (Chebyshev points)."""
     energy = np.array(
         [fit_energy(one, nu, step) for one, nu in zip(all_samples, nodes, strict=True)]
     )
@@ -232,5 +232,5 @@ class SolidTip:
 
 
 def rms_difference(one: ArrayLike, other: ArrayLike) -> float:
-    """Return the rms of the difference divided by the rms of ``other``."""
+    """Return the RMS difference divided by the RMS of ``other``."""
     return float(np.linalg.norm(np.subtract(one, other)) / np.linalg.norm(other))

@@ -187,7 +187,10 @@ def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
 
 
 def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
-    """Return the springs of harmonic 1: U + V = 0 on the axis; no mean motion of a lying base."""
+    """Return the stiff springs that constrain harmonic 1.
+
+    They enforce U + V = 0 on the axis and prevent a lying base from moving as a whole.
+    """
     if m != 1:
         return 0.0
     size = 3 * len(mesh.nodes)
@@ -244,7 +247,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
 
 
 def shear_response(rings: int, poisson: float, bonded: bool) -> tuple[FloatArray, FloatArray]:
-    """Return base node radii and harmonic 1 of their pressure for a unit shear force on the cap."""
+    """Return base node radii, and harmonic 1 of the base pressure under a unit shear on the cap."""
     mesh = Meridian(rings)
     _, _, nodal, angle = arc_loads(mesh)
     load = np.zeros(3 * len(mesh.nodes))

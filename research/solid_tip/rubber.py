@@ -498,7 +498,7 @@ class Body:
 def strained(
     block: str, poisson: float, theta: float | None, mesh: Meridian, file: Path
 ) -> dict[str, FloatArray]:
-    """Return linear and nonlinear presses as arrays (2, n, …), linear first. Caches to ``file``."""
+    """Return linear and nonlinear presses as arrays (2, n, …), linear first; cached in ``file``."""
     if not file.exists():
         base, sticking = block.removesuffix("-sticking"), block.endswith("-sticking")
         found = []

@@ -133,7 +133,7 @@ def through(points: FloatArray, values: FloatArray) -> Callable[[float], FloatAr
 
 
 class Strain:
-    """Effect of strain in one block, for any d, θ and ν."""
+    """Effect of finite strain in one block, for any d, θ and ν."""
 
     def __init__(self, block: str, tilts: Mapping[int, FloatArray], folder: Path) -> None:
         """Set up a block; ``tilts`` maps indices of `SINES` to the ν values of coarse presses."""
@@ -214,7 +214,7 @@ class Strain:
 
 
 def main() -> None:
-    """Compute the presses that are missing in the folder, and write the file."""
+    """Compute the presses that are missing from the folder, and write the data file."""
     parser = argparse.ArgumentParser(
         prog="python -m research.solid_tip.strain", description=__doc__
     )
