@@ -54,7 +54,7 @@ def dated(changelog: str, version: str, today: datetime.date) -> str:
     Raises
     ------
     ReleaseError
-        If the version has no entries, is not newer than the last one, or has too many lines.
+        If the version has no entries, is not newer than the last release, or has too many lines.
     """
     found = sections(changelog)
     unreleased = found.pop("Unreleased", None)
