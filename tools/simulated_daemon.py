@@ -1,4 +1,4 @@
-"""Run a daemon on virtual time and record the simulated hand's true state.
+"""Run a daemon in virtual time and record the simulated hand's true state.
 
 ``envelope``, ``bench`` and the tests use this module.
 """
@@ -39,7 +39,7 @@ class TrueStates:
 
 
 class SimulatedDaemon:
-    """Daemon on virtual time whose simulated hand can be observed. Raises SettingsError."""
+    """Daemon in virtual time whose simulated hand can be observed. Raises SettingsError."""
 
     def __init__(
         self,

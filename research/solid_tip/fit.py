@@ -1,10 +1,10 @@
-"""Fit the data in the file to presses: a polynomial for the energy, modes for the base pressure.
+"""Fit the file's data to presses: a polynomial for the energy, modes for the base pressure.
 
-The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so N =
-∂U/∂d holds exactly. The base pressure divided by N is decomposed by singular values, one harmonic
-at a time. The mode amplitudes are polynomials as well. All polynomials are Chebyshev series in s =
-√(d/a), sin²θ and ν. The notes in the file describe the layout of the coefficients. `SolidTip` reads
-the file using only NumPy.
+The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so
+N = ∂U/∂d holds exactly. A singular value decomposition of the base pressure divided by N, one
+harmonic at a time, gives the modes. The mode amplitudes are also polynomials. All polynomials are
+Chebyshev series in s = √(d/a), sin²θ and ν. The notes in the file describe the layout of the
+coefficients. `SolidTip` reads the file using only NumPy.
 """
 
 from __future__ import annotations

@@ -243,7 +243,7 @@ class Body:
         return np.asarray(moved.reshape(-1, 27, 3, 3))
 
     def pressures(self, motion: FloatArray, change: FloatArray) -> FloatArray:
-        """Return p as linear functions, to first order after a ``change`` of motion."""
+        """Return p as linear functions, with a first-order update for ``change`` in the motion."""
         moved = self._strain(slice(None), motion)
         more = self._strain(slice(None), change)
         f = moved + np.eye(3)

@@ -5,7 +5,7 @@ d_t, a tip's energy is
 
     U(d, θ, d_t) = U₀(d, θ) + F(d, θ) (sin θ d_t + cos θ d_t²/d)
 
-with U₀ and F from the contact table. For a constant modulus, U is the energy of the
+where U₀ and F are taken from the contact table. For a constant modulus, U is the energy of the
 parallel-distributed model, πE[d³/(3cos²θ) + d² d_t tan θ + d d_t²]. The shear force is T = ∂U/∂d_t
 and the normal force is N = ∂U/∂d − T tan θ. The shear displacements are computed from the rolling
 increments of `reference_hand`. The increments are not integrable in general, so a grasp depends on

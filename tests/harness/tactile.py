@@ -63,8 +63,10 @@ class Rig:
     def __init__(
         self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None
     ) -> None:
-        """Set up the backend; ``source`` generates a serial board's frames (default: new
-        images)."""
+        """Set up the backend.
+
+        ``source`` generates the frames of a serial board. By default, each frame is a new image.
+        """
         self.backend = backend
         self._stack = ExitStack()
         self._stop = threading.Event()

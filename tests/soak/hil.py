@@ -307,7 +307,7 @@ def _conclude(account: Account) -> None:
 
 
 def subscribe(address: str) -> None:
-    """Print "ready" at the first state, and at the end the numbers of received and lost states."""
+    """Print "ready" at the first state; finally, print how many states were received and lost."""
     received = 0
     with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()

@@ -1,4 +1,4 @@
-"""Test that the covariance includes errors invisible in frames and matches the actual errors."""
+"""Test that the covariance matches the actual errors, even those that are invisible in frames."""
 
 import itertools
 import math

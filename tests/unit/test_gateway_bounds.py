@@ -121,7 +121,8 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
 
 
 def test_unread_replies_are_dropped(served, context, addresses):
-    """Unread replies neither block the gateway nor fill its memory: the reply queue is limited."""
+    """Unread replies neither block the gateway nor fill its memory, because the queue is
+    limited."""
     client = context.socket(zmq.DEALER)
     client.setsockopt(zmq.RCVHWM, 1)
     client.setsockopt(zmq.RCVBUF, 4096)

@@ -26,7 +26,7 @@ def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
 
 
 def load(hand: SimulatedHand, torques: Iterable[float], each: float) -> np.ndarray:
-    """Apply each motor torque [N·m] for ``each`` [s]; return the angle after each."""
+    """Apply each motor torque [N·m] for ``each`` [s]; return the angle after each torque."""
     found = []
     for torque in torques:
         hand.drive(0, CURRENT, True, 0.0, torque / CONSTANT)

@@ -73,7 +73,7 @@ def test_pressing_and_releasing_follow_the_prony_terms():
 
 
 def test_relaxing_tips_do_not_generate_energy():
-    """A free object bouncing between relaxing tips without other damping comes to rest."""
+    """A free object that bounces between relaxing tips comes to rest without any other damping."""
     settings = Settings.model_validate(
         {
             "material": {"law": "constant"},

@@ -1,6 +1,6 @@
-"""Test requirements for every servo backend in each operating mode, simulated and Dynamixel.
+"""Test the simulated and the Dynamixel servo backend in each operating mode.
 
-The same tests run for both backends. To test another backend, add it to ``RIGS``.
+Both backends must pass the same tests. To test another backend, add it to ``RIGS``.
 """
 
 import math

@@ -32,7 +32,11 @@ action = st.one_of(
 
 
 class Scene:
-    """Counts events; an ``arm`` is identified by the count at which it was first sent."""
+    """Gateway, link and loop, which act step by step.
+
+    Each event increments a counter. The counter value at which an ``arm`` was first sent identifies
+    this ``arm``.
+    """
 
     def __init__(self, folder: str) -> None:
         self.clock = VirtualClock()

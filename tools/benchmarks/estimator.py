@@ -167,7 +167,7 @@ def frames_to_contacts(rounds: int) -> Report:
 
 
 def centroid_and_extent(frames: FloatArray) -> FloatArray:
-    """Compute d and tilts [n, 3] from the centroid and extent of each footprint with NumPy.
+    """Use NumPy to compute d and tilts [n, 3] from each footprint's centroid and extent.
 
     For a constant modulus, the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance is
     d (4a − d)/6 − sin² θ d (12a − 5d)/36. The initial footprint contains all cells above a
@@ -214,7 +214,7 @@ def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> Floa
 
 
 def bound() -> float:
-    """Return the Cramér-Rao bound for d [m] using all cells, with unknown tilts and gain.
+    """Return the Cramér-Rao bound for d [m] from all cells if tilts and gain are unknown.
 
     Pressure derivatives with respect to (d, tilt_x, tilt_y, gain) are central differences.
     """

@@ -1,8 +1,9 @@
-"""Measure how grips behave with faulty measurements, using the plant's true state.
+"""Measure how grips behave with faulty measurements.
 
 Each case is a grip with a faulty measurement or an unusual tip. A trial's seed determines the
-noise, the times, the affected finger, the object mass and the torque constant error. Trials run on
-virtual time, so the results do not depend on the machine.
+noise, the times, the affected finger, the object mass and the torque constant error. Trials run in
+virtual time, so they do not depend on the machine. The results are computed from the plant's true
+state.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ class GripTrial:
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
-        """Record the results from the watch and the final state."""
+        """Record the results from ``watch`` and the hand's final state."""
         self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events

@@ -2,7 +2,7 @@
 
 A 10 N grip carries a constant load along the object faces, away from the palm. A larger load is
 then applied and maintained: either a push, or a twist with the same force at the faces. Trials run
-on virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
+in virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
 object is no longer between the tips. *Slid*: object displacement along its faces. The displacement
 is measured relative to the midpoint between the tips, so that leaning fingers do not affect the
 result. *Answer*: time from the onset of slip until the goal currents have increased by a quarter.

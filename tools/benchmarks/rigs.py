@@ -49,7 +49,7 @@ def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
 
 @contextlib.contextmanager
 def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
-    """Yield a daemon on virtual time with private addresses and a subscriber to ``topics``."""
+    """Yield a virtual-time daemon with private addresses, and a subscriber to ``topics``."""
     with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
         sections = {
             "loop": {"clock": "virtual"},

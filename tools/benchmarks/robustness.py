@@ -2,7 +2,7 @@
 
 The simulated hand and the daemon have separate settings. In each of the *rows*, one parameter
 differs by an amount that is normal for a healthy hand. In the *ensemble*, all parameters are drawn
-at random. Grips run on virtual time, so the results do not depend on the machine.
+at random. Grips run in virtual time, so the results do not depend on the machine.
 """
 
 from __future__ import annotations

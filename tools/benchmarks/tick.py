@@ -98,7 +98,7 @@ def _in_turns(title: str, rounds: int) -> Report:
 
 
 def ticks(daemon: Daemon, count: int) -> list[float]:
-    """Return the durations of ``count`` consecutive ticks on virtual time [µs]."""
+    """Return the durations [µs] of ``count`` consecutive ticks in virtual time."""
     loop, clock = daemon.loop, daemon.clock
     samples = []
     for _ in range(count):
@@ -108,7 +108,7 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
 
 
 def in_place(daemon: Daemon, rate: float) -> list[float]:
-    """Return tick durations [µs] over 0.15 s, with each tick started by a real-time deadline."""
+    """Return tick durations [µs] during 0.15 s; real-time deadlines start the ticks."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
     for _ in range(round(0.15 * rate)):
@@ -119,7 +119,7 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
 
 
 def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Measure ticks over ptys during a hold, alternating with the servo exchanges alone.
+    """Alternately time complete ticks and plain servo exchanges over ptys during a hold.
 
     A ``baud`` of 0 disables pacing, and ``changes`` override the profile. Raises RigError if the
     hand loses its grip, e.g. on a busy machine.

@@ -1,4 +1,4 @@
-"""Grip with a simulated hand on virtual time and observe the plant on every tick.
+"""Grip with a simulated hand in virtual time and observe the plant on every tick.
 
 True force, object position and slip are read from the plant, independently of the code under test.
 """
@@ -69,7 +69,7 @@ class Watch:
 
 
 class VirtualGrip(SimulatedDaemon):
-    """Grip on virtual time; ``look`` is called after each tick."""
+    """Grip in virtual time; ``look`` is called after each tick."""
 
     def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:
         """Build daemon and hand.

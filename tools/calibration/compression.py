@@ -1,4 +1,4 @@
-"""Calibrate a tip's material law from test machine CSV files: `calibrate law --compression`.
+"""Run `calibrate law --compression`: fit a tip's material law to CSV files of a test machine.
 
 A file contains strain and stress, or displacement and force. A file with displacement and force
 also needs the tilt, in a column or from ``--theta``.

@@ -1,4 +1,4 @@
-"""Measure joint friction with slow sweeps in air: `calibrate friction`."""
+"""Run `calibrate friction`: measure joint friction with slow sweeps in air."""
 
 from __future__ import annotations
 

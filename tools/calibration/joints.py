@@ -1,4 +1,4 @@
-"""Write servo data to a profile: `calibrate joints` and `calibrate heat`.
+"""Run `calibrate joints` and `calibrate heat`: write servo data to a profile.
 
 During `calibrate joints`, torque is off and the user moves each finger by hand. The servo counts
 are read in the closed, open and zero poses. `calibrate heat` fits the thermal constants to the
@@ -170,7 +170,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write ``new`` to the file, which becomes a copy of the profile if it does not exist yet.
+    """Write the settings ``new`` to ``arguments.file``, or to a copy of the profile at this path.
 
     All other text is preserved.
     """

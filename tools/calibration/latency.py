@@ -1,4 +1,4 @@
-"""Measure the tactile frame latency from a grip with varying force: `calibrate latency`."""
+"""Run `calibrate latency`: measure the tactile frame latency in a grip with varying force."""
 
 from __future__ import annotations
 

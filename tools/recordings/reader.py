@@ -73,14 +73,14 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 class MessageSource(Protocol):
-    """Source of messages, in a file or in memory; user messages refer to it as ``path``."""
+    """Source of messages in a file or in memory; error messages call the source ``path``."""
 
     path: Path
 
     def messages(
         self, topics: Collection[bytes] | None = None
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield the topic and map of each message in ``topics``, in order."""
+        """Yield the topic and map of each message whose topic is in ``topics``, in order."""
 
 
 class Recording:

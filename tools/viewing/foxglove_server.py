@@ -1,4 +1,4 @@
-"""Serve the stream to Foxglove with its WebSocket protocol (foxglove/ws-protocol, version 1).
+"""Serve the stream to Foxglove via its WebSocket protocol (foxglove/ws-protocol, version 1).
 
 Channels have the same names, schemas and messages as in recordings (`tools.recordings.channels`),
 so the same layout works for both. The additional channel ``hand/scene`` contains the moving hand.

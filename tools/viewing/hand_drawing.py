@@ -44,7 +44,7 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
 
 
 class DrawnPart(NamedTuple):
-    """Part of a picture, which is empty while the part is absent."""
+    """Lines and labels of one part of a picture; the lists are empty while the part is absent."""
 
     lines: list[tuple[str, float, FloatArray]]  # colour name, width [m], points [n, 2] [m]
     texts: list[tuple[str, FloatArray, str]]  # colour name, position [2] and text of each label

@@ -310,7 +310,7 @@ def listen(host: str, port: int | None) -> socket.socket:
 
 
 def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
-    """Serve the page until the end. Raises SoftfingerError if nothing can be shown."""
+    """Serve the page until ``ending`` is met. Raises SoftfingerError if nothing can be shown."""
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
     if recording is not None and arguments.save is not None:

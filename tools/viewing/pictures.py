@@ -1,8 +1,8 @@
 """Convert the stream's messages to data for the web page: scene, pictures and plot rows.
 
-A picture is JSON with the lines, dots, texts and images for each panel at one time. The scene
-contains the constant parts: the layout and the energy landscape. A row contains the values of all
-plots at one time. A page receives each row once, even if it skips pictures. Colours are sent by
+A picture is a JSON text with the lines, dots, texts and images for each panel at one time. The
+scene contains the constant parts: the layout and the energy landscape. A row contains the values of
+all plots at one time. A page receives each row once, even if it skips pictures. Colours are sent by
 name, and the page defines their RGB values.
 """
 
@@ -255,7 +255,7 @@ class Pictures:
         self._scene_text = _packed(self._scene)
 
     def mark(self, marks: list[Any]) -> None:
-        """Show a recording's ``marks``, from `sources.marks_of`."""
+        """Show a recording's ``marks``, which `sources.marks_of` returns."""
         self._marks = self._scene["marks"] = marks
         self._scene_text = _packed(self._scene)
 
