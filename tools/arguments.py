@@ -1,7 +1,7 @@
 """Command-line arguments shared by several subcommands.
 
 The settings module is imported only when a profile is loaded, because clients of a running hand do
-not need it.
+not need settings.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Contact of a rigid plane with the hemisphere, as a linear complementarity problem.
 
 Without friction, each surface cell has one unknown: the force q ≥ 0 along the plane's normal
-n = (sin θ, 0, cos θ), which also acts on the mirror image of the cell at −y. The cells move by C q,
+n = (sin θ, 0, cos θ). The same force acts on the cell's mirror image at −y. The cells move by C q,
 where C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Contact therefore
 requires q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
 

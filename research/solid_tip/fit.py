@@ -1,8 +1,8 @@
 """Fit the file's data to presses: a polynomial for the energy, modes for the base pressure.
 
 The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so
-N = ∂U/∂d holds exactly. A singular value decomposition of the base pressure divided by N, one
-harmonic at a time, gives the modes. The mode amplitudes are also polynomials. All polynomials are
+N = ∂U/∂d holds exactly. For each harmonic, a singular value decomposition of the base pressure
+divided by N gives the modes. The mode amplitudes are also polynomials. All polynomials are
 Chebyshev series in s = √(d/a), sin²θ and ν. The notes in the file describe the layout of the
 coefficients. `SolidTip` reads the file using only NumPy.
 """
@@ -106,7 +106,7 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
 
 
 def push_of(energy: FloatArray) -> FloatArray:
-    """Convert coefficients of V to those of Q = 6/5 V + s/5 ∂V/∂s in N = N_Hertz (1 + s Q)."""
+    """Convert coefficients of V to coefficients of Q = 6/5 V + s/5 ∂V/∂s; N = N_Hertz (1 + s Q)."""
     slope = chebyshev.chebder(energy, axis=0) * (2 / S_MAX)
     s = np.array([S_MAX / 2, S_MAX / 2])  # the variable s as a Chebyshev series
     product = np.apply_along_axis(lambda row: chebyshev.chebmul(s, row), 0, slope)

@@ -8,7 +8,7 @@ The functions are computed with finite elements of the linear elastic hemisphere
 harmonic at a time. A displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ), where U, V and W
 are defined on the meridian plane (r, z), a quarter disc. The elements are quadrilaterals with nine
 nodes. The volumetric strain is projected onto linear functions in each element (the Q2/P1 pair with
-the discontinuous pressure eliminated), which avoids locking as ν approaches ½.
+the discontinuous pressure eliminated). This projection avoids locking as ν approaches ½.
 """
 
 from __future__ import annotations

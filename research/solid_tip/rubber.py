@@ -2,10 +2,10 @@
 
 The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and κ = E/(3 −
 6ν), where E and ν are the small-strain values. Elements have 27 nodes. In the volumetric part, J −
-1 is projected onto linear functions in each element (mean dilatation to first order), which avoids
-locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a tilted plane, the
-mesh covers half a turn, with the symmetry plane y = 0. For an upright plane, the mesh is one thin
-wedge, and all nodes at the same r and z have the same motion.
+1 is projected onto linear functions in each element (mean dilatation to first order). This
+projection avoids locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a
+tilted plane, the mesh covers half a turn, with the symmetry plane y = 0. For an upright plane, the
+mesh is one thin wedge, and all nodes at the same r and z have the same motion.
 
 Contact occurs between the plane and nodes. An active node lies in the plane and transmits a normal
 force. An active node moves freely along the plane unless the face is sticking. Each Newton step
@@ -218,7 +218,7 @@ class Body:
         return turns
 
     def _sparsity(self) -> None:
-        """Set the sparsity of the tangent's upper triangle and the positions of element entries."""
+        """Set the sparsity pattern of the tangent's upper triangle, and its entries' positions."""
         size = self.places.shape[1]
         row, column = np.repeat(self.places, size, 1).ravel(), np.tile(self.places, size).ravel()
         self.upper = np.flatnonzero(row <= column)

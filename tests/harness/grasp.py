@@ -95,8 +95,8 @@ class Grasp:
     def symmetric(self, d: float) -> GraspState:
         """Return a state with both tips indented by ``d`` [m], an upright object and no shear.
 
-        Raise ValueError if the fingers cannot reach this state, and GraspError if it is outside the
-        tip's range.
+        Raise ValueError if the fingers cannot reach this state, and GraspError if the state is
+        outside the tip's range.
         """
         q = self.hand.inverse((0.0, 0.0, 0.0), (d, d), self.width)
         # T = 0 gives d_t = −(d/2) tan θ.

@@ -22,7 +22,7 @@ class ReferenceHand(HandGeometry):
     """Hand model with derivatives and inverse kinematics."""
 
     def variables(self, x: Any, width: float) -> Any:
-        """Return (d, θ, s) of each tip (2, 3, …) at coordinates (5, …), which may be complex."""
+        """Return (d, θ, s) of each tip (2, 3, …) at real or complex coordinates (5, …)."""
         found = []
         for side, q in ((1.0, x[0]), (-1.0, x[1])):
             inwards = self.finger_length * np.sin(q) + self.finger_offset * np.cos(q)

@@ -306,7 +306,7 @@ def test_panels_for_missing_parts_are_omitted(tmp_path, changes, gone, there):
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[tuple[FakeDaemon, Viewed]]:
-    """Yield a fake daemon and its viewer, for tests that change neither."""
+    """Yield a fake daemon and its viewer, for tests that do not change them."""
     with FakeDaemon() as fake, view(fake) as viewed:
         yield fake, viewed
 

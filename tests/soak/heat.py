@@ -2,12 +2,11 @@
 
 ``python -m tests.soak.heat --runs 40``.
 
-Each run draws random values: a servo model; factors for heating, cooling and heat capacity (0.75 to
-1.33); the room temperature (15 to 35 °C); a current (1.15 to 1.8 times the maximum continuous
-current); and the time at which the room becomes 5 or 8 °C warmer or colder. The daemon's filter
-receives temperatures in whole degrees and a current with 3 % noise. The plant is
-`servo_model.servo_joint`. ``--grips N`` adds complete hands in virtual time that grip too hard for
-too long.
+Each run draws a servo model, factors for heating, cooling and heat capacity (0.75 to 1.33), a room
+temperature (15 to 35 °C) and a current (1.15 to 1.8 times the maximum continuous current). At a
+random time, the room becomes 5 or 8 °C warmer or colder. The daemon's filter receives temperatures
+in whole degrees and a current with 3 % noise. The plant is `servo_model.servo_joint`. ``--grips N``
+adds complete hands in virtual time that grip too hard for too long.
 """
 
 import argparse

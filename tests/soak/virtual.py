@@ -4,7 +4,7 @@
 the grips are then loaded, turned, disturbed by faulty measurements and stopped. The complete daemon
 runs, except for its sockets. Requirements are checked against the plant and the data sent to the
 servos, never against the daemon's own reports. The soak counts how often each requirement is
-checked, and fails if a requirement is never checked. The tests run a few sequences.
+checked, and fails if a requirement is never checked. The test suite runs only a few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time and records and reads its stream.
 Violations are counted and do not end the run. The run fails if memory grows or a state is

@@ -225,7 +225,7 @@ def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered
 
 
 class Aged:
-    """Handler that stores the ages of commands and refuses those older than 0.2 s as late."""
+    """Handler that stores the ages of commands and refuses commands older than 0.2 s as late."""
 
     def __init__(self) -> None:
         self.ages: list[float] = []

@@ -153,7 +153,10 @@ def test_a_friction_level_that_changes_at_standstill_adds_no_torque():
 
 
 def reference(torque: float, rate: float, stribeck: float, seconds: float) -> np.ndarray:
-    """Return angle, velocity and deflection by the same equations, starting at ``rate`` [rad/s]."""
+    """Solve the same equations; return angle, velocity and deflection.
+
+    The initial velocity is ``rate`` [rad/s].
+    """
 
     def equations(_t, state):
         _, v, z = state

@@ -28,7 +28,7 @@ def twin(
 ) -> tuple[complex, complex]:
     """Return F and U by Gauss quadrature on the base plane, x = h s + ρ c sin t, y = b sin τ.
 
-    Complex arguments give exact derivatives by the complex step.
+    Complex arguments allow exact derivatives with the complex-step method.
     """
     a, s, c = tip.radius, np.sin(theta), np.cos(theta)
     h = a - d

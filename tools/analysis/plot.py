@@ -111,8 +111,8 @@ class Missing(SoftfingerError):
 class RecordedRun:
     """Recording, or part of one, in SI units; ``t`` is relative to the recording's first message.
 
-    ``states`` contains one array per field. The field names are those in the stream; nested names
-    contain a dot.
+    ``states`` contains one array per field. The fields have the same names as in the stream; nested
+    names contain a dot.
     """
 
     name: str

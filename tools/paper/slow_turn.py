@@ -6,11 +6,14 @@ model is frictionless. For a tip with shear ζ
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
 The shear rate is the rolling speed minus two other terms: the speed along the face, and the
-component along a tilted face due to increasing d. s, d and θ are defined in
+component along a tilted face due to increasing d. The quantities s, d and θ are defined in
 `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium if Σ δU = 0
-for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ +
-T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies this equilibrium condition. `turned`
-solves the condition step by step; the solution does not involve time, mass or damping.
+for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, the condition becomes
+
+    Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0
+
+Every pose in a slow turn satisfies this equilibrium condition. `turned` solves the condition step
+by step; the solution does not involve time, mass or damping.
 """
 
 from __future__ import annotations

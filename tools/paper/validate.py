@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def comparisons() -> Iterator[PublishedValue]:
-    """Yield all rows, computing each on demand."""
+    """Yield all rows; each row is computed on demand."""
     for rows in (_tips, _energy, _relaxation, _sensors, _hands):
         yield from rows()
 

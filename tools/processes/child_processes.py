@@ -25,7 +25,7 @@ _RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe or to close i
 
 
 class RecorderError(SoftfingerError):
-    """The recorder did not start. The error text is the recorder's own message."""
+    """Error raised if the recorder does not start. The text is the recorder's own message."""
 
 
 class _Lifeline:

@@ -227,8 +227,8 @@ def _unhurried(settings: Settings, paced: bool) -> Settings:
     """Return the settings with real-time options that are suitable for a pseudo-terminal.
 
     SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Idle
-    states are disabled only if the servos reproduce the wire timing, which requires very short
-    sleeps.
+    states are disabled only if the servos reproduce the wire timing, because this timing requires
+    very short sleeps.
     """
     changes = {"priority": 0, "cpus": (), "spin": 0.0, "lock_memory": False}
     held = paced and settings.realtime.hold_latency

@@ -1,4 +1,4 @@
-"""Convert a topic's map to a channel's JSON and back, for the writer and the reader."""
+"""Convert the message maps of a topic to a channel's JSON and back."""
 
 from __future__ import annotations
 

@@ -197,7 +197,7 @@ def export(
 
 
 def _file_name(topic: bytes) -> str:
-    """Return a safe file name for any topic: not hidden, and without a folder part."""
+    """Return a safe file name for any topic; the file is not hidden or in another folder."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 

@@ -1,6 +1,6 @@
 """Read MCAP files: `Recording` provides a file's summary and its messages in order of arrival.
 
-A recording may have been written by any MCAP writer, with or without chunks, indexes, statistics
+A recording may have been written by any MCAP writer, and may contain chunks, indexes, statistics
 and other programs' channels. Sizes and counts in the file are not trusted. The memory use and the
 run time are bounded by the file's size on disk. `read_recording` returns the states as NumPy
 columns.
@@ -334,7 +334,7 @@ class Recording:
             return PROFILE
 
     def _summary(self, file: BinaryIO) -> Statistics | None:
-        """Return the summary's statistics, or None if they or their channels are missing."""
+        """Return the summary's statistics, or None if statistics or channels are missing."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Statistics
 

@@ -109,7 +109,7 @@ class RecordingWriter:
             raise self._failed(error) from None
 
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Write one message, possibly modifying its map. Raises RecordingError.
+        """Write one message; its map may be modified. Raises RecordingError.
 
         A repeated message (``again``) contains its original time, which precedes the recording. To
         keep all log times within the recording, the repeated message gets the previous message's

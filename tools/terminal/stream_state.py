@@ -252,7 +252,7 @@ class StreamState:
         return client if now < until else ""
 
     def grip(self) -> str:
-        """Describe the grip's goal; return an empty string without a grip."""
+        """Describe the grip's goal; return an empty string if there is no grip."""
         force, angle = self.state.goal_force, math.degrees(self.state.goal_angle)
         if not math.isfinite(force):
             return ""

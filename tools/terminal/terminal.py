@@ -1,7 +1,7 @@
 """Control the terminal of a full-screen page: screen modes, key decoding, output, restoration.
 
-A redraw sends all changed lines in a single write operation, which is fast over ssh and avoids
-flicker.
+A redraw sends all changed lines in a single write operation, because a single write is fast over
+ssh and avoids flicker.
 """
 
 from __future__ import annotations

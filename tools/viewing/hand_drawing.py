@@ -120,7 +120,7 @@ def held_outline(
 
 
 def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
-    """Return the outline [m] of the object in ``hand/truth``, [n, 2]; empty without an object."""
+    """Return the outline [m] of the object in ``hand/truth``, [n, 2], or an empty array."""
     pose = read(TrueState, truth).true_object
     try:
         shape = shape_of(settings)

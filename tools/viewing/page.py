@@ -61,7 +61,7 @@ _say = to_stderr("view")
 
 
 class _Published(NamedTuple):
-    """Picture, with additional data for the page."""
+    """Picture with additional data for the page."""
 
     scene: str
     picture: str
@@ -238,7 +238,7 @@ class Site:
             await page.send(answer)
 
     def _in_thread(self, text: str | bytes) -> asyncio.Future[str]:
-        """Run `_answer` in a thread that ends with the process; return its future."""
+        """Run `_answer` in a thread that ends with the process; return a future for the reply."""
         future: asyncio.Future[str] = self._loop.create_future()
 
         def give(answer: str) -> None:
@@ -252,7 +252,7 @@ class Site:
         return future
 
     def _answer(self, text: str | bytes) -> str:
-        """Send the request ``text`` to the daemon, which checks it; return a line about the result.
+        """Send the request ``text`` to the daemon for checking; return a line about the result.
 
         A command other than stop is dropped if the user's picture (time ``seen``, monotonic [s]) is
         too old.

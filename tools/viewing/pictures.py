@@ -120,7 +120,7 @@ def _row(number: int, state: HandState) -> list[Any]:
 
 
 class Row(NamedTuple):
-    """Plot row, prepared for sending to a page; ``number`` is consecutive."""
+    """Plot row, packed for sending to a page; rows are numbered consecutively."""
 
     number: int
     text: str
@@ -307,7 +307,7 @@ class Pictures:
         self._publish(self._scene_text, _packed(picture), [row for _, row in self._past])
 
     def _set(self) -> dict[str, float]:
-        """Return the grip's requested force [N] and angle [°], or NaN without a grip."""
+        """Return the grip's requested force [N] and angle [°], or NaN if there is no grip."""
         feed, state = self.feed, self.feed.state
         angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
         force = feed.commanded if math.isfinite(feed.commanded) else state.goal_force
@@ -324,7 +324,7 @@ class Pictures:
         return {"lines": lines, "texts": texts}
 
     def _maps(self, now: float) -> dict[str, Any]:
-        """Draw each tip's pressure frame and rim, and the footprint and centroid of its contact."""
+        """Draw each tip's pressure frame and rim, and each contact's footprint and centroid."""
         frames, tip = self.feed.frames, self._settings.tip.radius
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
