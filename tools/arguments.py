@@ -257,7 +257,7 @@ def add_duration(parser: argparse.ArgumentParser) -> None:
 def add_split(parser: argparse.ArgumentParser) -> None:
     """Add ``--split-size`` and ``--split-time``.
 
-    A recorder uses more memory the larger its file is, so splitting limits the memory use.
+    A recorder's memory use grows with the file size, so splitting limits the memory use.
     """
     parser.add_argument(
         "--split-size",

@@ -31,7 +31,7 @@ WRONG = (
 
 @kernel
 def past_limit(radius, d, theta, curvature):
-    """Return the minimum indentation of the rim [m] that d and θ of the tip imply."""
+    """Return the minimum rim indentation [m] implied by the tip's d and θ."""
     if curvature == 0.0:
         return d - radius * (1.0 - abs(math.sin(theta)))
     away = radius - d + 1.0 / curvature

@@ -127,7 +127,7 @@ def test_too_short_a_hold_is_refused():
 
 
 def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
-    """Return the true force divided by 8 N, 1 s into a hold and at its end, and the warnings."""
+    """Return true force / 8 N after 1 s of a hold and at the end, and the warnings."""
     sections: dict[str, dict[str, Any]] = {name: dict(values) for name, values in tip.items()}
     sections.setdefault("simulation", {})["tip_relaxation"] = STRENGTHS
     if aware:

@@ -163,8 +163,8 @@ class Source:
 
     ``t`` is relative to the recording's first message, or to the first frame in files that contain
     only frames. ``total`` is the final value of ``progress``. ``recording`` is set for files that
-    contain only frames. Kernels are loaded when ``models`` is called, so that an unreadable file
-    fails quickly.
+    contain only frames. Kernels are loaded when ``models`` is called, so that an unreadable file is
+    reported quickly.
     """
 
     settings: Settings

@@ -135,7 +135,10 @@ class GripTrial:
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
-        """Return (time, channel) of the correct or, if not ``rightly``, the wrong diagnoses."""
+        """Return (time, channel) of each correct diagnosis.
+
+        If ``rightly`` is False, the wrong diagnoses are returned instead.
+        """
         names = [
             (t, k.removeprefix(_EVENT_PREFIX))
             for t, k in self.events

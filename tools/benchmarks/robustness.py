@@ -44,7 +44,7 @@ _LATENCY = Settings().tactile.latency
 
 @dataclass(frozen=True)
 class HandCase:
-    """Grip with ``force`` [N] by a daemon whose settings differ from the hand's."""
+    """Case of a grip with ``force`` [N] in which the daemon's settings differ from the hand."""
 
     name: str
     force: float

@@ -447,7 +447,7 @@ def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
 
 
 def _flat(points: FloatArray) -> FloatArray:
-    """Return x and y alternately, rounded to four decimals (at most a tenth of a pixel)."""
+    """Return x and y alternately, rounded to four decimals (an error below a tenth of a pixel)."""
     return np.clip(points, -_NUMBER_MAX, _NUMBER_MAX).round(4).ravel()
 
 
