@@ -98,8 +98,9 @@ class Meridian:
     def stiffness(self, m: int, poisson: float) -> sparse.csc_matrix:
         """Return the stiffness matrix of harmonic ``m`` for E = 1.
 
-        The degrees of freedom are 3 node + (0 U, 1 V, 2 W). The energy is integrated only over r
-        and z; the factor π (2π for m = 0) is omitted here and in the loads.
+        The degrees of freedom U, V and W of node k have the indices 3k, 3k + 1 and 3k + 2. The
+        energy is integrated only over r and z; the factor π (2π for m = 0) is omitted here and in
+        the loads.
         """
         shear, lame = 0.5 / (1 + poisson), poisson / ((1 + poisson) * (1 - 2 * poisson))
         shape, gradient, r, weight = self._geometry

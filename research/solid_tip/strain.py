@@ -101,7 +101,7 @@ def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def coefficients(each: Change, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit coefficients of the energy ratio (i,), T (i,) and base pressure (i, H, R).
+    """Fit the coefficients of energy ratio (i,), T (i,) and base pressure (i, H, R).
 
     ``step`` is the cell width.
     """

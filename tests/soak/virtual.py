@@ -520,7 +520,7 @@ class Soak:
         return chance.uniform(low, high)
 
     def _disturb(self) -> None:
-        """Start a load, a measurement fault, or a fault of a servo or a sensor."""
+        """Start a load, a measurement fault, a servo fault or a sensor fault."""
         self._mend()
         chance, t = self._random, self.daemon.clock.now()
         self._well_at = self.count + self._after(_DISTURBED_FOR)

@@ -21,7 +21,7 @@ nasty = st.lists(
 
 
 def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
-    """Return the frames decoded when the data are fed byte by byte.
+    """Decode the data byte by byte and return the frames.
 
     If the decoder synchronises late, it may complete several frames at once but returns only the
     newest frame.

@@ -104,7 +104,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
 )
 @settings(max_examples=60)
 def test_every_admissible_material_has_its_minimum_energy_upright(slopes, depth, share):
-    """Random positive Bernstein polynomials as tangent moduli give laws of all curvatures."""
+    """The tangent moduli are random positive Bernstein polynomials, so the laws curve both ways."""
     n = len(slopes) - 1
     modulus = np.polynomial.Polynomial([0.0])
     for k, slope in enumerate(slopes):

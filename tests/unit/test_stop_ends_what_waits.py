@@ -32,7 +32,7 @@ action = st.one_of(
 
 
 class Scene:
-    """Gateway, link and loop, which act step by step.
+    """Gateway, link and loop that act step by step.
 
     Each event increments a counter. The counter value at which an ``arm`` was first sent identifies
     this ``arm``.

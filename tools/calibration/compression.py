@@ -73,7 +73,7 @@ _BETTER = 6.0
 
 
 def read_csv(path: Path) -> dict[str, FloatArray]:
-    """Read the known columns of a file in SI units.
+    """Read a file's known columns and convert them to SI units.
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
     semicolon. Units follow the column names in the header, or are in a separate row below the
