@@ -210,8 +210,7 @@ class SolidTip:
         return stick * float(np.sin(theta) * np.cos(theta))
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
-        """Average the pressure over the cells of a square grid centred under the tip, with rows
-        along y."""
+        """Average the pressure over cells of a square grid centred under the tip (rows along y)."""
         parts, turns = 10, 2000  # number of radial and angular pieces of each ring
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,
