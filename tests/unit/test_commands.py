@@ -441,7 +441,10 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(con
 
 
 class Flood:
-    """Clients that send requests without waiting for replies. At first, no request is served."""
+    """Clients that send requests without waiting for replies.
+
+    Initially, the requests are not served.
+    """
 
     def __init__(self, context: zmq.Context[Any], address: str, clients: int, each: int) -> None:
         self.sockets = [context.socket(zmq.DEALER) for _ in range(clients)]

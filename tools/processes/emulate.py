@@ -140,7 +140,10 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT, SIGTERM or SIGHUP. If the setup fails, print a message and return 1."""
+    """Emulate the hand until SIGINT, SIGTERM or SIGHUP arrives.
+
+    If the setup fails, a message is printed, and 1 is returned.
+    """
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder with --dir")

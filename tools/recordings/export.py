@@ -153,7 +153,7 @@ def export(
     end: float = math.inf,
     progress: Any = None,
 ) -> list[Path]:
-    """Write one table per topic and one ``.npz`` file with frames per sensor into ``folder``.
+    """Write one table per topic, and one ``.npz`` file of frames per sensor, into ``folder``.
 
     In all files, the first column ``t`` is the time since the recording's first message [s],
     according to the daemon's clock. The other columns are the fields of the schema and any
