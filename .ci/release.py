@@ -31,7 +31,7 @@ _UNRELEASED = "## [Unreleased]\n"
 
 
 class ReleaseError(Exception):
-    """The release cannot be prepared."""
+    """Error raised if the release cannot be prepared."""
 
 
 def sections(changelog: str) -> dict[str, str]:
@@ -49,12 +49,12 @@ def stated(changelog: str, version: str) -> dict[str, str]:
 def dated(changelog: str, version: str, today: datetime.date) -> str:
     """Move the unreleased entries to a heading for ``version``.
 
-    A changelog that already has this version and no unreleased entries is not changed.
+    The changelog is not changed if it already has this version and no unreleased entries.
 
     Raises
     ------
     ReleaseError
-        If the version has no entries, is not newer than the last one, or has too many lines.
+        If the version has no entries, is not newer than the last release, or has too many lines.
     """
     found = sections(changelog)
     unreleased = found.pop("Unreleased", None)

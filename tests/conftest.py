@@ -87,7 +87,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Exclude the million permanent objects of the imported modules from garbage collection."""
+    """Exclude about a million permanent objects of imported modules from garbage collection."""
     if session.config.stash.get(PERTURBATION, None) is not None:
         session.config.stash[PERTURBATION].enter_modules()
     gc.collect()
@@ -101,7 +101,7 @@ def pytest_unconfigure() -> None:
 
 @pytest.fixture(autouse=True)
 def ended_with_the_test() -> Iterator[None]:
-    """Kill the test's remaining child processes; restore signal handlers and garbage collection."""
+    """After each test, kill its child processes; restore signal handlers and garbage collection."""
     before = descendants.running()
     handlers = {each: signal.getsignal(each) for each in _SIGNALS}
     yield
@@ -138,8 +138,8 @@ def addresses() -> tuple[str, str]:
 def write_profile(path: Path, addresses: tuple[str, str], text: str = "") -> Path:
     """Write a profile that contains ``addresses`` and ``text``.
 
-    The loop rate is 100 Hz unless ``text`` sets it, because the daemons of several tests share the
-    processors.
+    Unless ``text`` sets the loop rate, the rate is 100 Hz, because the daemons of several tests
+    share the processors.
     """
     stream, commands = addresses
     rate = "" if "loop.rate" in text else "loop.rate = 100.0\n"

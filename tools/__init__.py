@@ -1,1 +1,1 @@
-"""User tools: the command line in `cli`, and its subcommands in one package per topic."""
+"""Provide the command line in `cli`, and the subcommands in one package per topic."""

@@ -1,7 +1,7 @@
 """Command-line arguments shared by several subcommands.
 
 The settings module is imported only when a profile is loaded, because clients of a running hand do
-not need it.
+not need settings.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def profile(arguments: argparse.Namespace) -> Settings:
 
 
 def own_runtime_folder() -> Path | None:
-    """Return the default port folder for an emulated hand, or None without a runtime folder."""
+    """Return an emulated hand's default port folder, or None if there is no runtime folder."""
     return None if runtime_fault() else runtime_folder()
 
 
@@ -100,7 +100,7 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
 
 
 def stream_address(text: str) -> str:
-    """Parse the stream address from a socket address, ``tcp://HOST`` or ``STREAM,COMMANDS``.
+    """Parse the stream address, given as a socket address, ``tcp://HOST`` or ``STREAM,COMMANDS``.
 
     An empty string selects SOFTFINGER_ADDRESS or, if the variable is unset, the default address on
     this machine.
@@ -146,7 +146,7 @@ def addresses(text: str) -> tuple[str, str]:
 
 
 def waiting(address: str, folder: Path | None) -> str:
-    """Return the message shown while a client waits for the stream, with a hint if it has no keys.
+    """Return the message for a client that waits for the stream, with a hint if keys are missing.
 
     To a client without keys, a daemon that requires keys appears unreachable.
     """
@@ -187,12 +187,12 @@ def number(
 
 
 def seconds(text: str) -> float:
-    """Parse a time above 0 s; raise ArgumentTypeError if it is invalid."""
+    """Parse a time above 0 s; raise ArgumentTypeError if the text is invalid."""
     return number(text, "a time above 0 s", 0.0)
 
 
 def megabytes(text: str) -> float:
-    """Parse a size above 0 MB; raise ArgumentTypeError if it is invalid."""
+    """Parse a size above 0 MB; raise ArgumentTypeError if the text is invalid."""
     return number(text, "a size above 0 MB", 0.0)
 
 
@@ -219,7 +219,7 @@ def add_range(parser: argparse.ArgumentParser) -> None:
 def add_daemon(
     parser: argparse.ArgumentParser, kind: Callable[[str], Any], client: bool = False
 ) -> None:
-    """Add ``--address`` and ``--keys``, and ``--client`` to a program that sends commands."""
+    """Add ``--address`` and ``--keys``; add ``--client`` if the program sends commands."""
     where = "daemon address: tcp://HOST, STREAM,COMMANDS, or a single socket"
     parser.add_argument("--address", type=kind, default="", help=where)
     parser.add_argument(
@@ -238,7 +238,7 @@ def add_stream(
     kind: Callable[[str], Any] = stream_address,
     client: bool = False,
 ) -> None:
-    """Add the `add_daemon` arguments, ``--no-wait`` and ``--duration`` to a subscriber."""
+    """Add a subscriber's arguments: those of `add_daemon`, ``--no-wait`` and ``--duration``."""
     add_daemon(parser, kind, client)
     parser.add_argument(
         "--no-wait",
@@ -255,7 +255,10 @@ def add_duration(parser: argparse.ArgumentParser) -> None:
 
 
 def add_split(parser: argparse.ArgumentParser) -> None:
-    """Add ``--split-size`` and ``--split-time``; a recorder's memory use grows with its file."""
+    """Add ``--split-size`` and ``--split-time``.
+
+    A recorder's memory use grows with the file size, so splitting limits the memory use.
+    """
     parser.add_argument(
         "--split-size",
         type=megabytes,

@@ -2,8 +2,8 @@
 
 Each subcommand is a module in a ``tools/`` package and is imported only when called. The module
 defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user
-can correct, the module raises SettingsError (exit status 2), another SoftfingerError, or OSError
-for a file (exit status 1).
+can correct, the module raises SettingsError (exit status 2), or another SoftfingerError or an
+OSError (exit status 1).
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ _EXTRAS = {  # maps each extra to the reason in the error message and to its mod
 
 
 class MissingExtra(SoftfingerError, ImportError):
-    """A package from an optional extra is missing; the message contains the install command."""
+    """Error raised if an extra's package is missing; the message gives the install command."""
 
 
 def require(extra: str) -> None:

@@ -1,4 +1,4 @@
-"""Run a daemon on virtual time and record the simulated hand's true state.
+"""Run a daemon in virtual time and record the simulated hand's true state.
 
 ``envelope``, ``bench`` and the tests use this module.
 """
@@ -33,20 +33,20 @@ class TrueStates:
         return TrueStates(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
 
     def settled(self, off: NDArray[np.bool_]) -> float:
-        """Return the time [s] of the last tick at which ``off`` is True."""
+        """Return the time [s] from the first tick to the last tick at which ``off`` is True."""
         where = np.flatnonzero(off)
         return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
 
 
 class SimulatedDaemon:
-    """Daemon on virtual time whose simulated hand can be observed. Raises SettingsError."""
+    """Daemon in virtual time whose simulated hand can be observed. Raises SettingsError."""
 
     def __init__(
         self,
         sections: dict[str, dict[str, Any]],
         hand: dict[str, dict[str, Any]] | None = None,
     ) -> None:
-        """Build the daemon; ``hand`` contains the hand's settings if these are different."""
+        """Build the daemon; ``hand`` contains the hand's settings, by default the daemon's."""
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self.events: list[Event] = []
         real = None if hand is None else checked(hand | {"loop": {"clock": "virtual"}})

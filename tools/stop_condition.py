@@ -51,14 +51,14 @@ class StopCondition:
         return self.is_requested or time.monotonic() >= self._deadline
 
     def wait(self, seconds: float) -> bool:
-        """Wait up to ``seconds`` for an end request; return True if the subcommand should end."""
+        """Wait up to ``seconds`` for a stop request; return True if the subcommand should end."""
         self.wait_readable(seconds)
         return self.is_met
 
     def wait_readable(self, seconds: float, *others: int) -> list[int]:
         """Wait up to ``seconds`` and return the readable descriptors among ``others``.
 
-        The wait is also interrupted by a request to end or by any other signal.
+        A stop request or any other signal also interrupts the wait.
         """
         left = min(seconds, self._deadline - time.monotonic())
         watched = [self._wakes.fileno(), *self._lifeline, *others]
@@ -69,7 +69,7 @@ class StopCondition:
         return [each for each in readable if each in others]
 
     def end(self, *_: object) -> None:
-        """Request the end; may be called from a signal handler."""
+        """Ask the subcommand to end; this method may be called from a signal handler."""
         self._is_requested = True
         self.wake()
 

@@ -54,7 +54,7 @@ _SETTINGS: dict[Any, Any] = {
 
 
 def settings() -> AbstractContextManager[None]:
-    """Return a context manager that applies this style; raise MissingExtra without matplotlib."""
+    """Return a context manager for this style; raise MissingExtra if matplotlib is missing."""
     require("plot")
     import matplotlib
 

@@ -177,9 +177,9 @@ def compare_tips(
 ) -> list[TipFit]:
     """Fit spring and solid models of the tip and return the fits, best first.
 
-    Springs are fitted with a constant modulus. If ``material`` is nonlinear, springs are also
-    fitted with its law. Solid rubber is fitted with its best ν: with a frictionless face on either
-    base, and with a sticking face on the better base.
+    Springs are fitted with a constant modulus and, if ``material`` is nonlinear, also with its law.
+    Solid rubber is fitted with ν as a free parameter: first with a frictionless face for both base
+    types, and then with a sticking face for the better base type.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
     if not material.is_linear:

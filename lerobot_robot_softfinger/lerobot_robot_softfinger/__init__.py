@@ -1,4 +1,4 @@
-"""LeRobot plugin: the softfinger hand as ``--robot.type`` and ``--env.type`` ``softfinger``."""
+"""LeRobot plugin that adds ``softfinger`` as a ``--robot.type`` and an ``--env.type``."""
 
 from lerobot_robot_softfinger.config_environment import SoftfingerEnvConfig
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig

@@ -1,4 +1,4 @@
-"""Define the environment's settings (``--env.NAME``), and register it with Gymnasium.
+"""Define the settings (``--env.NAME``) of the environment; register the environment with Gymnasium.
 
 ``--env.type=softfinger`` selects the simulated hand, which is loaded when the environment is
 created.

@@ -1,4 +1,4 @@
-"""The simulated hand with the robot's observations and actions, for LeRobot's policies."""
+"""Provide the simulated hand to LeRobot policies, with the robot's observations and actions."""
 
 from __future__ import annotations
 

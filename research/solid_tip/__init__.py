@@ -1,4 +1,4 @@
-"""Offline computation of a solid rubber fingertip: finite elements, contact, and the data file.
+"""Offline computation for a solid rubber fingertip: finite elements, contact, and the data file.
 
 ``python -m research.solid_tip LINEAR`` computes the small-strain model. ``python -m
 research.solid_tip.strain LINEAR OUT`` adds the effect of finite strain and writes the data file,
@@ -8,9 +8,9 @@ Lengths are in units of the tip radius a, and stresses in units of E.
 1. Small strain: the program computes the response to loads on surface rings, one Fourier harmonic
    at a time. Contact with the tilted plane is a linear complementarity problem, which is solved at
    19 depths × 9 tilts × 4 values of ν.
-2. Finite strain: upright presses use a fine mesh at three values of ν, and tilted presses use
-   8 × 8 × 6 elements of half a body at ν = 0.475. Only the ratio of neo-Hookean to linear presses
-   on the same mesh is used, so the mesh error (0.5 to 2 % of N) cancels.
+2. Finite strain: upright presses use a fine mesh at three values of ν, and tilted presses use a
+   half-body mesh of 8 × 8 × 6 elements at ν = 0.475. Only the ratio of neo-Hookean to linear
+   presses on the same mesh is used, so the mesh error (0.5 to 2 % of N) cancels.
 3. Fit: one polynomial is fitted to energies and normal forces together, and a few modes per
    harmonic represent the base pressure.
 """

@@ -1,6 +1,7 @@
 """Compute the linear model of a solid tip: ``python -m research.solid_tip``.
 
-The result is the input file for `strain`. The notes in the output of `strain` describe the format.
+The result is the input file for `strain`. The notes in the file written by `strain` describe the
+format.
 """
 
 from __future__ import annotations

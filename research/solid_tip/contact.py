@@ -1,9 +1,9 @@
 """Contact of a rigid plane with the hemisphere, as a linear complementarity problem.
 
-Without friction, the unknown of each surface cell is its normal force q ≥ 0 along the plane's
-normal n = (sin θ, 0, cos θ), applied to both mirror images y and −y. The cells move by C q, where
-C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Contact therefore requires
-q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
+Without friction, each surface cell has one unknown: the force q ≥ 0 along the plane's normal
+n = (sin θ, 0, cos θ). The same force acts on the cell's mirror image at −y. The cells move by C q,
+where C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Contact therefore
+requires q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
 
 On a sticking face, two additional forces along the plane hold each cell at the position where the
 cell first touched the plane. The result then depends on the path. The plane moves straight along n,

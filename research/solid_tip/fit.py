@@ -1,10 +1,10 @@
-"""Fit the data in the file to presses: a polynomial for the energy, modes for the base pressure.
+"""Fit the file's data to presses: a polynomial for the energy, modes for the base pressure.
 
 The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so
-N = ∂U/∂d holds exactly. The base pressure divided by N is decomposed by singular values, one
-harmonic at a time. The mode amplitudes are polynomials as well. All polynomials are Chebyshev
-series in s = √(d/a), sin²θ and ν; the notes in the file describe their layout. `SolidTip` reads the
-file using only NumPy.
+N = ∂U/∂d holds exactly. For each harmonic, a singular value decomposition of the base pressure
+divided by N gives the modes. The mode amplitudes are also polynomials. All polynomials are
+Chebyshev series in s = √(d/a), sin²θ and ν. The notes in the file describe the layout of the
+coefficients. `SolidTip` reads the file using only NumPy.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def chebyshev_nodes(low: float, high: float, count: int) -> FloatArray:
 
 
 class Samples(NamedTuple):
-    """Arrays over all presses of one base at one ν."""
+    """Arrays with one row per press, for one base type and one ν."""
 
     d: FloatArray
     theta: FloatArray
@@ -106,7 +106,7 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
 
 
 def push_of(energy: FloatArray) -> FloatArray:
-    """Convert coefficients of V to those of Q = 6/5 V + s/5 ∂V/∂s in N = N_Hertz (1 + s Q)."""
+    """Convert coefficients of V to coefficients of Q = 6/5 V + s/5 ∂V/∂s; N = N_Hertz (1 + s Q)."""
     slope = chebyshev.chebder(energy, axis=0) * (2 / S_MAX)
     s = np.array([S_MAX / 2, S_MAX / 2])  # Chebyshev series of the variable s
     product = np.apply_along_axis(lambda row: chebyshev.chebmul(s, row), 0, slope)
@@ -124,7 +124,7 @@ def over_nu(values: FloatArray) -> FloatArray:
 def fit(
     all_samples: list[Samples], nodes: FloatArray, step: float, tolerance: float
 ) -> dict[str, FloatArray]:
-    """Fit the arrays of one base; ``nodes`` are the ν values of the samples, Chebyshev points."""
+    """Fit the arrays of one base type; ``nodes`` are the samples' ν values (Chebyshev points)."""
     energy = np.array(
         [fit_energy(one, nu, step) for one, nu in zip(all_samples, nodes, strict=True)]
     )
@@ -211,7 +211,7 @@ class SolidTip:
         return stick * float(np.sin(theta) * np.cos(theta))
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
-        """Average the pressure over cells of a square grid centred under the tip; rows along y."""
+        """Average the pressure over cells of a square grid centred under the tip (rows along y)."""
         parts, turns = 10, 2000  # numbers of radial and angular pieces per ring
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,
@@ -233,5 +233,5 @@ class SolidTip:
 
 
 def rms_difference(one: ArrayLike, other: ArrayLike) -> float:
-    """Return the rms of the difference divided by the rms of ``other``."""
+    """Return the RMS difference divided by the RMS of ``other``."""
     return float(np.linalg.norm(np.subtract(one, other)) / np.linalg.norm(other))

@@ -8,7 +8,7 @@ The functions are computed with finite elements of the linear elastic hemisphere
 harmonic at a time. A displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ), where U, V and W
 are defined on the meridian plane (r, z), a quarter disc. The elements are quadrilaterals with nine
 nodes. The volumetric strain is projected onto linear functions in each element (the Q2/P1 pair with
-the discontinuous pressure eliminated), which avoids locking as ν approaches ½.
+the discontinuous pressure eliminated). This projection avoids locking as ν approaches ½.
 """
 
 from __future__ import annotations
@@ -99,8 +99,9 @@ class Meridian:
     def stiffness(self, m: int, poisson: float) -> sparse.csc_matrix:
         """Return the stiffness matrix of harmonic ``m`` for E = 1.
 
-        The degrees of freedom are 3 node + (0 U, 1 V, 2 W). The energy is integrated only over r
-        and z; the factor π (2π for m = 0) is omitted here and in the loads.
+        The degrees of freedom U, V and W of node k have the indices 3k, 3k + 1 and 3k + 2. The
+        energy is integrated only over r and z; the factor π (2π for m = 0) is omitted here and in
+        the loads.
         """
         shear, lame = 0.5 / (1 + poisson), poisson / ((1 + poisson) * (1 - 2 * poisson))
         shape, gradient, r, weight = self._geometry
@@ -188,7 +189,10 @@ def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
 
 
 def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
-    """Return the springs of harmonic 1: U + V = 0 on the axis; no mean motion of a lying base."""
+    """Return the stiff springs that constrain harmonic 1.
+
+    They enforce U + V = 0 on the axis and prevent a lying base from moving as a whole.
+    """
     if m != 1:
         return 0.0
     size = 3 * len(mesh.nodes)
@@ -245,7 +249,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
 
 
 def shear_response(rings: int, poisson: float, bonded: bool) -> tuple[FloatArray, FloatArray]:
-    """Return base node radii and harmonic 1 of their pressure for a unit shear force on the cap."""
+    """Return base node radii, and harmonic 1 of the base pressure under a unit shear on the cap."""
     mesh = Meridian(rings)
     _, _, nodal, angle = arc_loads(mesh)
     load = np.zeros(3 * len(mesh.nodes))

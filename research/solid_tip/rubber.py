@@ -2,10 +2,10 @@
 
 The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and κ = E/(3 −
 6ν), where E and ν are the small-strain values. Elements have 27 nodes. In the volumetric part, J −
-1 is projected onto linear functions in each element (mean dilatation to first order), which avoids
-locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a tilted plane, the
-mesh covers half a turn, with the symmetry plane y = 0. For an upright plane, the mesh is one thin
-wedge, and all nodes at the same r and z have the same motion.
+1 is projected onto linear functions in each element (mean dilatation to first order). This
+projection avoids locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a
+tilted plane, the mesh covers half a turn, with the symmetry plane y = 0. For an upright plane, the
+mesh is one thin wedge, and all nodes at the same r and z have the same motion.
 
 Contact occurs between the plane and nodes. An active node lies in the plane and transmits a normal
 force. An active node moves freely along the plane unless the face is sticking. Each Newton step
@@ -218,7 +218,7 @@ class Body:
         return turns
 
     def _sparsity(self) -> None:
-        """Set the sparsity of the tangent's upper triangle and the positions of element entries."""
+        """Set the sparsity pattern of the tangent's upper triangle, and its entries' positions."""
         size = self.places.shape[1]
         row, column = np.repeat(self.places, size, 1).ravel(), np.tile(self.places, size).ravel()
         self.upper = np.flatnonzero(row <= column)
@@ -243,7 +243,7 @@ class Body:
         return np.asarray(moved.reshape(-1, 27, 3, 3))
 
     def pressures(self, motion: FloatArray, change: FloatArray) -> FloatArray:
-        """Return p as linear functions, to first order after a ``change`` of motion."""
+        """Return p as linear functions, with a first-order update for ``change`` in the motion."""
         moved = self._strain(slice(None), motion)
         more = self._strain(slice(None), change)
         f = moved + np.eye(3)
@@ -498,7 +498,7 @@ class Body:
 def strained(
     block: str, poisson: float, theta: float | None, mesh: Meridian, file: Path
 ) -> dict[str, FloatArray]:
-    """Return linear and nonlinear presses as arrays (2, n, …), linear first. Caches to ``file``."""
+    """Return linear and nonlinear presses as arrays (2, n, …), linear first; cached in ``file``."""
     if not file.exists():
         base, sticking = block.removesuffix("-sticking"), block.endswith("-sticking")
         found = []

@@ -1,12 +1,12 @@
-"""Finite strain: ``python -m research.solid_tip.strain LINEAR OUT --folder FOLDER``.
+"""Add the effect of finite strain to the linear model of a solid tip.
 
-The program reads the linear model from the file written by ``python -m research.solid_tip`` and
-writes the neo-Hookean model in the same format. To obtain the effect of finite strain, the linear
-and neo-Hookean elements of `rubber` are compared on the same mesh, so the mesh error cancels. The
-ratio of the two energies scales the energy of the linear model. The difference between the two base
-pressures, relative to the normal force, is added to the base pressure of the linear model. Upright
-presses use a fine mesh. Tilted presses use a coarse mesh and are compared with upright presses on
-that mesh.
+``python -m research.solid_tip.strain LINEAR OUT --folder FOLDER`` reads the linear model from the
+file written by ``python -m research.solid_tip`` and writes the neo-Hookean model in the same
+format. To obtain the effect of finite strain, the linear and neo-Hookean elements of `rubber` are
+compared on the same mesh, so the mesh error cancels. The ratio of the two energies scales the
+energy of the linear model. The difference between the two base pressures, relative to the normal
+force, is added to the base pressure of the linear model. Upright presses use a fine mesh. Tilted
+presses use a coarse mesh and are compared with upright presses on that mesh.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def coefficients(each: Change, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit coefficients of the energy ratio (i,), T (i,) and base pressure (i, H, R).
+    """Fit the coefficients of energy ratio (i,), T (i,) and base pressure (i, H, R).
 
     ``step`` is the cell width.
     """
@@ -133,7 +133,7 @@ def through(points: FloatArray, values: FloatArray) -> Callable[[float], FloatAr
 
 
 class Strain:
-    """Effect of strain in one block, for any d, θ and ν."""
+    """Effect of finite strain in one block, for any d, θ and ν."""
 
     def __init__(self, block: str, tilts: Mapping[int, FloatArray], folder: Path) -> None:
         """Set up a block; ``tilts`` maps indices of `SINES` to the ν values of coarse presses."""
@@ -167,7 +167,7 @@ class Strain:
     def at(self, poisson: float) -> Callable[[float], tuple[FloatArray, FloatArray, FloatArray]]:
         """Return a function of sin²θ that gives the coefficients at one ν.
 
-        The coefficients are those of the energy ratio, T/(N sin θ cos θ) and the base pressure.
+        The coefficients describe the energy ratio, T/(N sin θ cos θ) and the base pressure.
         """
         energy, _, base = (each(poisson) for each in self.upright)
         rises, shears, bases, firsts = (
@@ -214,7 +214,7 @@ class Strain:
 
 
 def main() -> None:
-    """Compute the presses that are missing in the folder, and write the file."""
+    """Compute the presses that are missing from the folder, and write the data file."""
     parser = argparse.ArgumentParser(
         prog="python -m research.solid_tip.strain", description=__doc__
     )

@@ -1,4 +1,4 @@
-"""Run fuzz tests with random or mutated input, for hours with `python -m tests.fuzz`."""
+"""Fuzz the package with random or mutated input; `python -m tests.fuzz` can run for hours."""
 
 import random
 from typing import NamedTuple

@@ -1,7 +1,7 @@
-"""Fuzz targets (default: all): ``python -m tests.fuzz TARGET … --count N --seed S``.
+"""Fuzz the given targets (default: all): ``python -m tests.fuzz TARGET … --count N --seed S``.
 
-Each target receives N inputs. The run stops at the first input that raises an unexpected exception,
-and prints all other errors.
+Each target receives N inputs. The run stops at the first input that raises an unexpected exception.
+Errors of any other kind are printed, and the run continues.
 """
 
 import argparse

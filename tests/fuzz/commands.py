@@ -74,7 +74,7 @@ def some_message(rng: random.Random) -> bytes:
 
 
 class CommandTarget:
-    """Hand on the virtual clock with a real command server, called directly and through its socket.
+    """Hand on the virtual clock; its command server is called directly and through a socket.
 
     After every message the hand must keep working: it ticks, its goals are within the limits, and
     torque is off in modes without torque.
@@ -152,7 +152,7 @@ class CommandTarget:
 
 
 class FileTarget:
-    """File reader that returns the content or raises its documented exception."""
+    """File reader under test, which must return the content or raise its documented exception."""
 
     def __init__(
         self, read: Callable[[Path], Any], error: type[Exception], seeds: list[bytes], end: str

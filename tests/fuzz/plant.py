@@ -31,7 +31,7 @@ WRONG = (
 
 @kernel
 def past_limit(radius, d, theta, curvature):
-    """Return the minimum rim indentation implied by the tip's d and θ alone [m]."""
+    """Return the minimum rim indentation [m] implied by the tip's d and θ."""
     if curvature == 0.0:
         return d - radius * (1.0 - abs(math.sin(theta)))
     away = radius - d + 1.0 / curvature
@@ -98,8 +98,8 @@ def carry_out(plants, data, ring, commands):
 def random_hand(generator: np.random.Generator, long: bool = False):
     """Return a hand with a random scene and random parameters.
 
-    Masses are from 1 g to 10 kg, moduli from 10 kPa to 10 MPa, friction from 0 to 2, and joint
-    inertias from 1e-4 to 0.1 kg·m², with gravity in any direction.
+    Masses range from 1 g to 10 kg, moduli from 10 kPa to 10 MPa, friction coefficients from 0 to 2,
+    and joint inertias from 1e-4 to 0.1 kg·m². Gravity may have any direction.
     """
     table = (PAPER, TABLE_I)[generator.integers(2)]
     modulus = float(10 ** generator.uniform(4, 7))

@@ -58,7 +58,7 @@ def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
 
 
 def until_it_says(words: Sequence[str | Path], text: str) -> None:
-    """Run a tool until it prints a line with ``text``; terminate it and check its exit status."""
+    """Run a tool until it prints a line with ``text``; then terminate it and check its status."""
     process = started(*words, stderr=None)
     assert any(text in line for line in process.stdout), f"{text!r} was not printed"
     process.terminate()

@@ -1,8 +1,7 @@
 """Find and kill processes that tests started, directly or indirectly.
 
 When run as a program with a word as its argument, this module waits until its standard input
-closes. When standard input has closed, the module kills every process whose environment contains
-the word.
+closes. The module then kills every process whose environment contains the word.
 """
 
 import contextlib

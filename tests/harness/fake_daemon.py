@@ -1,6 +1,6 @@
-"""Publish states and serve commands on real sockets, for a hand computed from formulas.
+"""Publish states and serve commands on real sockets; formulas replace the hand and its daemon.
 
-Client tests use these sockets and control all messages.
+Client tests connect to these sockets and control all messages.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Served:
             self.service.step(0.0)
 
     def has_request(self) -> bool:
-        """Return True if libzmq has received a request; let the gateway only accept new clients."""
+        """Accept new clients, and return True if libzmq has received a request."""
         self.service._sockets.authenticate(0.0)
         return bool(self.service.commands.socket.poll(0))
 

@@ -1,11 +1,11 @@
-"""Reference model of a grasp: two rotational fingers, two soft tips, an object at equilibrium.
+"""Reference model of a grasp: two rotational fingers, two soft tips, and an object at equilibrium.
 
 The energy is the sum of both tips' energies and the potential energy of gravity. With the shear
 d_t, a tip's energy is
 
     U(d, θ, d_t) = U₀(d, θ) + F(d, θ) (sin θ d_t + cos θ d_t²/d)
 
-with U₀ and F from the contact table. For a constant modulus, U is the energy of the
+where U₀ and F are taken from the contact table. For a constant modulus, U is the energy of the
 parallel-distributed model, πE[d³/(3cos²θ) + d² d_t tan θ + d d_t²]. The shear force is T = ∂U/∂d_t
 and the normal force is N = ∂U/∂d − T tan θ. The shear displacements are computed from the rolling
 increments of `reference_hand`. The increments are not integrable in general, so a grasp depends on
@@ -31,7 +31,7 @@ _STEP = 1e-6  # Step for finite differences of forces, in rad or in tip radii.
 
 
 class GraspError(SoftfingerError, ValueError):
-    """A contact opens or leaves its range, or no equilibrium is found."""
+    """Error raised if a contact opens or leaves its range, or if no equilibrium is found."""
 
 
 def sheared_contact(
@@ -95,8 +95,8 @@ class Grasp:
     def symmetric(self, d: float) -> GraspState:
         """Return a state with both tips indented by ``d`` [m], an upright object and no shear.
 
-        Raise ValueError if the fingers cannot reach this state, and GraspError if it is outside the
-        tip's range.
+        Raise ValueError if the fingers cannot reach this state, and GraspError if the state is
+        outside the tip's range.
         """
         q = self.hand.inverse((0.0, 0.0, 0.0), (d, d), self.width)
         # T = 0 gives d_t = −(d/2) tan θ.

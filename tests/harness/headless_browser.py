@@ -89,7 +89,7 @@ class Browser:
         self.ask("Emulation.setEmulatedMedia", features=[feature])
 
     def ask(self, method: str, **parameters: Any) -> Any:
-        """Send one command and wait for its reply; raise RuntimeError if it is an error."""
+        """Send one command and wait for its reply; raise RuntimeError if the reply is an error."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         self._socket.send(json.dumps(message))

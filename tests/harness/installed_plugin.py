@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[2]
 def plugin_path(folder: Path) -> str:
     """Write an installed package's metadata to ``folder``; return a PYTHONPATH that includes it.
 
-    The entry points are those in pyproject.toml.
+    The entry points are taken from pyproject.toml.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     entries = project["entry-points"]["pytest11"]

@@ -1,4 +1,8 @@
-"""The paper's tip and sensor, used by most tests: 20 mm, 0.304 MPa, 44 × 44 cells on 58 mm."""
+"""Provide the paper's tip and sensor, which most tests use.
+
+The tip has a radius of 20 mm and a modulus of 0.304 MPa. The sensor has 44 × 44 cells on a 58 mm
+square.
+"""
 
 import math
 from typing import Any

@@ -9,10 +9,10 @@
 - the results of contact tables, closed forms, quadrature, material laws and pressure grids;
 - the parameters of each simulated plant, which affect transitions between stick and slip.
 
-The change depends only on the number, its position in its array, and SEED. Repeating a computation
-therefore gives the same bits, but arrays and single numbers give different results, and values
-that are equal by symmetry become different. Integers are not changed, because every library
-computes sin 0 and cos 0 exactly.
+The change depends only on the number, the position in the array, and SEED. Repeating a computation
+therefore gives the same bits, but arrays and single numbers give different results, and values that
+are equal by symmetry become different. Integers are not changed, because every library computes sin
+0 and cos 0 exactly.
 
 The option does not affect operators (``+``, ``@``), array methods, intermediate results of kernels,
 modules imported within a function, or other processes. `tests.harness.arithmetic` covers these

@@ -56,8 +56,8 @@ def settled(hand: SimulatedHand, goals, current: float, seconds: float = 2.0) ->
 def push_along(hand: SimulatedDaemon, force: float, rate: float, start: float = 0.0) -> float:
     """Push the object along its faces from ``start`` to ``force`` [N] at ``rate`` [N/s].
 
-    A positive force points away from the palm and remains applied. Returns the maximum friction
-    utilisation of the tips.
+    A positive force points away from the palm and remains applied. Returns the tips' maximum
+    friction utilisation.
     """
     dt, used = 0.02, 0.0
     count = max(round(abs(force - start) / (rate * dt)), 1)

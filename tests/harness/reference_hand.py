@@ -22,7 +22,7 @@ class ReferenceHand(HandGeometry):
     """Hand model with derivatives and inverse kinematics."""
 
     def variables(self, x: Any, width: float) -> Any:
-        """Return (d, θ, s) of each tip (2, 3, …) at coordinates (5, …), which may be complex."""
+        """Return (d, θ, s) of each tip (2, 3, …) at real or complex coordinates (5, …)."""
         found = []
         for side, q in ((1.0, x[0]), (-1.0, x[1])):
             inwards = self.finger_length * np.sin(q) + self.finger_offset * np.cos(q)
@@ -51,11 +51,11 @@ class ReferenceHand(HandGeometry):
         return np.asarray((self.tip_radius - d) * by_theta + along * by_s - np.tan(theta) * by_d)
 
     def inverse(self, pose: ArrayLike, d: ArrayLike, width: float) -> FloatArray:
-        """Return joint angles (2,) at which an object at ``pose`` indents tips by ``d`` (2,) [m].
+        """Return joint angles (2,) at which an object at ``pose`` indents the tips by ``d`` [m].
 
-        The solution is closed-form: O1·n = −B cos φ + L sin θ1 + e cos θ1, and the mirror image for
-        the other finger. A negative ``d`` is a gap. Raises ValueError if a finger cannot reach this
-        position.
+        The solution for the left finger follows from O1·n = −B cos φ + L sin θ1 + e cos θ1. The
+        mirror image of this equation holds for the right finger. A negative ``d`` is a gap. Raises
+        ValueError if a finger cannot reach this position.
         """
         x, y, angle = vector(pose, 3, "pose")
         d1, d2 = vector(d, 2, "d")

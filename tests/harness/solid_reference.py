@@ -1,8 +1,8 @@
 """Compute frames of a solid tip with finite elements, for tests/golden/solid_frames.npz.
 
 ``python -m tests.harness.solid_reference OUT`` uses neo-Hookean elements. The meshes differ from
-those used to fit the data file, and the program does not use the fit's polynomials, modes or linear
-material law. It requires pypardiso.
+the meshes that were used to fit the data file, and the program does not use the fit's polynomials,
+modes or linear material law. The program requires pypardiso.
 """
 
 import argparse
@@ -32,7 +32,7 @@ class _Rings(SolidTip):
     edges = RING_EDGES
 
     def __init__(self) -> None:
-        """Create only the rings, which suffice to compute frames."""
+        """Create only the rings, which are sufficient for computing frames."""
 
 
 def row(block: str, theta: float, press: Strained) -> dict[str, object]:

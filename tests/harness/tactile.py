@@ -63,7 +63,10 @@ class Rig:
     def __init__(
         self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None
     ) -> None:
-        """``source`` makes the frames of a serial board; by default each frame is a new image."""
+        """Set up the backend.
+
+        ``source`` generates the frames of a serial board. By default, each frame is a new image.
+        """
         self.backend = backend
         self._stack = ExitStack()
         self._stop = threading.Event()

@@ -1,1 +1,1 @@
-"""Tests with processes, pseudo-terminals or daemons in real time."""
+"""Tests that use processes, pseudo-terminals or real-time daemons."""

@@ -32,14 +32,14 @@ def bus(running: Run) -> RunningBus:
 
 @pytest.fixture
 def connect(running: Run) -> Iterator[Connect]:
-    """Return a function that connects backends; they are closed before their buses."""
+    """Return a function that connects backends; each backend is closed before its bus."""
     with ExitStack() as stack:
         yield lambda bus, **servos: stack.enter_context(closing(connected(bus, **servos)))
 
 
 @pytest.fixture
 def fake() -> Iterator[FakeDaemon]:
-    """Return a fake daemon, which has real sockets and computes its hand from formulas."""
+    """Return a fake daemon that has real sockets and computes its states from formulas."""
     with FakeDaemon() as fake:
         yield fake
 

@@ -17,7 +17,7 @@ UNIT = by_name("XM430-W350").current_unit
 
 
 class Hand(BusClient):
-    """Configured servos; rising counts close the left finger, falling counts the right finger."""
+    """Configured servos; rising counts close the left finger and open the right finger."""
 
     def __init__(self) -> None:
         super().__init__(hand_bus(10.0))

@@ -1,4 +1,4 @@
-"""Test `softfinger calibrate joints` on an emulated hand whose joints are turned by hand."""
+"""Test `softfinger calibrate joints` on an emulated hand whose joints are moved manually."""
 
 import shlex
 import sys

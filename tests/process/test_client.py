@@ -345,7 +345,7 @@ def test_clients_and_the_gateway_import_nothing_of_the_daemon(code, absent):
 
 
 def _face(cls: type) -> dict[str, object]:
-    """Return the public methods with their parameters and defaults."""
+    """Return the class's public methods with parameters and defaults."""
     found = {name: member for name, member in vars(cls).items() if not name.startswith("_")}
     return {
         name: list(inspect.signature(member).parameters.values()) if callable(member) else None

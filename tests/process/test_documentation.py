@@ -1,8 +1,8 @@
-"""Run every code block of the README and the docs unchanged: shell, Python, profiles.
+"""Run all shell, Python and profile blocks of the README and the docs unchanged.
 
 Each page runs from top to bottom in its own folder, with one simulated hand. `harness.documented`
 provides the `softfinger` command and describes which commands are only parsed. A block with a title
-is saved in a file with that name, which later blocks can use. A mark above a block makes an
+is saved in a file with that name, which later blocks can use. A mark above a block defines an
 exception:
 
     <!-- not run: why -->                  the block cannot be run, with the reason

@@ -27,7 +27,7 @@ REFUSED = "left:shift-x=3"  # fault after which the hand releases the object
 
 @contextlib.contextmanager
 def running(hand: Sequence[str] = (), daemon: Sequence[str] = ()) -> Iterator[Rig]:
-    """Yield an emulated hand and its daemon on a shared clock, which tolerates a busy machine.
+    """Yield an emulated hand and its daemon on a shared clock that tolerates a busy machine.
 
     ``hand`` and ``daemon`` are additional settings.
     """

@@ -1,4 +1,4 @@
-"""Run the example programs unchanged, including those for the gym."""
+"""Run the example programs unchanged, including those for the Gymnasium environments."""
 
 import re
 

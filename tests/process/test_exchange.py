@@ -140,7 +140,7 @@ def test_slow_replies_are_reported_at_start_up(bus):
 
 
 def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
-    """An adapter may restart the board whenever its port is opened, so retries would never end."""
+    """Opening the port may restart the board, so the backend must not reopen the port to retry."""
     bus, opened = running(), []
     for i in (0, 1):
         bus.servo(i).silent = True

@@ -20,7 +20,7 @@ LATE = 1026 * 10 / 2e6 + 0.02  # time to transmit 32 × 32 cells, plus the laten
 
 
 class Board(FrameWriter):
-    """A board's port with a thread that sends the test's data."""
+    """A board's port, and a thread that sends the test's data."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -60,7 +60,7 @@ class Client:
         self.socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": ended}))
 
     def next(self, topic: str = "") -> tuple[str, float, dict[str, Any]]:
-        """Return topic, log time [s] and content of the next message, optionally of one topic."""
+        """Return topic, log time [s] and content of the next message (of ``topic``, if given)."""
         while True:
             message = self.socket.recv(timeout=WAIT)
             assert isinstance(message, bytes)
@@ -260,7 +260,7 @@ REQUEST = (
 
 
 def masked(message: dict[str, Any]) -> bytes:
-    """Return a client's text frame with a zero mask."""
+    """Return a client's WebSocket text frame with a zero mask."""
     text = json.dumps(message).encode()
     assert len(text) < 126
     return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text

@@ -47,7 +47,7 @@ def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def ticking(addresses: Addresses, own_folder: Path) -> Iterator[Daemon]:
-    """Yield a daemon running in a thread, with its gateway in a process."""
+    """Yield a daemon that runs in a thread and whose gateway runs in a process."""
     settings = Settings.model_validate(
         {
             "stream": {"address": addresses[0]},

@@ -1,7 +1,7 @@
 """Test that kernels compiled from other sources or by other users are never run.
 
-The tests change a small package, which has the real decorators and the same structure, and run it
-in separate processes.
+The tests use a small stand-in package, which has the real decorators and the structure of
+softfinger. They modify the stand-in's files and run its kernels in separate processes.
 """
 
 import os
@@ -77,7 +77,7 @@ class Package:
             shutil.copy(file, folder / "softfinger" / "kinematics" / "compiled")
 
     def write(self, name: str, text: str) -> None:
-        """Write one of the package's files."""
+        """Write one of this package's files."""
         file = self.folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")

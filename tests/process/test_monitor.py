@@ -1,4 +1,4 @@
-"""Test the monitor as a real process on a pseudo-terminal, with real sockets."""
+"""Test the monitor in a separate process with a pseudo-terminal and real sockets."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Test that modules without a tick work without Linux-only features, as on macOS and Windows."""
+"""Test that clients and tools work without Linux-only features, as on macOS and Windows."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Test that Numba's own compiler, used for untested Numba versions, builds the same kernels."""
+"""Test that Numba's own compiler, used for untested Numba versions, gives the same results."""
 
 import os
 from pathlib import Path

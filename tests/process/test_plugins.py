@@ -1,4 +1,4 @@
-"""Test backends of an installed package: found, checked, and run by a real daemon."""
+"""Test that the backends of an installed package are found, checked, and run by a real daemon."""
 
 import os
 import threading

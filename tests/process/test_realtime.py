@@ -177,7 +177,7 @@ def test_ticks_over_ptys_alternate_with_their_exchanges():
     reports: list[Report] = []
 
     def measured() -> bool:
-        """Return True if the attempt succeeded; on a busy machine the hand may not hold in time."""
+        """Return True if the attempt succeeded; on a busy machine, the grip may take too long."""
         part = partial(tick.in_the_loop, "paced", 2, 2_000_000, patient)
         reports.append(attempt("paced", part))
         return not reports[-1].failed

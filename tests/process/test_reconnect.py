@@ -1,4 +1,4 @@
-"""Test that a servo port that disappears is reopened only on command, with torque off."""
+"""Test that a lost servo port is reopened only on command, and with torque off."""
 
 import contextlib
 from collections.abc import Callable, Iterator

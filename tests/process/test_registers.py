@@ -1,4 +1,4 @@
-"""Test registers changed by another program: reported, written by `arm`, repaired, restored."""
+"""Test registers changed by another program: reports, corrections by `arm`, repairs, backups."""
 
 import json
 from typing import Any

@@ -1,4 +1,4 @@
-"""Test replayed recordings: published unchanged, and recomputed with identical states."""
+"""Test that recordings are published unchanged and recomputed with identical states."""
 
 import json
 import re

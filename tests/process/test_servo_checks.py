@@ -1,4 +1,4 @@
-"""Test the checks on connecting and their suggested fixes; temperature, supply and errors."""
+"""Test the checks on connecting, their suggested fixes, and servo health readings."""
 
 import math
 import os
@@ -270,7 +270,7 @@ def test_an_alert_names_the_hardware_error_and_arming_is_refused(bus, servos):
 
 
 class Loaded:
-    """A stationary hand whose left joint carries 2 A."""
+    """A stationary hand whose left motor draws 2 A."""
 
     q = dq = np.zeros(2)
     current = np.array([2.0, 0.0])

@@ -1,4 +1,4 @@
-"""Test a hand with solid tips: recorded on the virtual clock, processed by the tools."""
+"""Test the tools on a virtual-time recording of a hand with solid tips."""
 
 from pathlib import Path
 

@@ -52,7 +52,7 @@ GOALS = {"goal_force": 9.0, "goal_angle": 0.1}
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record 2.6 s of the simulated hand: it grasps, turns and releases."""
+    """Record 2.6 s of the simulated hand, which grasps, turns and releases the object."""
     path = tmp_path_factory.mktemp("recorded") / "hand.mcap"
     record_hand(path, GRASP, 2.6)
     return path
@@ -306,7 +306,7 @@ def test_panels_for_missing_parts_are_omitted(tmp_path, changes, gone, there):
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[tuple[FakeDaemon, Viewed]]:
-    """Yield a fake daemon and its viewer, for tests that change neither."""
+    """Yield a fake daemon and its viewer, for tests that do not change them."""
     with FakeDaemon() as fake, view(fake) as viewed:
         yield fake, viewed
 

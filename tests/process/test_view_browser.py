@@ -139,7 +139,7 @@ class Page:
         return float(self(f"{FRACTION}('{selector}', {list(colour)})"))
 
     def lag(self) -> float:
-        """Return the page's lag behind the stream [s]."""
+        """Return the delay [s] of the page relative to the stream."""
         return float(self("Date.now() / 1000 - picture.time"))
 
 

@@ -2,12 +2,11 @@
 
 ``python -m tests.soak.heat --runs 40``.
 
-Each run draws random values: a servo model; factors for heating, cooling and heat capacity (0.75 to
-1.33); the room temperature (15 to 35 °C); a current (1.15 to 1.8 times the maximum continuous
-current); and the time at which the room becomes 5 or 8 °C warmer or colder. The daemon's filter
-receives temperatures in whole degrees and a current with 3 % noise. The plant is
-`servo_model.servo_joint`. ``--grips N`` adds complete hands in virtual time that grip too hard for
-too long.
+Each run draws a servo model, factors for heating, cooling and heat capacity (0.75 to 1.33), a room
+temperature (15 to 35 °C) and a current (1.15 to 1.8 times the maximum continuous current). At a
+random time, the room becomes 5 or 8 °C warmer or colder. The daemon's filter receives temperatures
+in whole degrees and a current with 3 % noise. The plant is `servo_model.servo_joint`. ``--grips N``
+adds complete hands in virtual time that grip too hard for too long.
 """
 
 import argparse
@@ -52,7 +51,7 @@ class Bench:
         self._watch = HeatWatch(settings, self.state)
 
     def lasting_current(self) -> float:
-        """Find the current [A] at which the plant's case settles at the limit."""
+        """Find the current [A] at which the plant's case temperature settles at the limit."""
         low, high = 0.0, 3.0
         while high - low > 3e-3:
             current = 0.5 * (low + high)
@@ -78,7 +77,7 @@ class Bench:
 
 
 def foreseen(seed: int) -> Foreseen:
-    """Hold an excessive current until the temperature reading reaches the limit."""
+    """Apply an excessive current until the temperature reading reaches the limit."""
     bench = Bench(seed)
     chance = bench.chance
     current = bench.lasting_current() * chance.uniform(1.15, 1.8)
@@ -94,7 +93,7 @@ def foreseen(seed: int) -> Foreseen:
 
 
 def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
-    """Hold half the continuous current; halfway through, the room becomes 8 °C warmer.
+    """Apply half the maximum continuous current; halfway through, the room becomes 8 °C warmer.
 
     Returns the minimum predicted time until the limit [s].
     """

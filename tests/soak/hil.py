@@ -1,11 +1,11 @@
-"""Run a real-time hardware-in-the-loop soak of one hour: ``python -m tests.soak.hil``.
+"""Run a one-hour real-time hardware-in-the-loop soak: ``python -m tests.soak.hil``.
 
-The daemon's process runs on an emulated hand, with a recorder, three subscribers and a client that
-grasps, turns, moves, releases and streams setpoints at 50 Hz. Meanwhile, faults disturb servos,
-boards and the daemon itself. Every few seconds the emulated hand's record of the servo bus is
-checked. The memory of each process must stay constant, and all lost messages must be counted. The
-ticks at the end must be as punctual as at the beginning. At least three of ten grasps must lead to
-a hold. Faults caused by a busy machine are counted, reported and cleared.
+A daemon process drives an emulated hand. A recorder, three subscribers and a client connect to the
+daemon. The client grasps, turns, moves, releases and streams setpoints at 50 Hz, while faults
+disturb servos, boards and the daemon itself. Every few seconds the emulated hand's record of the
+servo bus is checked. The memory of each process must stay constant, and all lost messages must be
+counted. The ticks at the end must be as punctual as at the beginning. At least three of ten grasps
+must lead to a hold. Faults caused by a busy machine are counted, reported and cleared.
 """
 
 from __future__ import annotations
@@ -309,7 +309,7 @@ def _conclude(account: Account) -> None:
 
 
 def subscribe(address: str) -> None:
-    """Print "ready" at the first state, and at the end the numbers of received and lost states."""
+    """Print "ready" at the first state; finally, print how many states were received and lost."""
     received = 0
     with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()

@@ -1,13 +1,13 @@
 """Run a virtual-time soak: random sequences of commands, loads and faults, one per seed.
 
 ``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most sequences grip the object;
-the grips are then loaded, turned, disturbed by faulty measurements and stopped. The daemon runs
-completely, except for its sockets. Requirements are checked against the plant and the data sent to
-the servos, never against the daemon's own reports. The soak counts how often each requirement is
-checked, and fails if a requirement is never checked. The tests run a few sequences.
+the grips are then loaded, turned, disturbed by faulty measurements and stopped. The complete daemon
+runs, except for its sockets. Requirements are checked against the plant and the data sent to the
+servos, never against the daemon's own reports. The soak counts how often each requirement is
+checked, and fails if a requirement is never checked. The test suite runs only a few sequences.
 
-``--ticks 14400000`` runs one hand for eight hours of virtual time, with its stream recorded and
-read. Violations are counted and do not end the run. The run fails if memory grows or a state is
+``--ticks 14400000`` runs one hand for eight hours of virtual time and records and reads its stream.
+Violations are counted and do not end the run. The run fails if memory grows or a state is
 inconsistent.
 """
 
@@ -446,7 +446,7 @@ class Soak:
         return 1 + int(self._random.expovariate(1.0 / mean))
 
     def _may_be_disturbed(self) -> bool:
-        """Return True in the mode ``holding``, and occasionally in other modes."""
+        """Return True in the ``holding`` mode, and occasionally in other modes."""
         return self.daemon.loop.state.mode == "holding" or self._random.random() < 1e-3
 
     # Actions
@@ -522,7 +522,7 @@ class Soak:
         return chance.uniform(low, high)
 
     def _disturb(self) -> None:
-        """Start a load, a measurement fault, or a fault of a servo or a sensor."""
+        """Start a load, a measurement fault, a servo fault or a sensor fault."""
         self._mend()
         chance, t = self._random, self.daemon.clock.now()
         self._well_at = self.count + self._after(_DISTURBED_FOR)

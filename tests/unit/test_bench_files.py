@@ -1,4 +1,4 @@
-"""Test that frame files from test benches are read correctly or rejected with the right reason."""
+"""Test that frame files from test benches are read correctly or rejected with a clear reason."""
 
 import itertools
 import re
@@ -463,7 +463,7 @@ def test_a_calibration_reports_suspicious_recordings(tared, tmp_path, inline):
 
 
 def test_generators_differ():
-    """Check that each locale generates different bytes."""
+    """Check that the files generated for any two locales differ."""
     frame = np.full((1, 44, 44), 1234.5)
     texts = [export(frame, **form) for form in LOCALES.values()]
     same = [a == b for a, b in itertools.combinations(texts, 2)]

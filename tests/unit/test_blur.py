@@ -1,4 +1,4 @@
-"""Test the elastomer blur: model against dense convolution, estimator against its bound."""
+"""Test the elastomer blur: the model against dense convolution, the estimator against its bound."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Test `softfinger calibrate` on a simulated sensor, step by step, and its file in the daemon."""
+"""Test `softfinger calibrate` step by step on a simulated sensor; use the file in the daemon."""
 
 import json
 import math

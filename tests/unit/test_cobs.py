@@ -13,7 +13,7 @@ from softfinger.daemon.tactile.serial_reader import SensorClock
 
 
 def plain_stuff(message: bytes) -> bytes:
-    """Encode with COBS byte by byte, following its definition."""
+    """Encode data byte by byte according to the definition of COBS."""
     out, block = bytearray(), bytearray()
     for k, byte in enumerate(message):
         if byte == 0:

@@ -225,7 +225,7 @@ def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered
 
 
 class Aged:
-    """Handler that stores the ages of commands and refuses those older than 0.2 s as late."""
+    """Handler that stores the ages of commands and refuses commands older than 0.2 s as late."""
 
     def __init__(self) -> None:
         self.ages: list[float] = []
@@ -441,7 +441,10 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(con
 
 
 class Flood:
-    """Clients that send requests without waiting for replies. At first, no request is served."""
+    """Clients that send requests without waiting for replies.
+
+    Initially, the requests are not served.
+    """
 
     def __init__(self, context: zmq.Context[Any], address: str, clients: int, each: int) -> None:
         self.sockets = [context.socket(zmq.DEALER) for _ in range(clients)]

@@ -1,4 +1,4 @@
-"""Test that the covariance includes errors invisible in frames and matches the actual errors."""
+"""Test that the covariance matches the actual errors, even those that are invisible in frames."""
 
 import itertools
 import math
@@ -108,7 +108,7 @@ def pressed(tip, d, x, y, grid=FLAT):
 
 
 def unloading(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
-    """Return pressures with errors of up to 10 % of each cell's reading at the depth 1.3 d."""
+    """Return pressures at ``d`` with errors of up to 10 % of each cell's pressure at 1.3 d."""
     loaded = np.maximum(pressed(tip, 1.3 * d, x, y), 1e-9)
     strain = np.clip(pressed(tip, d, x, y) / loaded, 0.0, 1.0)
     return pressed(tip, d, x, y) + sign * 0.4 * loaded * strain * (1.0 - strain)
@@ -125,7 +125,7 @@ def power(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarr
 
 
 def misplaced(by):
-    """Return a pressure function whose cells have an unknown offset or rotation."""
+    """Return a pressure function for cells with an unknown offset, pitch error or rotation."""
     return lambda tip, d, x, y, sign: pressed(tip, d, x, y, replace(FLAT, **by(sign)))
 
 

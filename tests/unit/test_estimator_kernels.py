@@ -1,4 +1,4 @@
-"""Test the estimator's kernels against plain NumPy; clipped counts, thresholds and misfits."""
+"""Test the estimator's kernels against plain NumPy, with clipped counts and misfits."""
 
 import math
 

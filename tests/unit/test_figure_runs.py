@@ -65,7 +65,7 @@ def sheets() -> tuple[Sheet, ...]:
 
 
 def test_forces_are_energy_derivatives():
-    """Finite differences of the energy along rolling motions give the equilibrium."""
+    """Finite differences of the energy along rolling motions must match the joint torques."""
     here = slow_turn.turned(np.radians([2.0, 4.0]), slow_turn.gripped())[-1]
     step = 1e-6
     for k in range(5):

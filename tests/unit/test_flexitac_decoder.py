@@ -21,10 +21,10 @@ nasty = st.lists(
 
 
 def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
-    """Return the frames decoded when the data are fed byte by byte.
+    """Decode the data byte by byte and return the frames.
 
-    If the decoder synchronises late, several frames may be completed at once. Only the newest is
-    returned.
+    If the decoder synchronises late, it may complete several frames at once but returns only the
+    newest frame.
     """
     found = []
     for piece in pieces:

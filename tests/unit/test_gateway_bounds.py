@@ -1,4 +1,4 @@
-"""Test the gateway's limits on clients, which protect the service for other clients."""
+"""Test the gateway's limits on each client, which protect the other clients."""
 
 from collections.abc import Iterator
 
@@ -122,7 +122,7 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
 
 
 def test_unread_replies_are_dropped(served, context, addresses):
-    """Unread replies neither block the gateway nor fill its memory: the reply queue is limited."""
+    """Unread replies cannot block the gateway or fill its memory, because the queue is limited."""
     client = context.socket(zmq.DEALER)
     client.setsockopt(zmq.RCVHWM, 1)
     client.setsockopt(zmq.RCVBUF, 4096)

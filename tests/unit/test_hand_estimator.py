@@ -177,7 +177,7 @@ def test_a_contact_at_start_up_is_reported_from_the_first_frame_on(estimator, re
 @pytest.mark.parametrize("depths", [(3e-3, 3e-3), (3e-3, 1e-3)])
 @pytest.mark.parametrize("gripping", [False, True])
 def test_tips_are_independent_until_a_grip_begins(estimator, depths, gripping):
-    """Plates press both tips of a hand whose joints are at standstill."""
+    """Plates press against both tips of a hand whose joints are stationary."""
     contacts, pose = [Contact(), Contact()], ObjectPose()
     for k in range(100):
         t = 5.0 + 0.01 * k

@@ -68,7 +68,10 @@ def circle(graph: Mapping[str, set[str]]) -> list[str]:
 
 
 def rooms(top: str) -> dict[str, set[str]]:
-    """Return the imports between the subpackages of ``top``; a top-level module counts as one."""
+    """Return the imports between the subpackages of ``top``.
+
+    A module directly in ``top`` counts as a subpackage.
+    """
     graph: dict[str, set[str]] = {}
     for name, others in imports().items():
         if name.startswith(f"{top}."):

@@ -26,7 +26,7 @@ def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
 
 
 def load(hand: SimulatedHand, torques: Iterable[float], each: float) -> np.ndarray:
-    """Apply each motor torque [N·m] for ``each`` [s]; return the angle after each."""
+    """Apply each motor torque [N·m] for ``each`` [s]; return the angle after each torque."""
     found = []
     for torque in torques:
         hand.drive(0, CURRENT, True, 0.0, torque / CONSTANT)
@@ -154,7 +154,10 @@ def test_a_friction_level_that_changes_at_standstill_adds_no_torque():
 
 
 def reference(torque: float, rate: float, stribeck: float, seconds: float) -> np.ndarray:
-    """Return angle, velocity and deflection by the same equations, starting at ``rate`` [rad/s]."""
+    """Solve the same equations; return angle, velocity and deflection.
+
+    The initial velocity is ``rate`` [rad/s].
+    """
 
     def equations(_t, state):
         _, v, z = state

@@ -163,7 +163,7 @@ def test_only_readings_with_torque_on_are_compared(make, ticks_with_torque, faul
     "mode", ["current-based position", pytest.param("current", marks=pytest.mark.extended)]
 )
 def test_grips_turns_stops_and_pushes_cause_no_false_alarm(make, mode):
-    """The grips are long, with joints at a stop, on an object, or pushed away from their goals."""
+    """The joints move freely, press on and turn an object, and are pushed away from their goals."""
     daemon = make(servos={"mode": mode})
     hand: Any = daemon.hand
     command(daemon, "arm")

@@ -30,7 +30,7 @@ Build = Callable[..., tuple[Daemon, LateMachine, list[tuple[str, str, str]]]]
 
 @pytest.fixture
 def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
-    """Return a function that creates daemons on a machine with chosen delays, and event lists."""
+    """Return a function that creates a daemon, a machine with chosen delays, and an event list."""
 
     def build(clock: str, **sections: Any) -> tuple[Daemon, LateMachine, list[Any]]:
         machine, events = LateMachine(), []

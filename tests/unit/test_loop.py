@@ -1,4 +1,4 @@
-"""Test the complete pipeline on the virtual clock: commands and limits."""
+"""Test commands and limits in the complete pipeline on the virtual clock."""
 
 import math
 import re

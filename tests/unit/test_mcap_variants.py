@@ -1,4 +1,4 @@
-"""Test MCAP recordings written by other programs: merged, filtered, without an index."""
+"""Test MCAP recordings that other programs have merged, filtered or written without an index."""
 
 import json
 from collections.abc import Iterator

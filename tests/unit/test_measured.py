@@ -1,4 +1,4 @@
-"""Test a tip that no model fits: interpolated measurements, the table and the estimator."""
+"""Test a tip that no model fits: interpolation of measurements, the table and the estimator."""
 
 import json
 import math
@@ -40,7 +40,10 @@ WEIRD = 1e6  # stiffness [N/m²] of a force that no model predicts: F = WEIRD d^
 
 
 def weird(d: float, theta: float) -> np.ndarray:
-    """Return a blunt peak with the given force, which moves half as far as a spring tip's."""
+    """Return the pressure of a tip that no model fits: a blunt peak.
+
+    If the tip tilts, the peak moves half as far as the peak of a spring tip.
+    """
     x, y = np.meshgrid(*(pitch * (np.arange(32) - 15.5) for pitch in TRUE.pitches))
     x, y = x - TRUE.centre[0], y - TRUE.centre[1]
     c, s = math.cos(TRUE.rotation), math.sin(TRUE.rotation)

@@ -30,7 +30,7 @@ class Rig(SimulatedDaemon):
 
 
 def width_at_the_contacts(plant: Any) -> float:
-    """Return the distance between both contacts in the plant, along the object's n."""
+    """Return the distance between the plant's two contacts along the object's normal n."""
     found = []
     n = np.array([math.cos(plant.object_pose[2]), math.sin(plant.object_pose[2])])
     for finger, side in ((0, 1.0), (1, -1.0)):

@@ -157,7 +157,7 @@ MU = 0.3
 
 
 def pressed(**simulation: float) -> SimulatedHand:
-    """Return the left tip upright on an object; neither moves by itself."""
+    """Return a hand whose left tip presses upright on an object; both are held in place."""
     hand = make(PAPER, STEP, tip_friction=MU, **simulation)
     hand.plant.parameters.joints_held = hand.plant.parameters.object_held = True
     place(hand, (0.0, -0.3), (-0.010 - DEPTH, 0.08, 0.0))

@@ -1,7 +1,7 @@
 """Test the plant and its order of convergence against SciPy's adaptive solver.
 
-The smooth equations of motion are implemented independently in plain NumPy: for a constant modulus,
-sticking tips, and no damping except that of the tips and the palm. Contacts are geometric functions
+The smooth equations of motion are implemented independently in plain NumPy. They assume a constant
+modulus, sticking tips, and damping only in the tips and the palm. Contacts are geometric functions
 of the coordinates (q1, q2, x, y, φ), differentiated by complex steps; forces come from the closed
 form of the tips' energy.
 """
@@ -22,7 +22,7 @@ PALM_STIFFNESS, PALM_LOSS = 1e5, 1e-3
 
 
 def tips(x):
-    """Return both centres; the formulas also accept complex coordinates."""
+    """Return the centres of both tips; the formulas also accept complex coordinates."""
     length, half = HAND.finger_length, HAND.half_separation
     return (
         np.array([-half + length * np.sin(x[0]), length * np.cos(x[0])]),
@@ -102,7 +102,7 @@ def on_face(finger, point, angle):
 
 
 def wedge(width, taper=0.0, height=0.060):
-    """Return a wedge's contacts; the width refers to half the height, not the centre of mass."""
+    """Return a wedge's contacts; the width is measured at half height, not at the mass centre."""
     lean = 0.5 * taper
     slope = height * math.tan(lean)  # half the difference in length between the two parallel faces
     middle = height * slope / (6.0 * width)

@@ -10,7 +10,10 @@ from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, tilts
 
 
 def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
-    """Return a cell's mean σ(ε): midpoint rule in y, Gauss in the angle t of x = R sin t."""
+    """Return a cell's mean σ(ε).
+
+    The midpoint rule is used in y, and Gauss quadrature in t, where x = R sin t.
+    """
     n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
     n_z = math.sqrt(1.0 - n_x**2 - n_y**2)
     cells = grid.on(TIP)

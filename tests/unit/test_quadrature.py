@@ -28,7 +28,7 @@ def twin(
 ) -> tuple[complex, complex]:
     """Return F and U by Gauss quadrature on the base plane, x = h s + ρ c sin t, y = b sin τ.
 
-    Complex arguments give exact derivatives by the complex step.
+    Complex arguments allow exact derivatives with the complex-step method.
     """
     a, s, c = tip.radius, np.sin(theta), np.cos(theta)
     h = a - d
@@ -104,7 +104,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
 )
 @settings(max_examples=60)
 def test_every_admissible_material_has_its_minimum_energy_upright(slopes, depth, share):
-    """The tangent moduli are random positive Bernstein polynomials, for laws of all curvatures."""
+    """The tangent moduli are random positive Bernstein polynomials, so the laws curve both ways."""
     n = len(slopes) - 1
     modulus = np.polynomial.Polynomial([0.0])
     for k, slope in enumerate(slopes):

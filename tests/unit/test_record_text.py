@@ -77,7 +77,7 @@ def test_a_state_is_a_table_in_a_notebook():
 
 
 def drawn(found: TactileFrame) -> tuple[ElementTree.Element, np.ndarray]:
-    """Return the picture and the opacity of each cell that its paths fill; row 0 is the lowest."""
+    """Return a frame's picture and the opacity of each of its cells; row 0 is at the bottom."""
     picture, _ = ElementTree.fromstring(f"<p>{found._repr_html_()}</p>")
     cells = np.zeros((found.rows, found.cols))
     for path in picture:

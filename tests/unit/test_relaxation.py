@@ -73,7 +73,7 @@ def test_pressing_and_releasing_follow_the_prony_terms():
 
 
 def test_relaxing_tips_do_not_generate_energy():
-    """A free object bouncing between relaxing tips without other damping comes to rest."""
+    """A free object that bounces between relaxing tips comes to rest without any other damping."""
     settings = Settings.model_validate(
         {
             "material": {"law": "constant"},
@@ -127,7 +127,7 @@ def test_too_short_a_hold_is_refused():
 
 
 def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
-    """Return the true force divided by 8 N, 1 s into a hold and at its end, and the warnings."""
+    """Return true force / 8 N after 1 s of a hold and at the end, and the warnings."""
     sections: dict[str, dict[str, Any]] = {name: dict(values) for name, values in tip.items()}
     sections.setdefault("simulation", {})["tip_relaxation"] = STRENGTHS
     if aware:

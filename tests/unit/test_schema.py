@@ -29,7 +29,7 @@ def test_sent_messages_match_the_schema(topic):
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
 def test_messages_equal_golden_bytes(topic):
-    """Existing analysis tools rely on unchanged messages, byte for byte."""
+    """Existing analysis tools require messages that do not change in any byte."""
     golden = golden_file(topic).read_bytes()
     assert packer(topic)(*arguments(topic)) == golden
     assert msgpack.unpackb(golden) == sample(topic)

@@ -1,6 +1,6 @@
-"""Test requirements for every servo backend in each operating mode, simulated and Dynamixel.
+"""Test the simulated and the Dynamixel servo backend in each operating mode.
 
-The same tests run for both backends. To test another backend, add it to ``RIGS``.
+Both backends must pass the same tests. To test another backend, add it to ``RIGS``.
 """
 
 import math
@@ -94,7 +94,7 @@ RIGS: dict[str, Callable[..., Rig]] = {"simulated": SimulatedRig, "dynamixel": D
 def make(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., Rig]]:
-    """Return a function that creates rigs of one backend, which are closed after the test."""
+    """Return a function that creates rigs of one backend; the rigs are closed after the test."""
 
     def start(mode: str = MODES[0], **sections: Any) -> Rig:
         servos = {"mode": mode, "watchdog": 0.5, **sections.pop("servos", {})}

@@ -1,4 +1,4 @@
-"""Test servo temperature: prediction against an ODE solver, reactions with unknown constants."""
+"""Test the servo temperature prediction, and reactions when thermal constants are unknown."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Test instructions through our packet handler and the bus against direct table access."""
+"""Test instructions through softfinger's packet handler and the bus against table access."""
 
 import dynamixel_sdk as sdk
 import numpy as np

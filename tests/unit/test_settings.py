@@ -1,4 +1,4 @@
-"""Test settings: profiles are loaded, and all their errors are in one report."""
+"""Test that profiles are loaded, and that one report lists all their errors."""
 
 import json
 import tomllib

@@ -114,7 +114,8 @@ class GripUnderLoad:
     ) -> float:
         """Run ``ticks`` under a load with joints closing at ``speed``; return the goal force [N].
 
-        ``sense`` is the ratio of the right joint's values to the left one's; -1 is a twist.
+        ``sense`` is the ratio of the right joint's values to the left joint's values; -1 is a
+        twist.
         """
         torque = self.held.load_arm * load
         self.held.torque_residual = [torque, sense * torque]

@@ -18,7 +18,7 @@ PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0
 
 
 def centroid_and_extent(frame: NDArray[np.float64], pitch: float) -> tuple[float, float, float]:
-    """Return the measured centroid of a frame along x, and its extents σ_x and σ_y."""
+    """Return a frame's measured centroid along x and measured extents σ_x and σ_y."""
     place = (np.arange(len(frame)) - (len(frame) - 1) / 2) * pitch
     total = frame.sum()
     x, y2 = (frame.sum(axis=0) @ place) / total, (frame.sum(axis=1) @ place**2) / total

@@ -1,6 +1,6 @@
 """Test that a stop cancels all earlier requests, in any order of events and clients.
 
-Clients, gateway and loop act one at a time in an order that hypothesis chooses. Requests that
+Clients, gateway and loop act one at a time, in an order that Hypothesis chooses. Requests that
 libzmq has received are kept in a list, from which the gateway reads only a few at a time. When a
 stop is executed, a request may therefore wait in its connection, in the gateway, on the link, or in
 the loop.
@@ -32,7 +32,11 @@ action = st.one_of(
 
 
 class Scene:
-    """Counts events; an ``arm`` is identified by the count at which it was first sent."""
+    """Gateway, link and loop that act step by step.
+
+    Each event increments a counter. The counter value at which an ``arm`` was first sent identifies
+    this ``arm``.
+    """
 
     def __init__(self, folder: str) -> None:
         self.clock = VirtualClock()

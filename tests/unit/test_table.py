@@ -74,7 +74,7 @@ def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndar
 def hard_points(
     radius: float, points: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return random d [m] and θ [rad], dense at edges and corners, starting at the domain's end."""
+    """Return random d [m] and θ [rad], dense near the edges and corners of the domain."""
     which = rng.integers(0, 9, points)
     small = 10.0 ** rng.uniform(-9.0, -0.3, points)
     least = 10.0 ** rng.uniform(-16.0, -0.3, points)
@@ -150,7 +150,7 @@ def test_symmetry_sign_and_monotonicity(table, depth, share):
 @pytest.mark.parametrize("modulus", [1.0, 1e9])
 @pytest.mark.parametrize("radius", [1e-4, 1.0])
 def test_scaling_with_radius_and_modulus(table, radius, modulus):
-    """The scales range from 0.1 mm to 1 m, and from 1 Pa to 1 GPa at zero strain."""
+    """Tip radii range from 0.1 mm to 1 m, and moduli at zero strain range from 1 Pa to 1 GPa."""
     scale, share = radius / TIP.radius, Fraction(modulus) / TABLE_I.coefficients[0]
     other = Material(tuple(value * share for value in TABLE_I.coefficients))
     large = ContactTable.build(Fingertip(radius), other, 1e-9)

@@ -116,7 +116,7 @@ def holes(path: Path) -> None:
 
 
 def packed(path: Path, method: int = zipfile.ZIP_DEFLATED, *, honest: bool = True) -> None:
-    """Write 20 MB of zeros as an archive, or an array that claims more data than it has."""
+    """Write an archive with 20 MB of zeros or, if not ``honest``, with a header for more data."""
     with zipfile.ZipFile(path, "w", method) as archive, archive.open("frames.npy", "w") as file:
         begin(file, 5_000 if honest else 10**9)
         for _ in range(20 if honest else 1):

@@ -1,4 +1,4 @@
-"""Test bringing a held object upright without measuring its angle: closed form, control law."""
+"""Test that a held object is brought upright without a measurement of its angle."""
 
 import math
 from pathlib import Path

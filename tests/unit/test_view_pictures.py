@@ -89,7 +89,7 @@ def test_the_grid_is_read_from_the_frame() -> None:
 
 
 def contrast(*colours: str) -> float:
-    """Return the contrast of two colours by WCAG 2."""
+    """Return the contrast ratio of two colours as defined in WCAG 2."""
 
     def luminance(colour: str) -> float:
         parts = (int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5))

@@ -1,9 +1,9 @@
 """Run ``softfinger analyse FILE``: compute d, θ, force and energy versus time from frames.
 
 The frames are processed with the daemon's perception code. A stream recording (.mcap) contains its
-own settings and calibrations. A source with only frames (.npz, .npy, a folder of such files, or a
-Tekscan-style export) is analysed with the profile's left sensor. The number of cells, and the pitch
-if given, are taken from the file.
+own settings and calibrations. All other sources (.npz, .npy, a folder of such files, or a
+Tekscan-style export) contain only frames and are analysed with the settings of the profile's left
+sensor. The grid size is taken from the file, and so is the pitch if the file contains one.
 """
 
 from __future__ import annotations
@@ -163,8 +163,8 @@ class Source:
 
     ``t`` is relative to the recording's first message, or to the first frame in files that contain
     only frames. ``total`` is the final value of ``progress``. ``recording`` is set for files that
-    contain only frames. Kernels are loaded when ``models`` is called, so that an unreadable file
-    fails quickly.
+    contain only frames. Kernels are loaded when ``models`` is called, so that an unreadable file is
+    reported quickly.
     """
 
     settings: Settings
@@ -176,7 +176,7 @@ class Source:
 
     @property
     def truths(self) -> dict[str, NDArray[np.float64]]:
-        """True contact for each frame, by quantity, if a single-sensor file contains it."""
+        """True contact quantities for each frame, if a single-sensor file contains them."""
         return {} if self.recording is None else self.recording.truths
 
 
@@ -192,7 +192,7 @@ def open_source(path: Path, settings: Settings, own: bool) -> Source:
     Raises
     ------
     RecordingError
-        If the file is invalid; the message contains its name.
+        If the file is invalid; the message contains the file name.
     SettingsError, TactileError
     """
     if path.suffix == ".mcap":
@@ -277,7 +277,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Contacts:
-    """One sensor's contacts, one row per frame; COLUMNS lists the keys of ``values`` [SI]."""
+    """One sensor's contacts, with one row per frame; COLUMNS lists the keys of ``values``."""
 
     finger: str
     t: FloatArray
@@ -297,7 +297,7 @@ class Contacts:
 
 
 class _Pass:
-    """Perception code for one sensor, with the rows computed so far."""
+    """Run the perception code for one sensor and store the computed rows."""
 
     def __init__(
         self, source: Source, models: tuple[FingerModel, FingerModel], finger: int
@@ -328,7 +328,7 @@ class _Pass:
 
 
 def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
-    """Compute the contacts of each sensor. Raises the errors of ``source.frames``."""
+    """Compute the contacts of each sensor. Errors in ``source.frames`` are propagated."""
     models = source.models()
     passes = {finger: _Pass(source, models, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):

@@ -104,15 +104,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Missing(SoftfingerError):
-    """Error raised if the recording lacks data for a figure; the message names the data."""
+    """Error raised if the recording lacks data for a figure; the message names the missing data."""
 
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """A recording or part of it in SI units, with ``t`` relative to the recording's first message.
+    """Recording, or part of one, in SI units; ``t`` is relative to the recording's first message.
 
-    ``states`` contains one array per field. The field names are those in the stream; nested names
-    contain a dot.
+    ``states`` contains one array per field. The fields have the same names as in the stream; nested
+    names contain a dot.
     """
 
     name: str
@@ -123,7 +123,7 @@ class RecordedRun:
 
     @cached_property
     def t(self) -> FloatArray:
-        """Time [s] of each state according to the daemon's monotonic clock."""
+        """Time [s] of each state, based on the daemon's monotonic clock."""
         t: FloatArray = (self.states["mono_ns"] - self.zero) * 1e-9
         return t
 
@@ -138,7 +138,7 @@ class RecordedRun:
         return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
 
     def contacts(self) -> dict[str, ContactTable]:
-        """Return the contact table of each finger that touched; raise Missing if no finger did."""
+        """Return the table of each finger that had a contact; raise Missing if there was none."""
         if not self.t.size:
             raise Missing("the recording does not contain hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
@@ -155,7 +155,7 @@ def load_run(
     end: float,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedRun:
-    """Read the figure data from ``start`` to ``end`` [s]. Raises RecordingError."""
+    """Read the data between ``start`` and ``end`` [s]. Raises RecordingError."""
     messages = recording.messages([schema.STATE], start, end, progress)
     record = schema.TOPICS[schema.STATE].record
     states = to_columns([read(record, message) for _, message in messages])
@@ -179,7 +179,7 @@ def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
 def draw_time(run: RecordedRun) -> Figure:
     """Plot each tip's force, displacement and tilt, and the object's angle, versus time.
 
-    The bands are one standard deviation. Grey lines are the goals.
+    The bands show one standard deviation, and the grey lines show the goals.
     """
     if not run.t.size:
         raise Missing("the recording does not contain hand/state")
@@ -207,7 +207,7 @@ def draw_time(run: RecordedRun) -> Figure:
 
 
 def draw_angle(run: RecordedRun) -> Figure:
-    """Plot F and U versus θ with curves of constant d, and ratios of measured to model values."""
+    """Plot F and U versus θ with model curves of constant d, and plot measured/model ratios."""
     tables = run.contacts()
     rows = len(tables)
     figure = style.new_figure(7.2, 1.9 + 3.0 * rows)
@@ -269,7 +269,7 @@ def _against_angle(
 
 
 def _depths(d: FloatArray) -> FloatArray:
-    """Return one or more round displacements [m] that span the measured range."""
+    """Return one or more displacements [m], rounded for labels, that span the measured range."""
     from matplotlib.ticker import MaxNLocator
 
     largest = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3
@@ -277,7 +277,7 @@ def _depths(d: FloatArray) -> FloatArray:
 
 
 def draw_landscape(run: RecordedRun) -> Figure:
-    """Draw paths on U(d, θ) and its minimum over θ; plot their height above U(d, 0) versus time."""
+    """Draw each tip's path on a map of U(d, θ), and plot U(d, θ) − U(d, 0) versus time."""
     tables = run.contacts()
     figure = style.new_figure(7.0, 2.2 + 4.0 * len(tables))
     panels = figure.subplots(len(tables) + 1, 1, height_ratios=[*[1.0] * len(tables), 0.4])
@@ -307,7 +307,10 @@ def draw_landscape(run: RecordedRun) -> Figure:
 
 
 def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) -> None:
-    """Draw U(d, θ) [mJ] up to ``deepest`` [m] and ±``widest`` [rad], and its minimum over θ."""
+    """Draw U(d, θ) [mJ] for d ≤ ``deepest`` [m] and |θ| ≤ ``widest`` [rad].
+
+    The minimum of U over θ is also drawn.
+    """
     from matplotlib.colors import PowerNorm
 
     d = np.linspace(0.0, deepest, _GRID)[1:]

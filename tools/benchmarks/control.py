@@ -1,9 +1,9 @@
 """Measure the residual object angle error for each grip control law.
 
-An object is placed askew between the fingers and grasped. The error is computed from the simulated
-hand's true angle, not from the daemon's estimate. The simulated plants differ from the settings,
-and the sensor is either ideal or has defects. All runs use virtual time, so the results do not
-depend on the machine's speed.
+An object is placed between the fingers at an angle and then grasped. The error is computed from the
+simulated hand's true angle, not from the daemon's estimate. The simulated plants differ from the
+settings, and the sensor is either ideal or has defects. All runs use virtual time, so the results
+do not depend on the machine's speed.
 
 The daemon's control laws are compared with two laws from the literature. *Equal torques* is the
 `upright` law without its spring and dither. *Two-phased* is the serial two-phased controller for
@@ -95,7 +95,7 @@ _DEFAULT: Sections = {}
 
 
 class Way(NamedTuple):
-    """Control law to test: `control` settings, the plant's tips and sensors, and the aim [°]."""
+    """Control law to test, with its `control` settings, the plant's settings and the aim [°]."""
 
     control: Mapping[str, Any] = _DEFAULT
     tips: Sections = _DEFAULT
@@ -133,7 +133,10 @@ def _upright(
     weight: tuple[float, float] = (0.0, 0.0),
     **simulation: Any,
 ) -> Way:
-    """Return an `upright` law without angle feedback, on a plant that violates its assumptions."""
+    """Return a test of the `upright` law without angle feedback.
+
+    The plant violates the assumptions of the control law.
+    """
     tips: Sections = {"simulation": simulation}
     if width:
         tips = {"object": {"width": width}, "simulation": {"object_width": width}}
@@ -198,7 +201,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
-    """Return each plant's deviations from the settings; all control laws use the same plants."""
+    """Draw each plant's deviations from the settings; all control laws use the same plants."""
     rng = np.random.default_rng(16)
     return [
         {

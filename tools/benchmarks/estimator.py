@@ -4,11 +4,11 @@ All measured functions take turns in one run. All lookups use the same points: |
 up to 8 mm. Half of the displacements are evenly spaced, and half are logarithmically spaced down to
 1 µm. The reported error is the maximum relative deviation from quadrature with many nodes.
 
-Each frame has 44 × 44 cells on 58 mm, and it shows a contact with d = 4 mm and a tilt of 15°. The
-noise is 0.2 % of the modulus. As in the control loop, the estimator is called from Python, for
-spring tips and solid tips in turn. RMS errors over these frames are listed next to the Cramér-Rao
-bound. The "sensor" rows show the errors for a profile's sensor that has been pressed in the same
-way for one second.
+Each frame has 44 × 44 cells on a 58 mm square and shows a contact with d = 4 mm and a tilt of 15°.
+The noise is 0.2 % of the modulus. As in the control loop, the estimator is called from Python.
+Spring tips and solid tips are measured in turn. RMS errors over these frames are listed next to the
+Cramér-Rao bound. The "sensor" rows show the errors for a profile's sensor that has been pressed in
+the same way for one second.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def lookups(rounds: int, count: int = 512) -> Report:
 
 
 def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) -> dict[str, Any]:
-    """Return the time per point and the error of SciPy's bicubic spline for F only."""
+    """Return the time per point and the error of SciPy's bicubic spline, which computes only F."""
     interpolate: Any = import_module("scipy.interpolate")
     at = np.linspace(0.0, _D_MAX, 129), np.linspace(-_TILT_MAX, _TILT_MAX, 65)
     spline = interpolate.RectBivariateSpline(*at, integrate(TIP, _LAW, *np.meshgrid(*at)).force.T)
@@ -167,7 +167,7 @@ def frames_to_contacts(rounds: int) -> Report:
 
 
 def centroid_and_extent(frames: FloatArray) -> FloatArray:
-    """Compute d and tilts [n, 3] from the centroid and extent of each footprint with NumPy.
+    """Use NumPy to compute d and tilts [n, 3] from each footprint's centroid and extent.
 
     For a constant modulus, the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance is
     d (4a − d)/6 − sin² θ d (12a − 5d)/36. The initial footprint contains all cells above a
@@ -201,7 +201,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
 
 
 def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> FloatArray:
-    """Return d and tilts [count, 3] from a profile's sensor that has been pressed for 1 s."""
+    """Estimate d and tilts [count, 3] from a profile's sensor that has been pressed for 1 s."""
     model = make_sensor_model(settings, 0)
     estimator = make_estimator(settings, make_material(settings.material))
     counts = np.zeros(model.grid.shape, np.uint16)
@@ -214,7 +214,7 @@ def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> Floa
 
 
 def bound() -> float:
-    """Return the Cramér-Rao bound for d [m] using all cells, with unknown tilts and gain.
+    """Return the Cramér-Rao bound for d [m] from all cells if tilts and gain are unknown.
 
     Pressure derivatives with respect to (d, tilt_x, tilt_y, gain) are central differences.
     """
@@ -229,7 +229,10 @@ def bound() -> float:
 def estimates(
     frames: FloatArray, cold: bool = False, tip: Fingertip = TIP
 ) -> Callable[[], FloatArray]:
-    """Return a function that estimates d and tilts [n, 3]; ``cold`` resets it for each frame."""
+    """Return a function that estimates d and tilts [n, 3].
+
+    If ``cold`` is set, the estimator is reset before each frame.
+    """
     estimator = ContactEstimator(tip, LINEAR, GRID, NOISE)
 
     def run() -> FloatArray:

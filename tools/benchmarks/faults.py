@@ -1,8 +1,9 @@
-"""Measure how grips behave with faulty measurements, using the plant's true state.
+"""Measure how grips behave with faulty measurements.
 
-Each case is a grip with a faulty measurement or an unusual tip. The seed of a trial determines the
-noise, times, finger, object mass and torque constant error. Trials run on virtual time, so the
-results do not depend on the machine.
+Each case is a grip with a faulty measurement or an unusual tip. A trial's seed determines the
+noise, the times, the affected finger, the object mass and the torque constant error. Trials run in
+virtual time, so they do not depend on the machine. The results are computed from the plant's true
+state.
 """
 
 from __future__ import annotations
@@ -128,13 +129,16 @@ class GripTrial:
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
-        """Record the results from the watch and the final state."""
+        """Record the results from ``watch`` and the hand's final state."""
         self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
-        """Return (time, channel) of all correct or, if not ``rightly``, all wrong diagnoses."""
+        """Return (time, channel) of each correct diagnosis.
+
+        If ``rightly`` is False, the wrong diagnoses are returned instead.
+        """
         names = [
             (t, k.removeprefix(_EVENT_PREFIX))
             for t, k in self.events
@@ -163,7 +167,7 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return one table per criterion with the cases whose name contains ``only``.
+    """Return one table per criterion, for the cases whose names contain ``only``.
 
     ``brief`` runs one trial per case. ``sweep`` maps trials to outcomes in one or more processes.
     """
@@ -250,7 +254,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Summarise the number of trials and the median first time [s] for each event kind."""
+    """Format each event kind with its number of trials and its median first occurrence [s]."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

@@ -74,11 +74,11 @@ def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None, *
 def interleave(
     subjects: Mapping[str, Callable[[], object]], rounds: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Measure the time per call [ns] of each subject in each round, float64 [rounds].
+    """Measure each subject's time per call [ns], with one value per round.
 
-    The subjects take turns, so that slow periods of the machine affect all of them. The first call
+    The subjects take turns, so that slow periods of the machine affect all subjects. The first call
     to each subject, which compiles it, is not counted. Each measurement repeats the call to fill a
-    time slice, with garbage collection disabled.
+    time slice. Garbage collection is disabled during the measurement.
     """
     timers, repeats = {name: Timer(run) for name, run in subjects.items()}, {}
     for name, timer in timers.items():

@@ -2,11 +2,11 @@
 
 A 10 N grip carries a constant load along the object faces, away from the palm. A larger load is
 then applied and maintained: either a push, or a twist with the same force at the faces. Trials run
-on virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
+in virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
 object is no longer between the tips. *Slid*: object displacement along its faces. The displacement
-is measured from the midpoint of both tips, so that leaning fingers do not affect it. *Answer*: time
-from the onset of slip until the goal currents have increased by a quarter. *Said*: time from object
-loss until the hand leaves the grip modes.
+is measured relative to the midpoint between the tips, so that leaning fingers do not affect the
+result. *Answer*: time from the onset of slip until the goal currents have increased by a quarter.
+*Said*: time from object loss until the hand leaves the grip modes.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Overload(NamedTuple):
 def measure(
     brief: bool = False, full: bool = False, sweep: Callable[..., Iterable[Any]] = map
 ) -> list[Report]:
-    """Return a table for each combination of tip or sensor and mass; ``brief`` runs fewer cases.
+    """Return one table per hand (tip or sensor, and object mass); ``brief`` runs fewer cases.
 
     ``sweep`` maps cases to outcomes in one or more processes.
     """

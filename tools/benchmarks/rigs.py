@@ -38,7 +38,7 @@ _FRAME_COUNT = 16  # number of frames through which the benchmark cycles
 
 
 class RigError(SoftfingerError):
-    """The measurement is not possible, because the test rig does not work."""
+    """Error raised if the test rig does not work, so that the measurement is not possible."""
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
@@ -49,7 +49,7 @@ def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
 
 @contextlib.contextmanager
 def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
-    """Yield a daemon on virtual time with private addresses and a subscriber to ``topics``."""
+    """Yield a virtual-time daemon with private addresses, and a subscriber to ``topics``."""
     with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
         sections = {
             "loop": {"clock": "virtual"},
@@ -69,7 +69,7 @@ def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
 def hold(daemon: Daemon, force: float = 8.0) -> None:
     """Grasp the simulated object.
 
-    Raises RigError if the object is not held within 10 s, or Refused.
+    Raises RigError if the object is not held within 10 s, and Refused if a command is refused.
     """
     loop = daemon.loop
     loop.advance(0.2)
@@ -84,14 +84,14 @@ def hold(daemon: Daemon, force: float = 8.0) -> None:
 
 
 def must_hold(daemon: Daemon) -> None:
-    """Raise RigError unless the hand is holding."""
+    """Raise RigError unless the hand is holding an object."""
     state = daemon.loop.state
     if state.mode != "holding":
         raise RigError(f"the hand failed to grip the object: {state.mode} {state.fault}")
 
 
 class _Canned:
-    """Base class for canned backends, with operations that do nothing."""
+    """Base class for canned backends, whose operations do nothing."""
 
     def close(self) -> None:
         """Do nothing."""
@@ -150,7 +150,7 @@ class CannedSensor(_Canned):
 def can(daemon: Daemon) -> None:
     """Replace a daemon's backends with canned backends, so that only the tick itself is timed.
 
-    The canned backends repeat the next frames and the last reading. Several frames are used,
+    The canned backends repeat the last reading and the next few frames. Several frames are used,
     because the daemon would detect a single repeated frame as a frozen sensor.
     """
     loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate

@@ -2,7 +2,7 @@
 
 The simulated hand and the daemon have separate settings. In each of the *rows*, one parameter
 differs by an amount that is normal for a healthy hand. In the *ensemble*, all parameters are drawn
-at random. Grips run on virtual time, so the results do not depend on the machine.
+at random. Grips run in virtual time, so the results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _LATENCY = Settings().tactile.latency
 
 @dataclass(frozen=True)
 class HandCase:
-    """Grip with ``force`` [N] by a daemon whose settings differ from the hand's."""
+    """Case of a grip with ``force`` [N] in which the daemon's settings differ from the hand."""
 
     name: str
     force: float
@@ -192,7 +192,7 @@ class Outcome:
 
 
 def grip(case: HandCase, seed: int = 1) -> Outcome:
-    """Run one grip; ``seed`` determines the noise and the finger."""
+    """Run one grip; ``seed`` determines the noise and the times."""
     chance, found = random.Random(f"{case.name} {seed}"), Outcome()
     daemon = merged({"simulation": {"seed": seed}}, case.daemon)
     with VirtualGrip(daemon, merged(case.hand, daemon), case.torque) as hand:
@@ -253,7 +253,7 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return one table for the rows and one for the ensemble; ``brief`` runs only a few of each."""
+    """Return a table for the rows and a table for the ensemble; ``brief`` runs only a few cases."""
     trials = trials or (1 if brief else _TRIAL_COUNT)
     hands = [
         drawn(seed) for seed in range(1, (4 if brief else trials * _HAND_COUNT // _TRIAL_COUNT) + 1)

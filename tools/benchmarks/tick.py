@@ -1,10 +1,10 @@
 """Measure tick times: back to back, in place, and with emulated servos over a pty.
 
 Back-to-back ticks follow each other without a pause. Each in-place tick starts after a sleep, as in
-a running daemon. Both kinds of ticks are measured in turn, with the same hand and canned readings.
-In the measurement with emulated servos, another process emulates the servos, either unpaced or with
-the transmission times of a given baud rate. The whole simulated hand is also timed for one second
-of virtual time.
+a running daemon. Both kinds of ticks are measured alternately, with the same hand and canned
+readings. In the last measurement, another process emulates the servos, either unpaced or with the
+transmission times of a given baud rate. The whole simulated hand is also timed for one second of
+virtual time.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _IN_TURN = 20  # number of cycles before switching between ticks and exchanges
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Return tick times while holding an object [µs], and the time per virtual second [ms]."""
+    """Return tick times [µs] while holding an object, and the run time per virtual second [ms]."""
     rounds, turns = (10, 10) if brief else (40, 60)
     parts: dict[str, Callable[[str], Report]] = {
         "tick": partial(_in_turns, rounds=rounds),
@@ -47,7 +47,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def _simulated(title: str, seconds: int) -> Report:
-    """Measure the complete daemon with the simulated hand, per virtual second and per tick."""
+    """Time the complete daemon with the simulated hand, per virtual second and per tick."""
     with virtual_daemon() as daemon:
         hold(daemon)
         second = timed(partial(daemon.loop.advance, 1.0), seconds)
@@ -98,7 +98,7 @@ def _in_turns(title: str, rounds: int) -> Report:
 
 
 def ticks(daemon: Daemon, count: int) -> list[float]:
-    """Return the durations of ``count`` consecutive ticks on virtual time [µs]."""
+    """Return the durations [µs] of ``count`` consecutive ticks in virtual time."""
     loop, clock = daemon.loop, daemon.clock
     samples = []
     for _ in range(count):
@@ -108,7 +108,7 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
 
 
 def in_place(daemon: Daemon, rate: float) -> list[float]:
-    """Return tick durations [µs] over 0.15 s, with each tick started by a real-time deadline."""
+    """Return tick durations [µs] during 0.15 s; real-time deadlines start the ticks."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
     for _ in range(round(0.15 * rate)):
@@ -119,7 +119,7 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
 
 
 def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Measure ticks over ptys during a hold, alternating with the servo exchanges alone.
+    """Alternately time complete ticks and plain servo exchanges over ptys during a hold.
 
     A ``baud`` of 0 disables pacing, and ``changes`` override the profile. Raises RigError if the
     hand loses its grip, e.g. on a busy machine.

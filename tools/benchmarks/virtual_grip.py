@@ -1,4 +1,4 @@
-"""Grip with a simulated hand on virtual time and observe the plant on every tick.
+"""Grip with a simulated hand in virtual time and observe the plant on every tick.
 
 True force, object position and slip are read from the plant, independently of the code under test.
 """
@@ -58,7 +58,7 @@ class Watch:
         return fmean(ratio for t, ratio in self._mean if t > end)
 
     def first_off(self, share: float) -> float:
-        """Return the first time [s] at which the mean force left the range 1 ± ``share``."""
+        """Return the first time [s] at which the relative force left the range 1 ± ``share``."""
         came = False
         for t, ratio in self._mean:
             near = abs(ratio - 1.0) <= share
@@ -69,7 +69,7 @@ class Watch:
 
 
 class VirtualGrip(SimulatedDaemon):
-    """Grip on virtual time; ``look`` is called after each tick."""
+    """Grip in virtual time; ``look`` is called after each tick."""
 
     def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:
         """Build daemon and hand.
@@ -86,7 +86,7 @@ class VirtualGrip(SimulatedDaemon):
 
     @classmethod
     def drawn(cls, seed: int, chance: random.Random, sections: Sections) -> Self:
-        """Draw a grip with random object mass and torque constant."""
+        """Draw a grip with a random object mass and a random torque constant error."""
         drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
         error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
         return cls(merged(sections, {"simulation": drawn}), torque=1.0 + error)

@@ -144,7 +144,7 @@ def _while_pressed(
     told: str,
     load: Mapping[str, float],
 ) -> NDArray[np.uint16]:
-    """Return the frames before and during a load, and ``--frames`` frames after the load."""
+    """Return the last frames before a load is in place, and ``--frames`` frames under the load."""
     before: deque[NDArray[np.uint16]] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock, clock.now())
     with ThreadPoolExecutor(1) as pool:
@@ -165,7 +165,7 @@ def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | s
 
 
 def _move(command: str, load: Mapping[str, float | str]) -> None:
-    """Run the stage program for one load and wait for it. Raises CalibrationError."""
+    """Run the stage program for one load and wait until it exits. Raises CalibrationError."""
     try:
         words = [
             word.format(**{"force": 0.0, "d": 0.0, "theta": 0.0, **load})

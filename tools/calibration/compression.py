@@ -1,7 +1,7 @@
-"""Calibrate a tip's material law from test machine CSV files: `calibrate law --compression`.
+"""Run `calibrate law --compression`: fit a tip's material law to CSV files of a test machine.
 
-A file contains strain and stress, or displacement and force. With displacement and force, the tilt
-is in a column or given by ``--theta``.
+A file contains strain and stress, or displacement and force. A file with displacement and force
+also needs the tilt, in a column or from ``--theta``.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ _BETTER = 6.0
 
 
 def read_csv(path: Path) -> dict[str, FloatArray]:
-    """Read the known columns of a file in SI units.
+    """Read a file's known columns and convert them to SI units.
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
     semicolon. Units follow the column names in the header, or are in a separate row below the
@@ -149,7 +149,7 @@ def _is_number(cell: str) -> bool:
 
 @dataclass(frozen=True)
 class _Test:
-    """A test run, and its name in messages."""
+    """Test run, with the name that messages use for the run."""
 
     name: str
     run: Run
@@ -158,7 +158,7 @@ class _Test:
 def fit_files(
     calibration: Calibration, settings: Settings, paths: list[Path], theta: list[float]
 ) -> tuple[Calibration, str, tuple[Panel, ...]]:
-    """Fit the material law to files, for the profile's `tip.physics`.
+    """Fit the material law to test data, using the tip model in the profile's `tip.physics`.
 
     Parameters
     ----------
@@ -359,7 +359,7 @@ def _stress_strain(
 
 
 def _thinned(strain: FloatArray, stress: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average the points in `_BINS` strain ranges if there are at least 2 `_BINS` points."""
+    """Average the points in each strain range, if there are at least 2 × `_BINS` points."""
     if len(strain) < 2 * _BINS:
         return strain, stress
     edges = np.linspace(strain.min(), strain.max(), _BINS + 1)

@@ -1,4 +1,4 @@
-"""Measure joint friction with slow sweeps in air: `calibrate friction`."""
+"""Run `calibrate friction`: measure joint friction with slow sweeps in air."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _SEEN = 2.0
 def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write the joint friction to the profile and return a summary.
 
-    The errors of `LiveHand` may also be raised.
+    Errors raised by `LiveHand` are propagated.
 
     Raises
     ------

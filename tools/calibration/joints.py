@@ -1,4 +1,4 @@
-"""Write servo data to a profile: `calibrate joints` and `calibrate heat`.
+"""Run `calibrate joints` and `calibrate heat`: write servo data to a profile.
 
 During `calibrate joints`, torque is off and the user moves each finger by hand. The servo counts
 are read in the closed, open and zero poses. `calibrate heat` fits the thermal constants to the
@@ -171,7 +171,10 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write ``new`` to the file, or to a copy of the profile; all other text is preserved."""
+    """Write the settings ``new`` to ``arguments.file``, or to a copy of the profile at this path.
+
+    All other text is preserved.
+    """
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
     load(source, arguments.dir or own_runtime_folder(), [*arguments.set, *changes])

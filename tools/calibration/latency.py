@@ -1,4 +1,4 @@
-"""Measure the tactile frame latency from a grip with varying force: `calibrate latency`."""
+"""Run `calibrate latency`: measure the tactile frame latency in a grip with varying force."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write the frame latency to the profile and return a summary.
 
-    The errors of `LiveHand` may also be raised.
+    Errors raised by `LiveHand` are propagated.
 
     Raises
     ------
@@ -151,9 +151,9 @@ def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArra
 
 
 def _closing(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray]:
-    """Return times, and the closing depth [m] of the joints relative to an arbitrary origin.
+    """Return times, and d1 + d2 [m] computed from the joint angles, up to a constant offset.
 
-    d1 + d2 = W + 2a − (O2 − O1)·n does not change if the object moves between the tips.
+    The sum d1 + d2 = W + 2a − (O2 − O1)·n does not change if the object moves between the tips.
     """
     states = to_columns(read(HandState, message) for _, message in source.messages([STATE]))
     hand, angle = own.hand, states["object.angle"]

@@ -23,7 +23,7 @@ _WITHIN = 20.0  # time limit for each command, measured on the hand's clock [s]
 
 
 class LiveHand:
-    """Context manager that arms the hand and stores its stream as in a `Recording`.
+    """Context manager that arms the hand and stores its stream; `messages` works as in `Recording`.
 
     On exit, the hand is disarmed again if it was disarmed on entry. After an error, the torque is
     switched off.
@@ -98,7 +98,7 @@ class LiveHand:
                 raise CalibrationError(f"the hand is still {state.mode} after {_WITHIN:g} s")
 
     def wait(self, seconds: float) -> None:
-        """Wait for ``seconds`` in hand time."""
+        """Wait for ``seconds`` on the hand's clock."""
         end = next(self.states()).mono_ns + int(1e9 * seconds)
         self.until(lambda state: state.mono_ns >= end)
 

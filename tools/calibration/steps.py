@@ -72,7 +72,7 @@ Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 
 def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
-    """Load the calibration file or make a new calibration. Raises CalibrationFileError."""
+    """Load the calibration file or create a new calibration. Raises CalibrationFileError."""
     sensor = sensor_of(settings, FINGERS.index(arguments.finger))
     if not arguments.file.exists():
         return Calibration(sensor=sensor, date=now())
@@ -106,7 +106,7 @@ class Step:
 
     @cached_property
     def over(self) -> list[FloatArray]:
-        """Mean counts above the zero offset, times the gains, corrected for clipping at 0."""
+        """Mean counts minus zero offset, multiplied by the gains; clipping at 0 is corrected."""
         tare, zero, gain = self.calibration.tare, self.converter.zero, self.converter.gain
         means = [frames.mean(axis=0) for frames in self.loads.frames]
         if tare is None or self.settings.tactile.threshold:
@@ -169,7 +169,7 @@ def done(step: Step) -> Done:
 
 
 def _kept(kind: type[Any], found: object, **more: Any) -> Any:
-    """Make a ``kind`` step for the file from the fields of ``found`` and ``more``."""
+    """Create a ``kind`` step for the file from the fields of ``found`` and ``more``."""
     values = {name: getattr(found, name) for name in kind.model_fields if hasattr(found, name)}
     lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
     return kind(date=now(), **(lists | more))

@@ -1,1 +1,4 @@
-"""Self-contained example programs for users to copy; they use the public client and kinematics."""
+"""Provide self-contained example programs that users can copy.
+
+The examples use only the public client and the public kinematics package.
+"""

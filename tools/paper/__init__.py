@@ -1,5 +1,5 @@
 """The `figures` and `validate` commands, which reproduce the paper's figures and published values.
 
-Each figure is drawn from the same sheets that are written as CSV. matplotlib is imported only when
-a figure is drawn.
+The sheets that a figure is drawn from are also written as CSV files. matplotlib is imported only
+when a figure is drawn.
 """

@@ -106,7 +106,7 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return force and energy while the finger rotates about its root and then the object rolls.
+    """Return force and energy for a rotation of the finger about its root, followed by rolling.
 
     For each final displacement D, the root is D/sin 11.5° away from the tip centre. During the
     rotation, d therefore increases from first touch as D sin |θ|/sin 11.5°. During rolling, d is
@@ -167,7 +167,7 @@ _TERMS = ("first", "second", "third")
 
 
 class Terms(NamedTuple):
-    """Integrals of the root, 1 and the inverse root over the area element in eq. 14."""
+    """Integrals of r, 1 and 1/r over the area element in eq. 14; r = √(a² − (a − d)² tan² θ)."""
 
     first: FloatArray  # eq. 16 [m]
     second: FloatArray  # eq. 18

@@ -1,6 +1,6 @@
 """Run ``softfinger figures``: compute the paper's figures and write them as CSV and PNG.
 
-Figures that contain an erratum of the paper are marked.
+Figures affected by an erratum in the paper are marked.
 """
 
 from __future__ import annotations

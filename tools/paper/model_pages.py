@@ -62,7 +62,7 @@ def _tangent(material: Material, strain: FloatArray) -> FloatArray:
 
 
 def law() -> tuple[Sheet, ...]:
-    """Tabulate the law versus strain, and compare the law with Table I at the table's strains."""
+    """Tabulate the material law versus strain, and compare it with the points in Table I."""
     material = Material.table_i()
     strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
     curve = {
@@ -87,7 +87,7 @@ def _stress(axes: Axes, curve: Sheet, _: Sheet) -> None:
 
 
 def _slope(axes: Axes, curve: Sheet, table: Sheet) -> None:
-    """Draw the law's slope and the points of Table I, labelled with their values."""
+    """Draw the slope of the law and the points in Table I, each labelled with its value."""
     axes.plot(curve["strain"], curve["modulus"], color=KINDS[0], label="slope of the law")
     measured = table["modulus in the paper"]
     axes.plot(table["strain"], measured, "o", color="white", mec=KINDS[0], mew=1.4, label="Table I")
@@ -208,10 +208,11 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Tabulate the quantity, its ratio to θ = 0, and exponents versus d up to 8 mm at each tilt.
+    """Tabulate the quantity, its ratio to the value at θ = 0, and exponents versus d at each tilt.
 
-    Ratios and exponents are computed from the double integral, so that they do not depend on the
-    closed form. The exponents for Table I's law are computed from its own integral.
+    d ranges up to 8 mm. Ratios and exponents are computed from the double integral and are
+    therefore independent of the closed form. The exponents for Table I's law are computed from its
+    own integral.
     """
     d = np.arange(81) / 10.0
     power = quantity.at_zero_tilt(d)

@@ -1,8 +1,8 @@
 """Reproduce Figs. 7, 8 and 10 in simulation, with the daemon's plant, sensor, estimator and table.
 
 Each run returns true and estimated values, one row per frame. The figures show the model, the
-estimates and their errors. The simulated sensor matches the paper's: 44 × 44 cells on 58 mm and
-40 ms per scan. The noise of each cell is 0.5 % of the modulus.
+estimates and their errors. The simulated sensor matches the paper's sensor: 44 × 44 cells on a 58
+mm square, and 40 ms per scan. The noise of each cell is 0.5 % of the modulus.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _daemon(sections: Sections) -> Daemon:
 def _frames(
     daemon: Daemon, count: int, place: Callable[[SimulatedHand, float], None] | None = None
 ) -> Iterator[Row]:
-    """Yield each frame's true state at its sample time and the estimate from this frame alone."""
+    """Yield the true state at each frame's sample time, and the estimate from this frame alone."""
     hand, loop = daemon.hand, daemon.loop
     assert hand is not None
     if place is not None:
@@ -266,7 +266,7 @@ def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
 
 @cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return sheets for the rotation, rolling at each displacement, and force and energy minima."""
+    """Return sheets for the rotation, rolling at each displacement, and the force/energy minima."""
     columns: dict[str, FloatArray] = {}
     for depth in DEPTHS:
         columns |= run_rolling(depth)
@@ -301,7 +301,7 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
 
 
 def _along(symbol: str, axes: Axes, rotation: Sheet, rolling: Sheet, _: Sheet) -> None:
-    """Draw the path: rotation, then rolling at 4 mm."""
+    """Draw the path of the rotation and of the subsequent rolling at d = 4 mm."""
     for piece, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),

@@ -1,7 +1,7 @@
-"""Explain the minimum slightly before 0° (section IV-B): part of the rolling shears the tip.
+"""Explain why the minimum lies slightly before 0° (section IV-B): rolling also shears the tip.
 
 The finger is tilted to −11.5°. From this tilt, the object rolls to 9.2° at constant displacement d.
-The tip does not follow a fraction s of the face motion by rolling. This fraction shears the tip by
+A fraction s of the face motion shears the tip instead of rolling it. The shear is
 
     ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
 

@@ -1,4 +1,4 @@
-"""Represent figures as data: one sheet of numbers per CSV file, and the panels drawn from it."""
+"""Represent figures as data: one sheet of numbers per CSV file, and panels drawn from sheets."""
 
 from __future__ import annotations
 

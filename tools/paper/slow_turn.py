@@ -6,11 +6,14 @@ model is frictionless. For a tip with shear ζ
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
 The shear rate is the rolling speed minus two other terms: the speed along the face, and the
-component along a tilted face due to increasing d. s, d and θ are defined in
+component along a tilted face due to increasing d. The quantities s, d and θ are defined in
 `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium if Σ δU = 0
-for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ +
-T (−δs + (a − d) δθ) = 0. Every pose in a slow turn satisfies this equilibrium condition. `turned`
-solves the condition step by step; time, mass and damping do not occur.
+for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, the condition becomes
+
+    Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0
+
+Every pose in a slow turn satisfies this equilibrium condition. `turned` solves the condition step
+by step; the solution does not involve time, mass or damping.
 """
 
 from __future__ import annotations
@@ -105,7 +108,10 @@ class Held(NamedTuple):
 
 
 def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
-    """Return the pose after the tips have rolled from ``last``; None means unsheared tips."""
+    """Return the pose after the tips have rolled from ``last``.
+
+    If ``last`` is None, the tips are not sheared.
+    """
     contacts = _HAND.contacts(q, pose, WIDTH)
     theta = _SIDES * contacts.theta
     shear = np.zeros(2)
@@ -238,7 +244,7 @@ def _triangle(turns: float) -> float:
 
 @cache
 def slow_turn() -> tuple[Sheet, ...]:
-    """Return the path from the equations, the plant's path, and V at antisymmetric joint angles."""
+    """Return sheets with the computed path, the plant's path, and V versus the object angle."""
     there = np.linspace(0.0, REACH, _STEPS + 1)[1:]
     back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _STEPS + 1)]
     start = gripped()

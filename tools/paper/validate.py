@@ -68,14 +68,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def comparisons() -> Iterator[PublishedValue]:
-    """Yield all rows, computing each on demand."""
+    """Yield all rows; each row is computed on demand."""
     for rows in (_tips, _energy, _relaxation, _sensors, _hands):
         yield from rows()
 
 
 def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
             unit: str = "", why: str = "") -> PublishedValue:  # fmt: skip
-    """Return a row that agrees if ``ours``, rounded to ``form``, is within [low, high]."""
+    """Return a row that compares ``ours`` with the range [low, high], all rounded to ``form``."""
     shown = [f"{each:{form}}" for each in (low, high, ours)]
     inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
     verdict = "agree" if inside else "disagree"

@@ -1,1 +1,1 @@
-"""Implement the commands `run`, `emulate` and `compile`, child processes and the event log."""
+"""Implement the `run`, `emulate` and `compile` commands, child processes and the event log."""

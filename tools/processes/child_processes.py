@@ -1,7 +1,7 @@
 """Run the monitor and the recorder as child processes of the daemon.
 
-Each child holds one end of a pipe, and only the daemon holds the other end. If the daemon ends for
-any reason, the pipe closes, and the child then ends too.
+Each child holds one end of a pipe, and only the daemon holds the other end. If the daemon exits for
+any reason, the pipe closes, and the child then exits too.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe, and to close
 
 
 class RecorderError(SoftfingerError):
-    """The recorder did not start. The error text is the recorder's own message."""
+    """Error raised if the recorder does not start. The text is the recorder's own message."""
 
 
 class _Lifeline:
@@ -47,7 +47,7 @@ class _Lifeline:
             os.close(reads)
 
     def close(self) -> None:
-        """Close the pipe, so that the child ends."""
+        """Close the pipe, so that the child exits."""
         if self._ours >= 0:
             os.close(self._ours)
             self._ours = -1
@@ -56,8 +56,8 @@ class _Lifeline:
 class MonitorProcess:
     """Run the monitor on this process's terminal until `close` is called.
 
-    When the monitor has ended, ``on_end`` is called once, from a signal handler in the main thread.
-    With ``on_end=loop.end``, the monitor's q key ends the daemon.
+    When the monitor exits, ``on_end`` is called once, from a signal handler in the main thread.
+    With ``on_end=loop.end``, the monitor's q key stops the daemon.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class MonitorProcess:
 
 
 class RecorderProcess:
-    """Run ``record`` with the arguments ``words``, of which the first is the file.
+    """Run ``record`` with the arguments ``words``; the first argument is the file.
 
     ``failed`` is set as soon as the recording is known to be incomplete.
     """
@@ -123,7 +123,7 @@ class RecorderProcess:
     ) -> None:
         """Start the recorder and wait until ``subscribed()`` is True. Raises RecorderError.
 
-        If the recorder ends before `close` is called, ``on_end`` is called from a thread with the
+        If the recorder exits before `close` is called, another thread calls ``on_end`` with the
         reason.
         """
         self.failed = False
@@ -153,7 +153,7 @@ class RecorderProcess:
         self._watch.start()
 
     def _wait(self) -> None:
-        """Wait until the recorder has ended, and report an unexpected end."""
+        """Wait until the recorder exits, and report an unexpected exit."""
         self._said = "".join(self._process.communicate()).strip()
         self.failed = not self._closing or self._process.returncode != 0
         if self._closing:

@@ -1,4 +1,4 @@
-"""Compile a scene's kernels on all cores, for ``softfinger compile`` and the first start.
+"""Compile a scene's kernels on all cores, for ``softfinger compile`` or a daemon's first start.
 
 The daemon itself only loads the kernels and therefore uses less memory. Each process compiles one
 pipeline part (`loop.warm_up`) after another. Parts that need the contact table wait until the table
@@ -80,12 +80,12 @@ def print_event(_level: str, _kind: str, text: str) -> None:
 def build_kernels(
     settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, bar: bool = True
 ) -> Built:
-    """Build the parts in ``wanted`` that are missing, by default for the whole scene.
+    """Build the missing parts in ``wanted``, or all missing parts of the scene by default.
 
     If all parts exist, the function returns quickly without a message. If standard error is a
     terminal and ``bar`` is set, a bar shows the progress. Otherwise ``tell(level, kind, text)`` is
-    called for each part. Failures are also passed to ``tell``. If the function is interrupted, all
-    processes end.
+    called for each part. Failures are also passed to ``tell``. If the function is interrupted, it
+    ends all processes.
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
@@ -129,7 +129,7 @@ def _available() -> float:
 
 
 class _Build:
-    """Build parts in several processes, each of which has its own thread."""
+    """Build parts in several processes, each controlled by its own thread."""
 
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
         self._head = f"{settings.model_dump_json()}\n"
@@ -227,8 +227,8 @@ def main() -> None:
     """Compile kernels, one part of a scene at a time, until standard input ends.
 
     Standard input contains the settings as JSON, followed by one part name per line. Standard
-    output has three kinds of lines: ``kernel NAME`` when a kernel is started, ``done`` when a part
-    has been built, and ``failed REASON`` when a part could not be built.
+    output has three kinds of lines: ``kernel NAME`` when the compilation of a kernel starts,
+    ``done`` when a part has been built, and ``failed REASON`` when a part could not be built.
     """
     # The compiler allocates many long-lived objects, so frequent garbage collection takes 10 % of
     # the time.

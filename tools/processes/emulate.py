@@ -1,4 +1,4 @@
-"""Run ``softfinger emulate``, the process of an emulated hand: arguments, signals, exit status."""
+"""Run ``softfinger emulate``: the arguments, signals and exit status of an emulated hand."""
 
 from __future__ import annotations
 
@@ -140,7 +140,10 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT, SIGTERM or SIGHUP. If the setup fails, print a message and return 1."""
+    """Emulate the hand until SIGINT, SIGTERM or SIGHUP arrives.
+
+    If the setup fails, a message is printed, and 1 is returned.
+    """
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder with --dir")
@@ -196,7 +199,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
     """Run `softfinger emulate` with the arguments ``words``; yield the process once it is ready.
 
-    Raises NoEmulator if the process ends before it is ready. The process prints its error message
+    Raises NoEmulator if the process exits before it is ready. The process prints its error message
     to standard error.
     """
     from softfinger.daemon.simulation.emulator.folder import NoEmulator
@@ -216,7 +219,10 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def _ready(ports: dict[str, Path]) -> str:
-    """Return a ready emulator's output as one text, because readers may wait for the last line."""
+    """Return the output that announces a ready emulator.
+
+    The lines are printed together, because readers may wait for the last line.
+    """
     return "".join(["ready\n", *(f"{name}: {path}\n" for name, path in ports.items())])
 
 
@@ -224,8 +230,8 @@ def _unhurried(settings: Settings, paced: bool) -> Settings:
     """Return the settings with real-time options that are suitable for a pseudo-terminal.
 
     SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Idle
-    states are disabled only if the servos reproduce the wire timing, which requires very short
-    sleeps.
+    states are disabled only if the servos reproduce the wire timing, because this timing requires
+    very short sleeps.
     """
     changes = {"priority": 0, "cpus": (), "spin": 0.0, "lock_memory": False}
     held = paced and settings.realtime.hold_latency

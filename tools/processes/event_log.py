@@ -52,7 +52,7 @@ class EventLog:
         self._thread.start()
 
     def line(self, level: str, kind: str, text: str, **fields: Any) -> None:
-        """Queue one line. The ``fields`` appear only in JSON."""
+        """Queue one line. The ``fields`` appear only in JSON logs."""
         if not self.quiet or self._file is not None:
             self._lines.append((time.time(), level, kind, text, fields))
             self._news.set()
@@ -60,7 +60,7 @@ class EventLog:
     def plain(self, text: str, level: str = "") -> None:
         """Queue one line without a kind; plain logs show the line unchanged.
 
-        In JSON, an empty ``level`` becomes ``info``.
+        In JSON logs, an empty ``level`` becomes ``info``.
         """
         self._lines.append((time.time(), level, "", text, {}))
         self._news.set()

@@ -1,4 +1,4 @@
-"""Convert a topic's map to a channel's JSON and back, for the writer and the reader."""
+"""Convert the message maps of a topic to a channel's JSON and back."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def _log(message: dict[str, Any]) -> dict[str, Any]:
 def _restored(
     topic: bytes, floats: list[list[str]], names: list[str], message: dict[str, Any]
 ) -> dict[str, Any]:
-    """Restore the stream's map: convert nulls to NaN and base64 to bytes, drop Foxglove's fields.
+    """Restore the stream's map: convert null to NaN and base64 to bytes, and drop added fields.
 
     Raises ValueError, TypeError or AttributeError if the map is not a message of this topic.
     """

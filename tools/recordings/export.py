@@ -153,7 +153,7 @@ def export(
     end: float = math.inf,
     progress: Any = None,
 ) -> list[Path]:
-    """Write one table per topic and one ``.npz`` file with frames per sensor into ``folder``.
+    """Write one table per topic, and one ``.npz`` file of frames per sensor, into ``folder``.
 
     In all files, the first column ``t`` is the time since the recording's first message [s],
     according to the daemon's clock. The other columns are the fields of the schema and any
@@ -197,7 +197,7 @@ def export(
 
 
 def _file_name(topic: bytes) -> str:
-    """Return a safe file name for any topic: not hidden, and without a folder part."""
+    """Return a safe file name for any topic; the file is not hidden or in another folder."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 

@@ -1,6 +1,6 @@
 """Read MCAP files: `Recording` provides a file's summary and its messages in order of arrival.
 
-A recording may have been written by any MCAP writer, with or without chunks, indexes, statistics
+A recording may have been written by any MCAP writer, and may contain chunks, indexes, statistics
 and other programs' channels. Sizes and counts in the file are not trusted. The memory use and the
 run time are bounded by the file's size on disk. `read_recording` returns the states as NumPy
 columns.
@@ -74,25 +74,25 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 class MessageSource(Protocol):
-    """Source of messages, in a file or in memory; user messages refer to it as ``path``."""
+    """Source of messages in a file or in memory; error messages call the source ``path``."""
 
     path: Path
 
     def messages(
         self, topics: Collection[bytes] | None = None
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield the topic and map of each message in ``topics``, in order."""
+        """Yield the topic and map of each message whose topic is in ``topics``, in order."""
 
 
 class Recording:
-    """Existing recording. Raises RecordingError if the file is not a recording.
+    """Reader for an existing recording. Raises RecordingError if the file is not a recording.
 
     ``counts`` (number of messages by channel), ``start`` and ``end`` (Unix time [s], NaN if empty)
-    are read from the summary at the end of the file. If the summary is incomplete, or if there are
-    other programs' channels, the whole file is read once instead. If the recorder was killed, the
-    file has no end and is marked ``truncated``. Corrupted chunks are skipped. Messages in other
-    programs' channels are ignored; ``others`` counts them. ``say`` is called once for each kind of
-    problem found.
+    are read from the summary at the end of the file. If the summary is incomplete, or if the file
+    contains other programs' channels, the whole file is read once instead. If the recorder was
+    killed, the end of the file is missing, and ``truncated`` is True. Corrupted chunks are skipped.
+    Messages in other programs' channels are ignored; ``others`` counts them. ``say`` is called once
+    for each kind of problem found.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
@@ -317,7 +317,7 @@ class Recording:
             self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
-        """Check the end of the file; return the header's profile, or PROFILE without a header."""
+        """Check the end of the file; return the header's profile, or PROFILE if it is missing."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Header
 
@@ -335,7 +335,7 @@ class Recording:
             return PROFILE
 
     def _summary(self, file: BinaryIO) -> Statistics | None:
-        """Return the summary's statistics, or None if they or their channels are missing."""
+        """Return the summary's statistics, or None if statistics or channels are missing."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Statistics
 
@@ -392,7 +392,8 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
     """Yield the kind and content of each record whose kind is in ``wanted``.
 
     If a message is too long, only its header is returned as the content. Raises EOFError for an
-    incomplete record, and ValueError for an invalid record or another record that is too long.
+    incomplete record, and ValueError for an invalid record or for an overlong record that is not a
+    message.
     """
     while head := file.read(_RECORD.size):
         if len(head) < _RECORD.size:

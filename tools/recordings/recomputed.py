@@ -110,7 +110,7 @@ def counts_of(
     Raises
     ------
     RecordingError
-        If the frame contains pressures, or its grid has another shape.
+        If the frame contains pressures, or if its grid does not match the settings.
     """
     if message.get("unit") != "count":
         raise RecordingError(
@@ -211,7 +211,11 @@ _Tick = tuple[
 def _ticks(
     recording: Recording, used: Settings, progress: Callable[[int], None] | None
 ) -> Iterator[_Tick]:
-    """Yield all ticks. Frames and commands precede the tick's input, which precedes its state."""
+    """Yield all ticks.
+
+    In a recording, the frames and commands of a tick come first, then the input, and then the
+    state.
+    """
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}

@@ -110,7 +110,7 @@ class RecordingWriter:
             raise self._failed(error) from None
 
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Write one message, possibly modifying its map. Raises RecordingError.
+        """Write one message; its map may be modified. Raises RecordingError.
 
         A repeated message (``again``) contains its original time, which precedes the recording. To
         keep all log times within the recording, the repeated message gets the previous message's
@@ -131,7 +131,7 @@ class RecordingWriter:
         self._write(topic, message, when)
 
     def flush(self) -> None:
-        """End the chunk and pass it to the system, which keeps it if this process is killed."""
+        """End the chunk and pass it to the system, so that it survives a kill of this process."""
         try:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._wrote()
@@ -228,7 +228,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Record until the end. Return 1 if the recording is incomplete. Raises SoftfingerError."""
+    """Record until a stop condition is met. Raises SoftfingerError.
+
+    Returns 1 if the recording is incomplete.
+    """
     if arguments.recover:
         messages, damage = recover(arguments.file)
         state = f"was corrupted ({damage}); only the intact part was kept" if damage else "intact"
@@ -254,7 +257,7 @@ class _Recorder:
         self._waiting = False  # True once the notice about the missing stream has been printed
 
     def record(self) -> int:
-        """Record messages until the end, and return the exit status."""
+        """Record messages until a stop condition is met, and return the exit status."""
         arguments, failure = self._arguments, ""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
@@ -274,7 +277,7 @@ class _Recorder:
         return self._summary(failure)
 
     def _take_all(self, socket: zmq.Socket[bytes]) -> str:
-        """Read messages until the end; return the reason for a failure, or an empty string."""
+        """Read messages until a stop condition is met; return any failure reason or ""."""
         arguments, ending = self._arguments, self._ending
         began = shown = last = time.monotonic()
         ending.begin()
@@ -313,7 +316,7 @@ class _Recorder:
         return count
 
     def _read_remaining(self, socket: zmq.Socket[bytes], quiet: float) -> None:
-        """Process the queued messages and those that arrive within another ``quiet`` s."""
+        """Process the queued messages and any messages that arrive within another ``quiet`` s."""
         end = time.monotonic() + _BACKLOG_TIMEOUT
         while time.monotonic() < end:
             if self._take_batch(socket) < _BATCH_SIZE:

@@ -160,8 +160,8 @@ _POLL_INTERVAL = 1e-3  # s
 class Wire:
     """Context manager for a gateway that publishes on ``address``, with access control by ``keys``.
 
-    Raises RecordingError if the address cannot be bound, or if other machines can reach it and
-    there are no keys.
+    Raises RecordingError if the address cannot be bound, or if other machines can reach it although
+    no keys are given.
     """
 
     def __init__(self, address: str, keys: Path | None = None) -> None:

@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _between(what: str, low: float, high: float) -> Callable[[str], float]:
-    """Return a parser for numbers within bounds; ``low`` itself is allowed unless it is 0."""
+    """Return a parser for numbers from ``low`` to ``high``; 0 itself is never allowed."""
     return lambda text: number(text, what, low, high, includes_low=low > 0.0)
 
 
@@ -145,7 +145,7 @@ def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, 
 def grasped(
     settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
 ) -> Cell:
-    """Grasp an object on the table, then apply its weight in the direction out of the hand.
+    """Grasp an object on the table, then pull it away from the palm with its own weight.
 
     The daemon's settings contain the object's width or diameter ``size`` [m], friction and weight
     (``mass`` [kg]), but not its shape. The daemon always assumes a block.

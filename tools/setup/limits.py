@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _values(settings: Settings, row: Limit) -> list[str]:
-    """Return the settings of a limit, each with the fraction at which the limit applies."""
+    """Return each setting of a limit, multiplied by the fraction at which the limit is reached."""
     share = "" if row.fraction == 1.0 else f"{row.fraction:g} × "
     return [f"{share}{key} = {_shown(_value(settings, key))}" for key in row.keys]
 

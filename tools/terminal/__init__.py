@@ -1,1 +1,1 @@
-"""Implement the daemon's terminal clients: `monitor`, `send` and `status`."""
+"""Implement the terminal clients `monitor`, `send` and `status`."""

@@ -59,7 +59,7 @@ def _overlaps(cells: int, pixels: int) -> FloatArray:
 
 
 def resample(grid: FloatArray, height: int, width: int) -> FloatArray:
-    """Resample ``grid`` [rows, cols] to [height, width] by averaging areas, preserving the mean."""
+    """Resample ``grid`` [rows, cols] to [height, width] by averaging areas; preserve the mean."""
     rows, cols = grid.shape
     result: FloatArray = _overlaps(rows, height) @ grid @ _overlaps(cols, width).T
     return result

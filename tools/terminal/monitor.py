@@ -144,7 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until the q key is pressed, a signal arrives, the duration is over or the daemon ends.
+    """Run until the q key is pressed, a signal arrives, the duration is over or the daemon exits.
 
     Returns 1 if no stream was received. Raises KeyFileError.
     """

@@ -269,7 +269,7 @@ class MonitorPage:
         return line.append(" µs", DIM)
 
     def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
-        """Draw the commanding client, the last reply, overlong texts, and events."""
+        """Draw the commanding client, the last reply, and events; wrap a long fault or reply."""
         who = truncated(Text(self.feed.commander(now)), 16)
         title = Text(f"events ─ {who} commands the hand" if who else "events")
         full: list[Text] = []
@@ -329,7 +329,7 @@ def _named(keys: dict[str, str]) -> Text:
 
 
 def _heights(width: int, height: int) -> tuple[int, int]:
-    """Return the numbers of lines for each map and for the events at this page size."""
+    """Return the line count of each map and the line count of the events for this page size."""
     spare = height - HEIGHT
     widest = (width - CENTRE - 2) // 4  # Each map has twice as many columns as lines.
     maps = max(MAP_LINES, min(widest, MAP_LINES + (2 * spare + 2) // 3))

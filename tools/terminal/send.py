@@ -67,7 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def si_numbers(words: list[str]) -> dict[str, float]:
-    """Parse ``key=value`` words into SI numbers. Raises ValueError with the word and the reason."""
+    """Parse ``key=value`` words into SI numbers.
+
+    Raises ValueError; the message contains the word and the reason.
+    """
     numbers = {}
     for key, text in _pairs(words):
         found = _NUMBER.fullmatch(text)

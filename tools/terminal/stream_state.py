@@ -253,7 +253,7 @@ class StreamState:
         return client if now < until else ""
 
     def grip(self) -> str:
-        """Describe the grip's goal; return an empty string without a grip."""
+        """Describe the grip's goal; return an empty string if there is no grip."""
         force, angle = self.state.goal_force, math.degrees(self.state.goal_angle)
         if not math.isfinite(force):
             return ""
@@ -276,7 +276,7 @@ class StreamState:
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
 
     def waited(self, now: float) -> float:
-        """Return the time for which a simulated hand has recently waited for a busy machine [s]."""
+        """Return the time [s] that a simulated hand has recently waited for a busy machine."""
         while self._waits and self._waits[0][0] < now - RECENT_TIME:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)

@@ -1,7 +1,7 @@
 """Control the terminal of a full-screen page: screen modes, key decoding, output, restoration.
 
-A redraw sends all changed lines in a single write operation, which is fast over ssh and avoids
-flicker.
+A redraw sends all changed lines in a single write operation, because a single write is fast over
+ssh and avoids flicker.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _KEY = re.compile(
 
 
 class TerminalGone(SoftfingerError):
-    """The terminal is not writable, or a signal has interrupted a blocked write."""
+    """Error raised if the terminal is not writable or a signal has interrupted a blocked write."""
 
 
 class KeyDecoder:

@@ -88,7 +88,11 @@ def format_value(value: float, decimals: int) -> str:
 
 
 def format_microseconds(seconds: float) -> str:
-    """Format a duration in up to 4 columns: in ms with unit, or below 10 ms in µs without unit."""
+    """Format a duration in up to 4 columns.
+
+    Durations of 10 ms or more are in ms and have a unit; shorter durations are in µs without a
+    unit.
+    """
     if not math.isfinite(seconds):
         return "—"
     return f"{1e6 * seconds:.0f}" if seconds < 9.9995e-3 else f"{1e3 * seconds:.0f}ms"

@@ -1,4 +1,4 @@
-"""Combine the page's parts into one document, for the server or with an embedded recording."""
+"""Combine the page's parts into one document, which is served or contains a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Serve the stream to Foxglove with its WebSocket protocol (foxglove/ws-protocol, version 1).
+"""Serve the stream to Foxglove via its WebSocket protocol (foxglove/ws-protocol, version 1).
 
 Channels have the same names, schemas and messages as in recordings (`tools.recordings.channels`),
 so the same layout works for both. The additional channel ``hand/scene`` contains the moving hand.
@@ -51,7 +51,7 @@ class _Client:
         self.queue: asyncio.Queue[bytes] = asyncio.Queue(_QUEUE_LENGTH)
 
     def give(self, channel: str, stamp: float, data: bytes) -> None:
-        """Queue a message if the client subscribes to its channel and the queue is not full."""
+        """Queue a message if the client has subscribed to its channel and the queue is not full."""
         if channel in self.subscribed and not self.queue.full():
             head = _HEAD.pack(1, self.subscribed[channel], int(stamp * 1e9))
             self.queue.put_nowait(head + data)

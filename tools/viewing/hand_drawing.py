@@ -44,7 +44,7 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
 
 
 class DrawnPart(NamedTuple):
-    """Part of a picture, which is empty while the part is absent."""
+    """Lines and labels of one part of a picture; the lists are empty while the part is absent."""
 
     lines: list[tuple[str, float, FloatArray]]  # colour name, width [m], points [n, 2] [m]
     texts: list[tuple[str, FloatArray, str]]  # colour name, position [2] and text of each label
@@ -120,7 +120,7 @@ def held_outline(
 
 
 def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
-    """Return the outline [m] of the object in ``hand/truth``, [n, 2]; empty without an object."""
+    """Return the outline [m] of the object in ``hand/truth``, [n, 2], or an empty array."""
     pose = read(TrueState, truth).true_object
     try:
         shape = shape_of(settings)

@@ -30,8 +30,9 @@ _TOLERANCE = 1e-6  # relative tolerance of the table for the picture
 class Landscape(NamedTuple):
     """A tip's energy, with θ on the horizontal axis and d on the vertical axis.
 
-    The colour changes in steps with the cube root of U, which is proportional to d, so the valley
-    along θ = 0 is visible at every depth. The edges between colours are lines of constant energy.
+    The colour changes in steps with the cube root of U. Because this root is proportional to d, the
+    valley along θ = 0 is visible at every depth. The edges between colours are lines of constant
+    energy.
     """
 
     # Levels of `heatmap` [HEIGHT, WIDTH]. The level `LEVELS` marks impossible contacts.

@@ -2,8 +2,8 @@
 
 A single thread serves the pages. The main thread reads the stream or plays a recording, and creates
 each picture once for all pages. A page requests the next picture after drawing the last picture, so
-a slow page skips pictures without delaying other pages. The terminal prints a token. Pages with
-this token may send commands, and each page is a separate client.
+a slow page skips pictures without delaying other pages. The command prints a token in the terminal.
+Pages with this token may send commands, and each page is a separate client.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _say = to_stderr("view")
 
 
 class _Published(NamedTuple):
-    """Picture, with additional data for the page."""
+    """Picture with additional data for the page."""
 
     scene: str
     picture: str
@@ -183,7 +183,7 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Redirect browsers with the one-time code to the page with the token; refuse others."""
+        """Redirect a browser with the one-time code to the page with the token, or refuse it."""
         if not self._code or not _has(request, "code", self._code):
             said = (
                 "Open this page with the newest address printed by softfinger view; each "
@@ -238,7 +238,7 @@ class Site:
             await page.send(answer)
 
     def _in_thread(self, text: str | bytes) -> asyncio.Future[str]:
-        """Run `_answer` in a thread that ends with the process; return its future."""
+        """Run `_answer` in a thread that ends with the process; return a future for the reply."""
         future: asyncio.Future[str] = self._loop.create_future()
 
         def give(answer: str) -> None:
@@ -252,7 +252,7 @@ class Site:
         return future
 
     def _answer(self, text: str | bytes) -> str:
-        """Send the request ``text`` to the daemon, which checks it; return a line about the result.
+        """Send the request ``text`` to the daemon for checking; return a line about the result.
 
         A command other than stop is dropped if the user's picture (time ``seen``, monotonic [s]) is
         too old.
@@ -310,7 +310,7 @@ def listen(host: str, port: int | None) -> socket.socket:
 
 
 def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
-    """Serve the page until the end. Raises SoftfingerError if nothing can be shown."""
+    """Serve the page until ``ending`` is met. Raises SoftfingerError if nothing can be shown."""
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
     if recording is not None and arguments.save is not None:

@@ -1,8 +1,8 @@
 """Convert the stream's messages to data for the web page: scene, pictures and plot rows.
 
-A picture is JSON with the lines, dots, texts and images for each panel at one time. The scene
-contains the constant parts: the layout and the energy landscape. A row contains the values of all
-plots at one time. A page receives each row once, even if it skips pictures. Colours are sent by
+A picture is a JSON text with the lines, dots, texts and images for each panel at one time. The
+scene contains the constant parts: the layout and the energy landscape. A row contains the values of
+all plots at one time. A page receives each row once, even if it skips pictures. Colours are sent by
 name, and the page defines their RGB values.
 """
 
@@ -55,7 +55,7 @@ _DEGREE = math.degrees(1.0)
 
 
 class _Plot(NamedTuple):
-    """Plot of lines versus time; ``span`` is the minimum height of its scale, in ``unit``."""
+    """Plot of several lines versus time; ``span`` is its minimum axis range, in ``unit``."""
 
     title: str
     unit: str
@@ -120,7 +120,7 @@ def _row(number: int, state: HandState) -> list[Any]:
 
 
 class Row(NamedTuple):
-    """Plot row, prepared for sending to a page; ``number`` is consecutive."""
+    """Plot row, packed for sending to a page; rows are numbered consecutively."""
 
     number: int
     text: str
@@ -255,7 +255,7 @@ class Pictures:
         self._scene_text = _packed(self._scene)
 
     def mark(self, marks: list[Any]) -> None:
-        """Show a recording's ``marks``, from `sources.marks_of`."""
+        """Show a recording's ``marks``, which `sources.marks_of` returns."""
         self._marks = self._scene["marks"] = marks
         self._scene_text = _packed(self._scene)
 
@@ -307,7 +307,7 @@ class Pictures:
         self._publish(self._scene_text, _packed(picture), [row for _, row in self._past])
 
     def _set(self) -> dict[str, float]:
-        """Return the grip's requested force [N] and angle [°], or NaN without a grip."""
+        """Return the grip's requested force [N] and angle [°], or NaN if there is no grip."""
         feed, state = self.feed, self.feed.state
         angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
         force = feed.commanded if math.isfinite(feed.commanded) else state.goal_force
@@ -324,7 +324,7 @@ class Pictures:
         return {"lines": lines, "texts": texts}
 
     def _maps(self, now: float) -> dict[str, Any]:
-        """Draw each tip's pressure frame and rim, and the footprint and centroid of its contact."""
+        """Draw each tip's pressure frame and rim, and each contact's footprint and centroid."""
         frames, tip = self.feed.frames, self._settings.tip.radius
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
@@ -396,7 +396,7 @@ class Pictures:
         return grip if "raised" in grip else ""
 
     def _facts(self, now: float) -> list[tuple[str, str]]:
-        """Return names and values for the details: loop times, frames, servos and losses."""
+        """Return names and values for the details panel: loop times, frames, servos and losses."""
         feed, state, times = self.feed, self.feed.state, self.feed.times
         fingers = [state.finger(name) for name in self._fingers]
 
@@ -447,7 +447,7 @@ def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
 
 
 def _flat(points: FloatArray) -> FloatArray:
-    """Return x and y alternately, rounded to four decimals (at most a tenth of a pixel)."""
+    """Return x and y alternately, rounded to four decimals (an error below a tenth of a pixel)."""
     return np.clip(points, -_NUMBER_MAX, _NUMBER_MAX).round(4).ravel()
 
 

@@ -34,7 +34,7 @@ _QUEUE_LENGTH = 5_000
 
 
 class ViewError(SoftfingerError):
-    """Nothing can be shown. The message gives the reason and a remedy."""
+    """Error raised if nothing can be shown. The message gives the reason and a remedy."""
 
 
 def follow(
@@ -44,7 +44,7 @@ def follow(
     ending: StopCondition,
     say: Callable[[str], None],
 ) -> None:
-    """Show the stream selected by ``arguments`` until the end. Raises ViewError."""
+    """Show the stream selected by ``arguments`` until ``ending`` is met. Raises ViewError."""
     context: zmq.Context[Any] = zmq.Context()
     try:
         if keys is not None:

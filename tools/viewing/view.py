@@ -96,7 +96,7 @@ def _rate(text: str) -> float:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show the page until the end. Raises SoftfingerError if nothing can be shown."""
+    """Show the page until a stop is requested. Raises SoftfingerError if nothing can be shown."""
     if arguments.foxglove is not None and arguments.file is not None:
         print(
             "view: --foxglove: found FILE.mcap, but only the live stream can be served; open "

@@ -10,7 +10,7 @@ from softfinger.daemon.types import Frame
 
 
 class PulseSettings(Section):
-    """Settings of the section ``[plugins.pulsing]``."""
+    """Settings in the ``[plugins.pulsing]`` section."""
 
     height: int = Field(default=3, ge=0, le=1000)  # counts
 
