@@ -32,6 +32,7 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
+_SOURCES = tuple(Path(__file__).parents[1] / name for name in ("daemon", "kinematics", "tools"))
 _CONNECT_TIMEOUT = 10.0  # time limit for connecting to the scheduler [s]
 _REDRAW_INTERVAL = 0.1  # time between two updates of a progress bar [s]
 _BAR_WIDTH = 20  # columns
@@ -108,7 +109,6 @@ class Sweep(Generic[Case, Result]):
     ) -> None:
         self._name, self._work, self._cases, self._journal = name, work, cases, journal
         self._results: dict[int, Result] = {}
-        self._digest = hashlib.sha256(pickle.dumps((work, list(cases)))).hexdigest()
 
     def run(self, processes: int | None = None, scheduler: str | None = None) -> Iterator[Result]:
         """Run the sweep and yield each result as soon as possible, in the order of the cases.
@@ -188,14 +188,16 @@ class Sweep(Generic[Case, Result]):
         """Read the journal from an interrupted sweep, or start a new journal."""
         if self._journal is None:
             return
+        digest = _digest_of(self._work, self._cases)
         if not self._journal.exists():
-            self._journal.write_text(json.dumps(self._digest) + "\n", encoding="utf-8")
+            self._journal.write_text(json.dumps(digest) + "\n", encoding="utf-8")
             return
         with open_regular(self._journal) as file:
             lines = file.read().decode("utf-8", "replace").splitlines()
-        if not lines or lines[0] != json.dumps(self._digest):
+        if not lines or lines[0] != json.dumps(digest):
             raise SweepError(
-                f"{self._journal}: belongs to another sweep; remove the file or choose another file"
+                f"{self._journal}: belongs to another sweep or to another version of softfinger; "
+                "remove the file or choose another file"
             )
         for line in lines[1:]:
             try:
@@ -203,6 +205,15 @@ class Sweep(Generic[Case, Result]):
             except ValueError:
                 break  # The last line is incomplete.
             self._results[int(k)] = result
+
+
+def _digest_of(work: object, cases: Sequence[object]) -> str:
+    """Return a digest of the sweep and of all sources, so that different code is not mixed."""
+    state = hashlib.sha256(pickle.dumps((work, list(cases))))
+    for folder in _SOURCES:
+        for file in sorted(folder.rglob("*.py")):
+            state.update(file.read_bytes())
+    return state.hexdigest()
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softfinger.tools import sweep
 from softfinger.tools.cli import main
 from softfinger.tools.sweep import Sweep, SweepError
 
@@ -18,7 +19,11 @@ CASES = list(range(12))
 EXPECTED = [random.Random(seed).random() for seed in CASES]
 
 
+drawn_cases: list[int] = []  # cases that were computed in this process
+
+
 def drawn(seed: int) -> float:
+    drawn_cases.append(seed)
     return random.Random(seed).random()
 
 
@@ -79,24 +84,23 @@ def test_an_interrupted_sweep_continues_from_its_journal(tmp_path):
     first.close()
     with journal.open("a", encoding="utf-8") as file:
         file.write("[4, 0.")  # The last line is truncated.
-    done = []
-
-    def counted(seed: int) -> float:
-        done.append(seed)
-        return drawn(seed)
-
-    again = Sweep("drawn", drawn, CASES, journal)
-    again._work = counted
-    again._digest = Sweep("drawn", drawn, CASES, journal)._digest
-    assert list(again.run(1)) == EXPECTED
-    assert done == CASES[4:]
+    drawn_cases.clear()
+    assert list(Sweep("drawn", drawn, CASES, journal).run(1)) == EXPECTED
+    assert drawn_cases == CASES[4:]
 
 
-def test_a_journal_of_another_sweep_is_refused(tmp_path):
-    journal = tmp_path / "map.toml.part"
+def test_a_journal_of_another_sweep_or_of_other_code_is_refused(tmp_path, monkeypatch):
+    journal, code = tmp_path / "map.toml.part", tmp_path / "code"
+    code.mkdir()
+    monkeypatch.setattr(sweep, "_SOURCES", (code,))
     next(Sweep("drawn", drawn, CASES, journal).run(1))
-    with pytest.raises(SweepError, match=r"map\.toml\.part: belongs to another sweep"):
+    assert list(Sweep("drawn", drawn, CASES, journal).run(1)) == EXPECTED
+    refused = r"map\.toml\.part: belongs to another sweep or to another version"
+    with pytest.raises(SweepError, match=refused):
         list(Sweep("drawn", drawn, CASES[1:], journal).run(1))
+    (code / "new.py").write_text("x = 1\n", encoding="utf-8")
+    with pytest.raises(SweepError, match=refused):
+        list(Sweep("drawn", drawn, CASES, journal).run(1))
 
 
 ENVELOPE = "envelope --shape rectangle --size 3 40 --mass 1 --friction 0.6 --keep"
