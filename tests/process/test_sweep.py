@@ -1,19 +1,23 @@
 """Test that sweeps are bit-identical in one process, a pool, and a cluster that loses a worker."""
 
 import json
+import multiprocessing
 import os
 import random
 import shlex
 import signal
+import threading
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from softfinger.tools import sweep
 from softfinger.tools.cli import main
 from softfinger.tools.sweep import Sweep, SweepError
+from tests.conftest import until
 
 CASES = list(range(12))
 EXPECTED = [random.Random(seed).random() for seed in CASES]
@@ -48,6 +52,28 @@ def test_results_do_not_depend_on_the_number_of_processes_or_a_crash(tmp_path):
     assert list(Sweep("drawn", drawn, CASES).run(1)) == EXPECTED
     assert list(Sweep("drawn", partial(dies_once, tmp_path), CASES).run(2)) == EXPECTED
     assert (tmp_path / "died").exists()
+
+
+def hangs(folder: Path, seed: int) -> float:
+    (folder / str(os.getpid())).touch()
+    threading.Event().wait()
+    return drawn(seed)
+
+
+def test_the_workers_exit_if_the_sweep_is_killed(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    process = context.Process(target=_hang, args=(tmp_path,))
+    process.start()
+    until(lambda: len(list(tmp_path.iterdir())) == 2)
+    workers = [psutil.Process(int(each.name)) for each in tmp_path.iterdir()]
+    process.kill()
+    process.join()
+    _, alive = psutil.wait_procs(workers, timeout=150.0)
+    assert not alive
+
+
+def _hang(folder: Path) -> None:
+    list(Sweep("hangs", partial(hangs, folder), CASES).run(2))
 
 
 @pytest.mark.extended
