@@ -7,7 +7,7 @@ The steps are, in order:
 3. curve: conversion from equilibrated readings to pressure,
 4. centre: position of the tip on the sensor and rotation of the sensor,
 5. modulus: modulus of the tip,
-6. relaxation: decrease of the tip force during a hold.
+6. relaxation: decrease in tip force during a hold.
 
 Each step returns its result together with the residuals.
 """
@@ -82,8 +82,8 @@ class Tare:
 def tare(frames: ArrayLike) -> Tare:
     """Determine the zero offset and noise of each cell from unloaded frames [n, rows, cols].
 
-    Raises CalibrationError if several cells vary much more than other cells, which indicates a
-    contact.
+    Raises CalibrationError if several cells vary much more than other cells, because this indicates
+    a contact.
     """
     stack = _stack(frames, "tare")
     if len(stack) < 2:
@@ -150,7 +150,7 @@ class Equilibration:
 
 
 def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
-    """Determine the gains from frames [n, rows, cols] at each of several uniform pressures.
+    """Determine the gains from frames [n, rows, cols] for each of several uniform pressures.
 
     The gain of a cell is the least-squares fit of its readings to the mean of all working cells.
     Cells with less than a fifth of the median response are considered dead. Raises CalibrationError
@@ -432,7 +432,7 @@ class Relaxation:
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
-    """Integrate ḣ = (F∞ − h)/τ from h = 0, with F∞ = ``lasting`` interpolated linearly in ``t``."""
+    """Integrate ḣ = (F∞ − h)/τ from h = 0; F∞ is ``lasting``, interpolated linearly in ``t``."""
     out = np.zeros_like(lasting)
     for k in range(1, t.size):
         step = (t[k] - t[k - 1]) / time

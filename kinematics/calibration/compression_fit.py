@@ -66,12 +66,12 @@ class Run:
 
     @property
     def depth(self) -> float:
-        """Maximum d relative to the beginning of the curve [m]."""
+        """Maximum d [m], measured from the beginning of the curve."""
         return float(self.d.max()) - self.begin
 
     @property
     def toe(self) -> float:
-        """Half width of the toe [m]."""
+        """Half-width of the toe [m]."""
         return TOE * self.depth
 
     @property
@@ -86,7 +86,7 @@ class Run:
 
 
 def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
-    """Find the loading branch of a test and the beginning of its curve.
+    """Find the loading branch of a test, and the d at which the curve begins.
 
     If there are several cycles, the last cycle that reaches the full depth is used, because rubber
     softens in its first cycles (Mullins, 1948). The branch ends as soon as d is within 0.5 % of its
@@ -150,7 +150,7 @@ def rising(d: FloatArray) -> tuple[slice, int]:
 
 
 def _turning_points(d: FloatArray, slack: float) -> list[int]:
-    """Return the indices of the first row, the last row, and reversals of ``d`` above ``slack``."""
+    """Return the indices of the first row, the last row, and ``d`` reversals above ``slack``."""
     turns, extreme, way = [0], 0, 0
     for k in range(1, d.size):
         moved = d[k] - d[extreme]
@@ -167,7 +167,10 @@ def _turning_points(d: FloatArray, slack: float) -> list[int]:
 
 
 def _begin(d: FloatArray, force: FloatArray) -> float:
-    """Return the d at which the linearised steep part of the curve extrapolates to zero force."""
+    """Return the d at which a line fitted to the steep part of the curve reaches zero force.
+
+    The line is fitted to a power of the force that is linear in d.
+    """
     zero = float(np.median(force[: max(1, force.size // 50)]))
     rise = force - zero
     most = float(rise.max())
@@ -231,7 +234,7 @@ class CompressionFit:
         return np.asarray(self.modulus * self.law.stress(strain))
 
     def force(self, run: Run, zeros: FloatArray) -> FloatArray:
-        """Return the modelled force of a run [N] for the run's row in ``zeros``."""
+        """Return the modelled force of a run [N], given the run's row in ``zeros``."""
         tables = _tables(self.tip, self.law if len(self.factors) == 1 else None)
         theta = np.full(len(run.d), run.theta)
         return np.asarray(_shapes(tables, run.d - zeros[0], theta)[0] @ self.factors + zeros[1])
@@ -243,7 +246,7 @@ def _power_law(factors: FloatArray, strain: ArrayLike, derivative: int = 0) -> F
 
 
 def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -> CompressionFit:
-    """Fit a law, and the zero offsets of d and F in each run, to runs by least squares.
+    """Fit a law to runs by least squares, together with the zero offsets of d and F in each run.
 
     Correlated residuals increase the standard deviations.
 
@@ -254,8 +257,8 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
     tip
         Fingertip with its radius and physics.
     law
-        Shape of the stress-strain law for a modulus of 1 Pa. None selects springs with σ = c_1 ε +
-        c_2 ε² + c_3 ε³, whose modulus depends on the strain.
+        Shape of the stress-strain law for a modulus of 1 Pa. None selects springs with the law σ =
+        c_1 ε + c_2 ε² + c_3 ε³, i.e. a strain-dependent modulus.
 
     Raises
     ------
@@ -320,8 +323,8 @@ def compare_laws(
     """Fit spring and solid rubber models to runs; return the fits, best first, and notes.
 
     Springs are fitted with a constant modulus, with a strain-dependent modulus and, if ``material``
-    is nonlinear, with the shape of its law. Solid rubber has the given Poisson's ratio, because
-    F(d) does not determine this ratio.
+    is nonlinear, with the shape of the material's law. The Poisson's ratio of solid rubber is not
+    fitted, because F(d) does not determine it.
     """
     springs, solid = Fingertip(radius), Fingertip(radius, "solid", poisson)
     tried: list[tuple[str, Fingertip, Material | None]] = [("springs", springs, _UNIT)]
@@ -352,7 +355,7 @@ def _end(table: ContactTable, tip: Fingertip, theta: float) -> float:
 
 
 def _tables(tip: Fingertip, law: Material | None) -> list[ContactTable]:
-    """Return the tables whose forces are combined linearly in the fit."""
+    """Return the tables whose forces the fit combines linearly."""
     if law is not None:
         return [ContactTable.build(tip, law, _TOLERANCE)]
     return [ContactTable.build(tip, Material((Fraction(1), *each)), _TOLERANCE) for each in _POWERS]
@@ -361,7 +364,7 @@ def _tables(tip: Fingertip, law: Material | None) -> list[ContactTable]:
 def _shapes(
     tables: Sequence[ContactTable], d: FloatArray, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the normal force of each power of the strain and its derivative in d, both [n, k]."""
+    """Return the normal force for each power of the strain, and its d derivative, both [n, k]."""
     touching, depth = d > 0.0, np.maximum(d, _STEP)
 
     def forces(at: FloatArray) -> FloatArray:
@@ -373,7 +376,7 @@ def _shapes(
 
 
 def _variance_inflation(left: FloatArray) -> float:
-    """Return the variance increase factor due to lag-1 correlation of the residuals ``left``."""
+    """Return the factor by which lag-1 correlation of the residuals increases the variance."""
     lag = float(left[1:] @ left[:-1]) / float(left @ left)
     lag = min(max(lag, 0.0), 0.99)
     return (1.0 + lag) / (1.0 - lag)

@@ -1,4 +1,4 @@
-"""Coulomb, viscous and break-away friction of a joint, from reciprocating motion in free air."""
+"""Fit a joint's Coulomb, viscous and break-away friction to reciprocating motion in free air."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ def fit_friction(
 
     where F is the Coulomb friction and b ≥ 0 the viscous friction. The polynomial models torques
     that do not depend on the direction of motion, i.e. weight, cables and the current offset. The
-    break-away friction is the maximum torque during a start from standstill with a slow goal.
+    break-away friction is the maximum torque during a start from standstill towards a slowly moving
+    goal.
 
     Parameters
     ----------
@@ -114,7 +115,7 @@ def fit_friction(
 
 
 def duration_error(seconds: float) -> str:
-    """Return the error message for an overlong recording of ``seconds``."""
+    """Return the error message for a recording that is too long at ``seconds``."""
     return f"found {seconds:.0f} s of data, expected at most {DURATION_MAX:g} s"
 
 
@@ -135,7 +136,7 @@ def _motion(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _throughout(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return True where the condition holds throughout the window around an instant."""
+    """Return a mask that is True if the condition holds throughout the window around an instant."""
     size = 2 * _WINDOW + 1
     return np.convolve(np.pad(holds, _WINDOW), np.ones(size), "valid") > size - 0.5
 

@@ -37,10 +37,10 @@ def forecast(
     start: float,
     ambient: float,
 ) -> NDArray[np.float64]:
-    """Predict the case temperature [°C] for each of ``squares`` [A²], spaced by _STEP.
+    """Predict the case temperature [°C] from squared currents [A²] sampled every _STEP.
 
     The model is defined in `hand.servo_heat`. Winding and case start at ``start`` [°C]. ``rise``
-    and ``time`` are factors on the model constants.
+    and ``time`` scale the model constants.
     """
     winding = case = start
     heating, inner, outer = law.heating * rise / time, law.winding_time * time, law.case_time * time

@@ -1,4 +1,4 @@
-"""Measure the latency of tactile frames, i.e. the delay of d at the tips after the joint motion."""
+"""Measure the latency of tactile frames, i.e. the delay of the measured d after joint motion."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ITERATIONS = 3  # number of iterations that alternately estimate the first cont
 
 
 class LatencyFit(NamedTuple):
-    """Frame delay in addition to the configured latency, with standard deviation [s]."""
+    """Frame delay beyond the configured latency, and its standard deviation [s]."""
 
     delay: float
     std: float
@@ -43,11 +43,11 @@ def fit_latency(
     latency: float,
     response: float = 0.0,
 ) -> LatencyFit:
-    """Fit the frame delay to the ramps k of a grip. The force rises or falls during a ramp.
+    """Fit the frame delay to the ramps k of a grip, in which the force rises or falls.
 
         d(t) = scale · closing(t − delay) + offset_k
 
-    Cells with a response time follow the closing with a first-order lag, and the footprint is wider
+    Cells with a response time show the closing with a first-order lag. The footprint appears wider
     while it grows.
 
     Parameters
@@ -55,7 +55,7 @@ def fit_latency(
     frames
         Times [s], d [m] and its noise standard deviation [m].
     joints
-        Times [s] and closing of the joints [m], from any origin.
+        Times [s] and closing of the joints [m], measured from any origin.
     errors
         Standard deviation of the closing due to the encoders [m], and relative standard deviation
         of d from the frames.

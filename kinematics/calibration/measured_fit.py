@@ -29,7 +29,7 @@ class CurvesError(SoftfingerError, ValueError):
 
 @dataclass(frozen=True)
 class PressSums:
-    """Presses at d [n] [m] and θ [n] [rad] in the finger's plane.
+    """Presses at known d [m] and θ [rad], both [n], in the finger's plane.
 
     ``frames`` contains the frames [k, rows, cols] [Pa] of each press, processed as in the daemon.
     ``pressures`` [n, rows, cols] are the mean frames, corrected for the bias of noise clipped at 0.
@@ -47,7 +47,7 @@ class PressSums:
 
 
 def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:
-    """Fit the curves of a tip of ``radius``, and its position on the ``grid``.
+    """Fit the curves of a tip of ``radius``, and the tip position on the ``grid``.
 
     Raises CurvesError.
     """
@@ -139,7 +139,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
 
 
 def _excess_error(misses: FloatArray, noise: FloatArray, smallest: float) -> float:
-    """Return the weighted standard deviation of the residuals in excess of their noise."""
+    """Return the weighted standard deviation by which the residuals exceed their noise."""
     weight = 1.0 / (noise**2 + smallest**2)
     return math.sqrt(max(float(weight @ (misses**2 - noise**2)) / float(weight.sum()), 0.0))
 

@@ -236,7 +236,7 @@ class KernelFolder:
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> KernelFolder | None:
-        """Return the locator, or None if no folder is available and kernels are not stored."""
+        """Return the locator, or None if no folder is available; kernels are then not stored."""
         return None if kernel_folder() is None else cls(function, file)
 
     def get_cache_path(self) -> str:
@@ -276,7 +276,7 @@ class _MachineCode(CompileResultCacheImpl):
 
 
 class _Files:
-    """Storage with one file per overload; replaces Numba's index and data files."""
+    """Cache storage with one file per overload, instead of Numba's index and data files."""
 
     def __init__(self, folder: OwnFolder, name: str, stamp: str) -> None:
         self._folder, self._name, self._stamp = folder, name, stamp
@@ -321,7 +321,7 @@ inner = BitcodeKernel
 
 
 def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Return ``function`` compiled by Numba, cached on disk if a folder is available."""
+    """Compile ``function`` with Numba; cache the result on disk if a folder is available."""
     dispatcher = _njit(no_cfunc_wrapper=True, pipeline_class=KernelCompiler, **options)(function)
     try:
         dispatcher._cache = KernelCache(function)

@@ -38,7 +38,7 @@ class JitDisabled(SoftfingerError):
 
 
 def _chosen_compiler() -> tuple[ModuleType, str]:
-    """Return the compiler module and the reason for using `plain`, or an empty string."""
+    """Return the compiler module, and the reason if `plain` is used (otherwise an empty string)."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         raise JitDisabled(
             "NUMBA_DISABLE_JIT is set, but the kernels must be compiled; unset this variable"
@@ -59,7 +59,7 @@ _compiler, why_plain = _chosen_compiler()
 
 
 def kernel(function: Function) -> Function:
-    """Compile ``function`` with Numba, with an on-disk cache and IEEE arithmetic.
+    """Compile ``function`` with Numba, using an on-disk cache and IEEE arithmetic.
 
     The kernel keeps the GIL. If the GIL were released, the control loop might wait a whole switch
     interval to reacquire it.

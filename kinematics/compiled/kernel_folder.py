@@ -80,7 +80,7 @@ def find_kernel_folder() -> OwnFolder:
 
 
 def keep(folder: OwnFolder, name: str, content: bytes) -> None:
-    """Store a kernel; on failure, issue a warning, and the next start recompiles the kernel."""
+    """Store a kernel. On failure, issue a warning; the next start then recompiles the kernel."""
     try:
         folder.write(name + _KERNEL, hashlib.sha256(content).digest() + content)
     except OSError as error:
@@ -88,7 +88,10 @@ def keep(folder: OwnFolder, name: str, content: bytes) -> None:
 
 
 def kept(folder: OwnFolder, name: str) -> bytes | None:
-    """Return a stored kernel, or None if it is missing or, with a warning, corrupted."""
+    """Return a stored kernel, or None if it is missing or corrupted.
+
+    A corrupted kernel causes a warning.
+    """
     try:
         return _without_checksum(folder.read(name + _KERNEL))
     except FileNotFoundError:
@@ -136,7 +139,7 @@ def is_marked(folder: OwnFolder, part: str) -> bool:
 
 
 def mark(folder: OwnFolder, part: str) -> None:
-    """Mark the kernels of ``part`` as compiled; on failure, the next start checks all of them."""
+    """Mark the kernels of ``part`` as compiled. On failure, the next start checks all kernels."""
     with contextlib.suppress(OSError):  # Another process may have pruned the folder.
         folder.write(part + _MARK, b"")
 

@@ -1,4 +1,4 @@
-"""Records with named fields that are shared between Python and kernels.
+"""Records with named fields, shared between Python and kernels.
 
 A record is declared once as a class. Python code and kernels then access the same fields.
 
@@ -38,7 +38,7 @@ _SCALARS: dict[Any, Any] = {float: np.float64, int: np.int64, bool: np.bool_}
 
 
 class Records(Protocol, Generic[Each]):
-    """Structured array of one record class, as indexed in kernels."""
+    """Type of a structured array of records, for indexing in kernels."""
 
     def __getitem__(self, index: int, /) -> Each: ...
     def __setitem__(self, index: int, record: Any, /) -> None: ...  # copies the record

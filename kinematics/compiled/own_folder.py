@@ -1,8 +1,8 @@
 """Check that only the current user can modify a folder, and write files atomically.
 
-A user who can write to a parent folder can replace the folder, even between the check and its use.
-Therefore all parent folders are checked, the folder is opened once, files are read through its
-descriptor, and the owner of each file is checked.
+A user who can write to a parent folder can replace the folder, even after the folder has been
+checked. Therefore, all parent folders are checked, the folder is opened once, files are read
+through its descriptor, and the owner of each file is checked.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ def _alone_in(group: int) -> bool:
 def check_above(path: Path) -> None:
     """Check all parent folders of ``path``.
 
-    Raises PermissionError if other users can modify one of them, or an OSError from `Path.stat`.
+    Raises PermissionError if other users can modify a parent folder, or an OSError from
+    `Path.stat`.
     """
     for folder in path.resolve().parents:
         if wrong := fault(folder, folder.stat()):

@@ -48,7 +48,7 @@ inner = InnerKernel
 
 
 def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Return ``function`` compiled by Numba, cached on disk if a folder is available."""
+    """Compile ``function`` with Numba; cache the result on disk if a folder is available."""
     folder = kernel_folder()
     # Use the descriptor of the checked folder, because the path may since have been replaced.
     place = f"/proc/self/fd/{folder.descriptor}" if folder else ""

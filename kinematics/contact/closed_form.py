@@ -144,7 +144,8 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 
     ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN input.
-    The formulas are valid up to the limit on θ. Beyond the limit, the same formulas are evaluated.
+    The formulas are valid up to the limit on θ. Beyond the limit, the function still evaluates the
+    same formulas.
     """
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)

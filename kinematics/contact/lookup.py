@@ -4,7 +4,7 @@ A spring tip's table stores the ratio of each quantity to its closed form for th
 strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, the ratios
 are exactly 1 and the table has no coefficients.
 
-In two coordinates, the ratios are analytic up to the edges of the domain: the height h = (a − d)/a,
+The ratios are analytic up to the edges of the domain in two coordinates: the height h = (a − d)/a,
 and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The coordinate y is even in θ. The value of y is 1 at θ
 = 0 and 0 at the limit on θ. The peak strain is 1 − u. The domain is divided into slabs of h, 16 per
 octave, and each slab into as many pieces of y as the tolerance requires. The domain ends at h =
@@ -51,8 +51,9 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bit pattern of the smallest numb
 def _slab(h: float) -> tuple[int, float]:
     """Return the slab index of h in (H_END, 1] and the position of h within the slab, −1 to 1.
 
-    Both results are computed from the bits of h: the exponent gives the octave, and the mantissa
-    gives the slab and the position. Each slab includes its upper end but not its lower end.
+    The index and the position are computed from the bits of h: the exponent gives the octave, and
+    the mantissa gives the slab and the position. Each slab includes its upper end but not its lower
+    end.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
     fraction = ((number << SLAB_BITS) & _FRACTION) | _ONE
@@ -141,7 +142,7 @@ def normal_at(
 
 @inner_kernel
 def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
-    """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m], for a solid tip by Hertz's theory.
+    """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m]; solid tips use Hertz's theory.
 
     ``scale`` is 2πE [Pa], where E is the modulus at zero strain.
     """

@@ -34,7 +34,7 @@ class MaterialError(SoftfingerError, ValueError):
 
 
 def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the points up to strain 1, without the origin; raise MaterialError if invalid."""
+    """Return the points up to strain 1, without the origin. Raises MaterialError if invalid."""
     x = np.asarray(strain, dtype=np.float64)
     y = np.asarray(stress, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape:
@@ -123,7 +123,7 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
-    """Fit the Bernstein coefficients of the modulus to the points, each at least _MODULUS_MIN."""
+    """Fit the modulus' Bernstein coefficients (lower bound _MODULUS_MIN) to the points."""
     matrix = _integrals(x, degree) * weights[:, None]
     smooth = np.zeros((max(degree - 1, 0), degree + 1))
     for i in range(degree - 1):

@@ -1,7 +1,7 @@
 """Reference integrals of force and energy for any material law.
 
-Contact tables are fitted to these integrals and checked against them. The springs stand on the base
-plane, and the object's face cuts the spherical cap, so
+Contact tables are fitted to the integrals in this module and checked against them. The springs
+stand on the base plane, and the object's face cuts the spherical cap, so
 
     F = ∬ σ(ε) dx dy,   U = ∬ z w(ε) dx dy,   ε = (n·P − h)/(z cos θ),   P = (x, y, z) on the cap.
 
@@ -10,11 +10,11 @@ dt dφ. The integrals give the ratio of each quantity to its closed form for a c
 The ratio is 1 plus a term that describes the material's nonlinearity, so there is no cancellation
 as d → 0.
 
-The integral over φ is exact: with ε dφ = (t − h)/(p cos θ) dχ and p = √(t² − sin² θ), ε is linear
-in cos χ, and a polynomial law needs few nodes. The integral over t is evaluated in
-y = √(t − sin θ); in this variable, the integrand is analytic except for poles at and near y = 0.
-The range is divided into pieces of at most one octave. The number of pieces grows logarithmically
-as the face approaches the rim.
+The integral over φ is exact. The substitution ε dφ = (t − h)/(p cos θ) dχ with p = √(t² − sin² θ)
+makes ε linear in cos χ, so a polynomial law needs few nodes. The integral over t is evaluated in y
+= √(t − sin θ); in this variable, the integrand is analytic except for poles at and near y = 0. The
+range is divided into pieces of at most one octave. The number of pieces grows logarithmically as
+the face approaches the rim.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def ratios(
 def integrate(
     tip: Fingertip, material: Material, d: ArrayLike, theta: ArrayLike, nodes: int | None = None
 ) -> ClosedForms:
-    """Integrate force, energy and first partials for any material, to a relative error of 1e-14.
+    """Integrate force, energy and first partials for any material, with a relative error of 1e-14.
 
     ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. The results are NaN
     outside the domain, which ends at d = a and at the limit on θ. ``nodes`` is as in

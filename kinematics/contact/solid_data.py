@@ -1,21 +1,21 @@
-"""Precomputed finite element data of a solid rubber tip: energy and base pressure.
+"""Precomputed finite element data for a solid rubber tip: energy and base pressure.
 
 The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², where
 μ = E/(2 + 2ν) and κ = E/(3 − 6ν) are the small-strain moduli. Contact is computed in the deformed
 configuration.
 
-The data file contains dimensionless polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, which
-are scaled by Young's modulus E and the radius a. The ``notes`` in the file describe the computation
-and the remaining errors. This module evaluates the polynomials for one value of ν. The energy is U
-= E a³ t⁵ g(t, sin² θ). The partials of U are the force along the face's normal, N = ∂U/∂d, and the
-moment ∂U/∂θ. With the base force F, the base pressure is
+The data file contains dimensionless polynomials in t = √(d/a), sin² θ and Poisson's ratio ν. The
+polynomials are scaled by Young's modulus E and the radius a. The ``notes`` in the file describe the
+computation and the remaining errors. This module evaluates the polynomials for one value of ν. The
+energy is U = E a³ t⁵ g(t, sin² θ). The partials of U are the force along the face's normal, N =
+∂U/∂d, and the moment ∂U/∂θ. With the base force F, the base pressure is
 
     p(r, φ) = F/a² B_0(r) + N/a² Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r).
 
 Without friction, F = N cos θ. A sticking face holds each point of the tip at the position where the
 point first touched it. The plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ
-is the derivative of the energy of straight presses with respect to the tilt. A shear force T = −N
-sin θ cos θ q_0 pulls the tip up the slope. Therefore, F = N cos θ (1 − sin² θ q_0).
+is the tilt derivative of the energy for straight presses. A shear force T = −N sin θ cos θ q_0
+pulls the tip up the slope. Therefore, F = N cos θ (1 − sin² θ q_0).
 
 A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). The shear force is
 assumed to act at height a, so its moment about the base centre is T a.
@@ -40,10 +40,10 @@ _FILE = Path(__file__).with_name("solid_tip.npz")
 
 @dataclass(frozen=True, eq=False)
 class SolidData:
-    """Data of a solid tip at one ν, for E = a = 1.
+    """Data for a solid tip at one ν, scaled to E = a = 1.
 
-    Polynomials are stored by powers of x = 2 t/``root`` − 1 and, within these, by powers of y = 2
-    sin² θ/``square`` − 1.
+    The polynomial coefficients [i, j] belong to power i of x = 2 t/``root`` − 1 and power j of y =
+    2 sin² θ/``square`` − 1.
     """
 
     root: float  # maximum t
@@ -124,6 +124,6 @@ def to_powers(count: int) -> FloatArray:
 
 
 def _slope(rising: FloatArray) -> FloatArray:
-    """Return the derivatives of polynomials stored in columns, keeping the number of powers."""
+    """Return the derivatives of polynomials stored in columns, padded to the same length."""
     factors = np.arange(1.0, len(rising))[:, None]
     return np.concatenate([rising[1:] * factors, np.zeros((1, rising.shape[1]))])

@@ -93,8 +93,8 @@ def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
 def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate `lookup.lookup`.
 
-    If |θ| is beyond the data, the energy is assumed not to depend on θ, and the partials are those
-    of this energy. The force continues to vary with cos θ.
+    If |θ| is beyond the range of the data, the energy is assumed not to depend on θ, and the
+    partials are those of this energy. The force continues to vary with cos θ.
     """
     within = abs(theta) <= table.tilt
     inside = within and d <= table.deepest

@@ -60,9 +60,9 @@ class ContactForces(NamedTuple):
 class Certificate(NamedTuple):
     """Bound on the relative error of all outputs, and the approximate location of the maximum.
 
-    The bound covers the whole domain including its edges, and rounding. The assumptions behind the
-    bound are listed in `table_build`. For softening laws, ∂F/∂θ may pass through zero. The error of
-    ∂F/∂θ is therefore relative to the larger of ∂F/∂θ and F tan θ.
+    The bound includes rounding errors and covers the whole domain including its edges. The
+    assumptions behind the bound are listed in `table_build`. For softening laws, ∂F/∂θ may pass
+    through zero. The error of ∂F/∂θ is therefore relative to the larger of ∂F/∂θ and F tan θ.
 
     Attributes
     ----------
@@ -97,7 +97,8 @@ class ContactTable:
     header
         The same record, with fields accessible by name.
     max_error
-        Bound on the relative error of all outputs. For a solid tip, this is the data error.
+        Bound on the relative error of all outputs. For a solid tip, the bound is the error of the
+        data.
 
     Notes
     -----
@@ -184,7 +185,7 @@ class ContactTable:
         Parameters
         ----------
         d, theta
-            Numbers or arrays, which broadcast. If both are numbers, the results are numbers.
+            Numbers or arrays, which broadcast. If d and theta are numbers, the results are numbers.
             Results are zero for d ≤ 0 and NaN for NaN input.
         edge
             If True, clamp points outside the domain without a RuntimeWarning. Regardless of

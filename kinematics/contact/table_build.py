@@ -3,9 +3,9 @@
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
 higher coefficients, and rounding. The bound assumes that the reference integrals have only rounding
-errors, and that the higher coefficients continue to decrease. Both assumptions about the
-coefficients hold for all supported laws, because each law is a single polynomial. Pieces are halved
-until the bound is within the tolerance.
+errors, and that the higher coefficients continue to decrease. Both assumptions hold for all
+supported laws, because each law is a single polynomial. Pieces are halved until the bound is within
+the tolerance.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Record type of contact tables, and the evaluation of their polynomials.
 
-A table consists of pieces. Each piece has five polynomials in two variables (the lanes), which are
-evaluated together. The meaning of the polynomials and of their variables depends on the tip model;
-see `lookup` and `solid_lookup`.
+A table consists of pieces. Each piece has five polynomials in two variables. These polynomials (the
+lanes) are evaluated together. The meaning of the polynomials and of their variables depends on the
+tip model; see `lookup` and `solid_lookup`.
 """
 
 from __future__ import annotations

@@ -90,7 +90,10 @@ class TipCurves:
         return np.asarray(_value(*np.broadcast_arrays(t, q), np.array(curve)))
 
     def energy(self) -> FloatArray:
-        """Return g [Pa] [i, j] of U = a³ t⁵ g, in powers of 2 t/root − 1 and 2 q/square − 1."""
+        """Return the coefficients [i, j] of g [Pa], where U = a³ t⁵ g.
+
+        g is a polynomial in 2 t/root − 1 and 2 q/square − 1.
+        """
         powers = np.arange(POWERS - FIRST)
         g = np.array(self.push)[FIRST:] * (2.0 / (5.0 + powers))[:, None] / self.radius**2
         return np.asarray(

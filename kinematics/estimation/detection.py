@@ -118,11 +118,11 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
 
 @inner_kernel
 def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
-    """Return True if the cells of a frame without contact scatter by more than their noise.
+    """Return True if the cells of a frame without contact scatter by more than the expected noise.
 
-    Only cells above a centre are used, because readings may be clipped at 0. The centre is the mean
-    reading, or 0 if more than a quarter of the cells read 0. If half of 788 cells are above the
-    centre, the standard deviation of the noise estimate is 4 %.
+    Only cells above a central reading are used, because readings may be clipped at 0. The central
+    reading is the mean, or 0 if more than a quarter of the cells read 0. If half of 788 cells are
+    above the central reading, the standard deviation of the noise estimate is 4 %.
     """
     signal = state.signal
     if not (signal.is_finite and signal.peak > signal.mean + _SUSPECT_PEAK * signal.noise):
@@ -194,7 +194,7 @@ def presses_outside(
 
 @inner_kernel
 def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
-    """Return True if the largest cell exceeds its neighbours by too much to be part of a contact.
+    """Return True if the largest reading exceeds its neighbours by too much to be a contact.
 
     A contact that is about as wide as a cell reads at most ``signal.narrow_contact_max``. In a
     wider contact, each cell reads less than twice the mean of its neighbours.

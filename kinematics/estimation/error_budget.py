@@ -17,8 +17,8 @@ x and y, the tip centre in x and y, the pitch, and the modulus or gain. ``size``
 deviation of each error. Patterns that move the tip relative to the cells are computed from pressure
 differences between neighbouring cells.
 
-R is the noise correlation as a function of the lag; it is measured by `calibrate`. The widening due
-to R depends on the footprint size and is tabulated. W² contains the fractions of a smooth error's
+R is the noise correlation as a function of the lag, as measured by `calibrate`. The widening due to
+R depends on the footprint size and is tabulated. W² contains the fractions of a smooth error's
 energy that appear as a change in d and gain, and as a tilt. The fractions are small because the
 errors of real cells are nearly as symmetric as the pressure. r_k are the residuals. For independent
 noise, the products of neighbouring residuals average to zero, whereas a misfit that is smooth over
@@ -225,7 +225,7 @@ def widen_covariance(state: EstimatorState) -> float:
 
 @fast_inner_kernel
 def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> tuple[float, float]:
-    """Return the sum [Pa²] and the number of products of neighbouring residuals in a row.
+    """Return the sum [Pa²] and the count of the products of neighbouring residuals in a row.
 
     Only cells with a modelled pressure above ``lowest`` [Pa] are included.
     """
@@ -274,10 +274,10 @@ def product(a: FloatArray, b: FloatArray, first: int, last: int) -> float:
 
 @fast_inner_kernel
 def _set_errors(state: EstimatorState, cells: Cells, first: int, last: int) -> None:
-    """Set the patterns of the common errors, as changes of the readings per unit error.
+    """Set the patterns of the common errors, as changes in the readings per unit error.
 
     The patterns are in the order of `Budget.sizes`. Differences between neighbours are not
-    available in the first and last two rows.
+    available in the first two and last two rows.
     """
     one = index(1)
     two = index(2)

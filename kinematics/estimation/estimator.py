@@ -62,8 +62,9 @@ class ContactEstimate:
     has_second_contact
         True if a second contact presses outside the footprint.
     misfit
-        True if χ² exceeds the value that noise alone reaches once in 3.5 million frames. In this
-        case, the model does not describe the contact well, or the noise is larger than specified.
+        True if χ² exceeds the value that noise alone reaches once in 3.5 million frames. A misfit
+        means that the model does not describe the contact well, or that the noise is larger than
+        specified.
     shear_x, shear_y
         Force along the face [N] of a solid tip; 0 for springs.
     cells_per_sample
@@ -81,12 +82,12 @@ class ContactEstimate:
     - The model explains at least 80 % of the frame's squared pressure.
     - There is no second contact.
     - The smooth part of the residual could change d by at most 60 % (one standard deviation). If
-      the gain is outside the range 1/2 to 2, this limit is 3 % instead, because a gain error
+      the gain is outside the range 1/2 to 2, the limit is 3 % instead, because a gain error
       together with a smooth residual indicates a different tip.
     - The standard deviation of d due to the known uncertainties is at most half of d.
 
-    The covariance includes the smooth residual, which occurs for example on a curved face, and the
-    known uncertainties.
+    The covariance includes the known uncertainties and the smooth residual, which occurs for
+    example on a curved face.
 
     Without a contact, d and the tilts are 0, the estimate is valid, and ``d_std`` is the smallest
     detectable d. A single frame does not reveal two errors: a wrong modulus if the gain is fixed,
@@ -250,7 +251,7 @@ class ContactEstimator:
     noise
         Standard deviation of a cell's noise [Pa].
     free_gain
-        If True, also estimate the gain, the ratio of measured to modelled pressure. Otherwise the
+        If True, also estimate the gain, the ratio of measured to modelled pressure. If False, the
         gain is 1. The default is True for springs and False for solid tips: the shape of a solid
         tip's frame hardly depends on d, so d can only be determined from the force.
     active
@@ -258,7 +259,7 @@ class ContactEstimator:
     readings
         Range and resolution of the readings.
     known
-        Other uncertainties of the sensor. These uncertainties, together with the material's
+        Other uncertainties of the sensor. The uncertainties, together with the material's
         ``fit_error``, widen the covariance and reduce the sensitivity of the contact detection.
 
     Attributes
@@ -441,8 +442,8 @@ class ContactEstimator:
         pascal_per_count
             Conversion factor from readings to Pa.
         seq
-            Sequence number. If this number equals the last frame's number, the last result is
-            returned.
+            Sequence number. If the sequence number equals the last frame's number, the last result
+            is returned.
 
         Returns
         -------
@@ -490,10 +491,10 @@ class ContactEstimator:
 
 
 def _with_data_errors(known: Uncertainty, tip: Fingertip, free_gain: bool) -> Uncertainty:
-    """Add the errors of a solid tip's data, from a comparison with independent finite elements.
+    """Add a solid tip's data errors, as determined by independent finite element analysis.
 
-    The pressure error is included only with a free gain. The pressure error is as symmetric as the
-    pressure itself, so it hardly affects d if the gain is known.
+    The pressure error is included only if the gain is free. The pressure error is as symmetric as
+    the pressure itself, so it hardly affects d if the gain is known.
     """
     data = solid_data(tip)
     smooth = data.pressure_error if free_gain else 0.0

@@ -60,7 +60,10 @@ SHARED_MAX = 0.5  # maximum standard deviation of d due to known uncertainties, 
 
 @inner_kernel
 def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Fit by maximum likelihood from the last estimate or, if this fails, from the frame alone."""
+    """Fit by maximum likelihood.
+
+    The fit starts from the last estimate or, if this fails, from the frame alone.
+    """
     estimate = state.estimate
     options = state.options
     signal = state.signal

@@ -327,8 +327,8 @@ def _check_fit(state: EstimatorState, cells: Cells) -> float:
 def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) -> bool:
     """Set the estimate after the fit; return False if there are too few cells.
 
-    ``fit.inverse`` times ``fit.variance`` is the covariance due to noise, and ``budget.shared``
-    times ``fit.widening`` the covariance due to other errors.
+    ``fit.inverse`` times ``fit.variance`` is the covariance due to noise. ``budget.shared`` times
+    ``fit.widening`` is the covariance due to other errors.
     """
     fit = state.fit
     estimate = state.estimate

@@ -59,7 +59,9 @@ def _curve(curve: Curve, t: float, q: float) -> tuple[float, float, float]:
 
 
 class MeasuredEstimator:
-    """Contact estimator for a tip whose ``physics`` is "measured"; each frame is independent.
+    """Contact estimator for a tip whose ``physics`` is "measured".
+
+    Each frame is processed independently of the other frames.
 
     Parameters
     ----------
@@ -70,7 +72,7 @@ class MeasuredEstimator:
     active
         Mask of working cells, bool [rows, cols]; None uses all cells.
     known
-        Sensor uncertainties: baseline and slope, and the changes of gain, centre and rotation since
+        Sensor uncertainties: baseline and slope, and the changes in gain, centre and rotation since
         the curves were measured.
 
     Raises
@@ -176,7 +178,7 @@ class MeasuredEstimator:
         return t
 
     def _contact(self, sums: FloatArray, result: ContactEstimate) -> Invalid:
-        """Set the contact from the sums; check the extent and the range of the curves."""
+        """Set the contact from the sums; check the frame extent and the range of the curves."""
         force, along, across, square = sums.tolist()
         moment = math.hypot(along, across)
         s_max = _EXTRAPOLATION_MAX * self._tilt_sine_max
@@ -223,7 +225,9 @@ class MeasuredEstimator:
         return Invalid.NONE if agrees else Invalid.MODEL_MISMATCH
 
     def _errors(self, t: float, n: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the partials of (d, n_x, n_y) with respect to the sums, and the covariance.
+        """Return the partials of (d, n_x, n_y) with respect to the sums.
+
+        The second result is the covariance of (d, n_x, n_y).
 
         The covariance includes the noise of the sums and the errors that are common to all frames.
         """

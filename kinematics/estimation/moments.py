@@ -1,7 +1,7 @@
 """Kernels for the initial contact estimate from the sum, centroid and extent of a frame.
 
 The pressure moments over the footprint are compared with the model's moments, which are tabulated
-versus d. The force or the extent determines d, and the centroid determines the tilt.
+as functions of d. The force or the extent determines d, and the centroid determines the tilt.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def _inverse(values: FloatArray, value: float) -> float:
 
 @inner_kernel
 def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Estimate the contact from the frame alone: from strong cells, then twice from moments."""
+    """Estimate the contact from a frame alone, first from strong cells, then twice from moments."""
     m = state.moments
     signal = state.signal
     guess = state.estimate.guess
@@ -145,7 +145,7 @@ def _select_inside(cells: Cells, u: float, v: float, w: float) -> None:
 
 @inner_kernel
 def _select_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Select the cells of a contact whose pressures are a few times the noise.
+    """Select the cells of a weak contact, whose pressures are only a few times the noise.
 
     Single noisy cells would distort the moments. Therefore a cell must read at least twice the
     noise and have a significant neighbourhood.
@@ -205,7 +205,7 @@ def _set_contact(state: EstimatorState) -> None:
     """Set the guess from the moments.
 
     If a spring tip's gain is free, the extent determines d and the force determines the gain.
-    Otherwise the force determines d.
+    Otherwise, the force determines d.
     """
     m = state.moments
     guess = state.estimate.guess

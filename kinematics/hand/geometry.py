@@ -4,7 +4,7 @@ The origin of the hand plane is midway between the pivots. x points from the lef
 pivot, and y points away from the palm. The pivots are at (∓B, 0), and positive joint angles q close
 the fingers. The tip centres are
 
-    O1 = (−B + L sin q1 + e cos q1,  L cos q1 − e sin q1)       O2 mirrors it
+    O1 = (−B + L sin q1 + e cos q1,  L cos q1 − e sin q1)       O2 is its mirror image
 
 where L is the finger length and e the finger offset (towards the object at q = 0). The object has
 centre G, width W and angle φ; n = (cos φ, sin φ) points from its left face to its right face, and
@@ -111,7 +111,10 @@ class HandGeometry:
 
 
 def vector(values: ArrayLike, length: int, name: str) -> FloatArray:
-    """Return ``values`` as float64 (length,). Raises ValueError for a different shape."""
+    """Return ``values`` as a float64 vector.
+
+    Raises ValueError unless the vector has this ``length``.
+    """
     out = np.asarray(values, dtype=np.float64)
     if out.shape != (length,):
         raise ValueError(f"{name} must have shape ({length},), got {out.shape}")

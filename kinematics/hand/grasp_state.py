@@ -59,9 +59,9 @@ def held_motion(
     2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m], and
     ``width`` is W cos(α/2), the distance between the contacts along n.
 
-    In turn_i, W is limited to at least half the tip radius. Without this limit, the prediction
-    would diverge for thinner objects, whose inertia and the tips' shear compliance make them rotate
-    more slowly than in ideal rolling.
+    In turn_i, W is limited to at least half the tip radius. Without the limit on W, the prediction
+    would diverge for thinner objects. In reality, inertia and the tips' shear compliance make thin
+    objects rotate more slowly than in ideal rolling.
     """
     q1, q2 = q
     d1, d2 = d
@@ -179,7 +179,7 @@ def _unexplained(
     arm: float,
     moment_arm: float,
 ) -> tuple[float, float, float]:
-    """Return the residual torque [N·m] of one finger, and its coefficients of −T and −T².
+    """Return the residual torque [N·m] of one finger, and its coefficients for −T and −T².
 
     The residual is the joint torque, signed by ``side``, minus the contributions of N, ∂U/∂θ and T.
     """
@@ -236,7 +236,7 @@ def load_torques(
     W turn_i.
 
     δ_i is the residual of τ_i at L = 0. For a load, (δ1 + δ2)/2 = moment_arm L + curvature L² holds
-    exactly. The function returns (δ1, δ2, moment_arm, curvature). All four results are zero if a
+    exactly. The function returns (δ1, δ2, moment_arm, curvature). The function returns zeros if a
     tip is not in contact or if a load would not change the torques.
     """
     d1, d2 = d

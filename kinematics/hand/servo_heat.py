@@ -59,7 +59,7 @@ class HeatState(Record):
 
 @kernel
 def follow(states: Records[HeatState], square: float, dt: float, reading: float) -> None:
-    """Predict over ``dt`` [s] with the mean squared current [A²], then use a ``reading`` [°C]."""
+    """Predict over ``dt`` [s] with mean squared current [A²], then update with ``reading`` [°C]."""
     s = states[0]
     if not s.known:
         s.known = True
@@ -145,8 +145,8 @@ def winding_std(states: Records[HeatState]) -> float:
 def time_to_limit(states: Records[HeatState], square: float, limit: float) -> float:
     """Return the time [s] until the case reaches ``limit`` [°C] at a mean squared current [A²].
 
-    The result is at most TIME_MAX. Implicit integration of the winding temperature allows growing
-    time steps.
+    The result is at most TIME_MAX. The winding temperature is integrated implicitly, so the time
+    steps may grow.
     """
     s = states[0]
     law = s.law

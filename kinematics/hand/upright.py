@@ -5,7 +5,7 @@ The small antisymmetric motions are the object's angle φ and the antisymmetric 
 q2)/2. These antisymmetric motions change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual
 spring k between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by
 kδ. For a normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ
-+ σ, where c is 2/3 for the spring model of the paper. With b = k/(N B) and pivots 2B apart,
++ σ, where c is 2/3 for the paper's spring model. With b = k/(N B) and pivots 2B apart,
 
     T = N (φ − bδ)                                       the forces of both fingers are collinear
     W T = N ((W + 2(a − d))φ − 2ℓδ) + 2 ∂U/∂θ            moment balance of the object
@@ -17,9 +17,9 @@ q, so the result does not depend on the path. For an object whose angle is φ0 a
     φ/φ0 = W D/(W D − 4 (a − d + cd) M)
     D = 2ℓ + (1 − 2c)d − b(W − d)        M = a − d + ℓ + (1 + b)d/2
 
-which vanishes for D = 0. The spring b = (2ℓ + (1 − 2c)d)/(W − d) therefore keeps the object upright
-for any φ0. The model neglects all friction except at the tips. It also neglects the tip tilt q
-relative to the faces, which is a second-order effect.
+The angle φ vanishes for D = 0. The spring b = (2ℓ + (1 − 2c)d)/(W − d) therefore keeps the object
+upright for any φ0. The model neglects all friction except at the tips. The model also neglects the
+tip tilt q relative to the faces, which is a second-order effect.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def cell_means(points: FloatArray, along: FloatArray, across: FloatArray) -> Flo
     """Return the means [rows, cols] of cells over ``points`` [lines, points per line].
 
     The weights along y, the weights ``across`` along x, and the order of the points are those of
-    :func:`axis_points`. All points of a cell are in sequence.
+    :func:`axis_points`. The points of a cell are consecutive.
     """
     for weights in (across, along):
         count, reach = weights.shape
@@ -57,8 +57,8 @@ def stencil(width: float) -> FloatArray:
     """Return the blur weights [2 n + 1] over neighbouring points, for a ``width`` w in points.
 
     The weights are samples of the Gaussian (trapezoid rule); their error decreases as exp(−2π² w²).
-    For widths below 0.75 points, five weights match the Gaussian's moments up to the fifth, so they
-    are exact for polynomials up to degree five. Without blur, the only weight is 1.
+    For widths below 0.75 points, five weights match the Gaussian's moments up to the fifth, so the
+    weights are exact for polynomials up to degree five. Without blur, the only weight is 1.
     """
     if width == 0.0:
         return np.ones(1)

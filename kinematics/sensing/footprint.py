@@ -1,8 +1,8 @@
 """Kernels for the outline of the footprint on a grid of cells.
 
-The forward model and the estimator share this geometry. Lengths are in m, in sensor axes, relative
-to the tip centre. The object's face is the plane ``n·(x, y, z) = h`` with ``h = a − d``. Above the
-base point (x, y), the height of the face is ``z = u − v x − w y``, where
+The forward model and the estimator share the geometry in this module. Lengths are in m, in sensor
+axes, relative to the tip centre. The object's face is the plane ``n·(x, y, z) = h`` with ``h = a −
+d``. Above the base point (x, y), the height of the face is ``z = u − v x − w y``, where
 
     u = h/n_z,  v = n_x/n_z,  w = n_y/n_z,
 

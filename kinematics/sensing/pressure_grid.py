@@ -117,9 +117,9 @@ class SensorGrid:
         """Return the pressure [Pa] of a contact, averaged over each cell.
 
         For a spring tip, the error is at most 1e-5 of the modulus, even in cells at the outline.
-        The error is 1e-4 for tilts above 30° and 1e-3 where the outline almost reaches the rim. For
-        a solid tip, the accuracy equals that of `solid_data`, and contacts outside the range of its
-        data are clamped.
+        The error increases to 1e-4 for tilts above 30°, and to 1e-3 where the outline almost
+        reaches the rim. For a solid tip, the accuracy equals that of `solid_data`, and contacts
+        outside the range of its data are clamped.
 
         Parameters
         ----------

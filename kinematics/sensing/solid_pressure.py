@@ -53,7 +53,7 @@ class Weights(Record):
 
 
 def weights_of(tip: Fingertip, material: Material) -> Weights:
-    """Return the modes of a solid tip; no contact is set yet.
+    """Create the weights of a solid tip; the contact is not set yet.
 
     Raises MaterialError unless the material is linear.
     """
@@ -172,8 +172,8 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
 def own_shear(weights: Weights, d: float, square: float) -> float:
     """Return the shear force of straight indentation on a sticking face, divided by a² sin θ [Pa].
 
-    This shear acts at height a and is already included in the modes. ``weights`` must be set for
-    this contact.
+    The shear force acts at height a and is already included in the modes. ``weights`` must be set
+    for this contact.
     """
     q = weights.q[0]
     normal = weights.values[0, 0] / (1.0 - square * q)
@@ -286,7 +286,7 @@ def pixels_of(images: FloatArray) -> FloatArray:
 
 
 class SolidPressure:
-    """Pressure of one solid tip on the cells of the ``basis`` images."""
+    """Pressure model of one solid tip for the cells of the ``basis`` images."""
 
     def __init__(self, tip: Fingertip, material: Material, basis: FloatArray) -> None:
         self._weights = weights_of(tip, material).array

@@ -149,7 +149,8 @@ def _raise_power(line: FloatArray, first: int, last: int, coefficient: float) ->
 def _sum_points(points: SpringPoints, first: int, last: int, ahead: int, weight: float) -> None:
     """Add the points at the index offset ``ahead`` to the sums of cells ``first`` to ``last``.
 
-    The three sums are the stress, its partial in −u, and this partial times x.
+    The three sums are the stress, its partial with respect to −u, and the product of this partial
+    and x.
     """
     line = points.line
     for k in range(first, last):
@@ -163,7 +164,7 @@ def _sum_points(points: SpringPoints, first: int, last: int, ahead: int, weight:
 def _press_line(
     points: SpringPoints, i: int, first: int, last: int, face: Face, a2: float, half: Span
 ) -> Cells:
-    """Evaluate one line of points over cells ``first`` to ``last`` and sum it for each cell.
+    """Evaluate a line of points over cells ``first`` to ``last``; add up the points of each cell.
 
     Returns the range of affected cells.
     """
@@ -225,7 +226,7 @@ def press_springs(
 ) -> Cells:
     """Compute the pressure and its partials [PLANES, rows, cols]; return the range of changed rows.
 
-    Other rows are left unchanged. ``around`` is scratch memory.
+    The remaining rows are left unchanged. ``around`` is scratch memory.
     """
     a = grid.radius
     count_x = points.across.shape[0]
