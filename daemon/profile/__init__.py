@@ -1,4 +1,4 @@
-"""Load profiles: validated settings from TOML files, and the models that the settings describe.
+"""Load validated settings from TOML profiles, and create the models that the settings describe.
 
 This package never communicates with the hand.
 """

@@ -16,7 +16,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 
 def make_tip(settings: Settings) -> Fingertip:
-    """Create the fingertip model. Raises SettingsError for a measured tip, which has none."""
+    """Create the fingertip model. Raises SettingsError for a measured tip, which has no model."""
     tip = settings.tip
     if tip.physics == "measured":
         raise SettingsError('tip.physics: found "measured", expected "springs" or "solid"')
@@ -24,7 +24,7 @@ def make_tip(settings: Settings) -> Fingertip:
 
 
 def law_problem(material: Material, limit: float) -> str:
-    """Describe the law's fit error if it exceeds ``limit`` (relative to F), otherwise return ""."""
+    """Describe the law's fit error if it exceeds ``limit`` relative to F; otherwise, return ""."""
     found = material.worst_force_error
     if found <= limit:
         return ""
@@ -36,7 +36,7 @@ def law_problem(material: Material, limit: float) -> str:
 
 
 def make_material(law: MaterialSettings) -> Material:
-    """Create the stress-strain law. Raises SettingsError if its points are unusable."""
+    """Create the stress-strain law. Raises SettingsError if the law's points are unusable."""
     if law.law == "constant":
         return Material.constant(law.modulus)
     if law.law == "table_i":
@@ -66,7 +66,7 @@ def make_table(
 
 @lru_cache(maxsize=8)
 def _built(tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
-    """Build a contact table, which takes 0.16 s. All hands in one process share the table."""
+    """Build a contact table in about 0.16 s. All hands in one process share the table."""
     return ContactTable.build(tip, material, tolerance)
 
 

@@ -36,10 +36,10 @@ Processor = Annotated[int, Field(ge=0, le=1023)]
 
 
 def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
-    """Declare a key in a section.
+    """Declare one setting in a section class.
 
-    The profile reference, the documentation and the JSON schema are generated from these
-    declarations.
+    The profile reference, the documentation and the JSON schema are generated from all declared
+    settings.
 
     Parameters
     ----------

@@ -70,9 +70,9 @@ def load(
 
     Parameters
     ----------
-    path : file, or one of `names`; None for the built-in simulated hand
-    directory : replacement for ``{dir}`` in the ports
-    changes : settings such as ``loop.rate=1000``, which override the file
+    path : file, or one of `names`; None for the built-in simulated hand directory : replacement for
+    ``{dir}`` in the port names changes : settings such as ``loop.rate=1000``, which override the
+    file
 
     Raises
     ------
@@ -87,7 +87,7 @@ def examine(
 ) -> ExaminedProfile:
     """Read a profile and find all of its errors. Raises SettingsError if the profile can't be read.
 
-    See `load` for the arguments.
+    The arguments are the same as for `load`.
     """
     name = str(path) if path else "built-in settings"
     data = _read(find(path), name) if path else {}
@@ -96,7 +96,7 @@ def examine(
 
 
 def checked(data: dict[str, Any]) -> Settings:
-    """Validate the sections ``data``. Raises SettingsError as `load`."""
+    """Validate the sections in ``data``. Raises SettingsError like `load`."""
     return _without_errors(_examined(data, "settings"))
 
 
@@ -173,8 +173,8 @@ def find(path: Path) -> Path:
 def profile_text(path: Path) -> str:
     """Return a profile's text.
 
-    Raises OSError like `read_file`, UnicodeDecodeError, and RecursionError if a key has too many
-    parts.
+    Raises OSError like `read_file`, UnicodeDecodeError if the file is not UTF-8, and RecursionError
+    if a key has too many parts.
     """
     text = read_file(path, _FILE_SIZE_MAX).decode("utf-8-sig")
     if _DEEP_KEY.search(text):
@@ -304,7 +304,7 @@ def _is_length(location: list[str]) -> bool:
 
 
 def _model(location: list[str], model: Any = Settings) -> Any:
-    """Return the section at this path within ``model``."""
+    """Return the section class at the path ``location`` within ``model``."""
     for part in location:
         model = model.model_fields[part].annotation
         assert issubclass(model, BaseModel)

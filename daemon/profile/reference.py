@@ -55,7 +55,7 @@ class _WithoutTitles(GenerateJsonSchema):
 
 
 def schema_text() -> str:
-    """Return the JSON schema for profiles in a single line, because only programs read it."""
+    """Return the JSON schema for profiles on a single line, because it is read only by programs."""
     schema = {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "softfinger profile",

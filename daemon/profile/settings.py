@@ -1,8 +1,8 @@
 """Define the profile sections, with defaults, bounds, units and meanings.
 
 The defaults describe the built-in simulated hand. `profile.load` reads and validates a file.
-`profile.reference` generates ``config/sim.toml`` and the JSON schema from these declarations. All
-pairs are in the order (left, right).
+`profile.reference` generates ``config/sim.toml`` and the JSON schema from the declarations in this
+module. All pairs are in the order (left, right).
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ class TipSettings(Section):
         "frictionless", "", "Contact between a solid tip and the object: sticking or frictionless."
     )
     relaxation: tuple[Fraction, Fraction, Fraction] = setting(
-        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms, as fractions of the final stiffness "
-        "of the tip."
+        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms, as fractions of the tip's final "
+        "stiffness."
     )  # fmt: skip
     relaxation_times: tuple[Positive, Positive, Positive] = setting(
         (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "
@@ -125,7 +125,7 @@ class MaterialSettings(Section):
 
 
 class TableSettings(Section):
-    """The contact table, a lookup of force, energy and their partial derivatives."""
+    """The contact table, a lookup table of force, energy and their partial derivatives."""
 
     tolerance: float = setting(
         1e-9, "", "Maximum relative error of the table lookup.", ge=1e-9, le=1e-2
@@ -440,7 +440,7 @@ class ControlSettings(Section):
     dither_frequency: float = setting(
         5.0, "Hz", "Dither frequency; lower frequencies would make the grip swing.", ge=3, le=50
     )
-    dither_time: Delay = setting(2.0, "s", "Time constant with which the dither decays.")
+    dither_time: Delay = setting(2.0, "s", "Time constant of the dither decay.")
     joint_inertia: Factor = setting(
         0.010, "kg·m²", "Inertia of the finger and the rotor, used to compute the damping."
     )

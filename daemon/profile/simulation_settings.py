@@ -120,14 +120,14 @@ class SimulationSettings(Section):
     tip_creep_time: NonNegative = setting(
         0.0,
         "s",
-        "Time constant with which the shear of a sticking tip relaxes; 0 disables relaxation.",
+        "Time constant of the shear relaxation of a sticking tip; 0 disables relaxation.",
     )
     tip_micro_slip: bool = setting(
         False, "", "Let the footprint slip at its edge first, and then at its centre."
     )
     tip_relaxation: tuple[Fraction, Fraction, Fraction] = setting(
         (0.0, 0.0, 0.0), "",
-            "Amplitudes of three Prony terms, as fractions of the final stiffness of the tip; "
+            "Amplitudes of three Prony terms, as fractions of the tip's final stiffness; "
             "0 makes the tip elastic."
     )  # fmt: skip
     tip_relaxation_times: tuple[Positive, Positive, Positive] = setting(
@@ -144,14 +144,14 @@ class SimulationSettings(Section):
     )
     joint_load_friction: tuple[Fraction, Fraction] = setting(
         (0.0, 0.0), "",
-            "Gear friction as a fraction of the transmitted torque, and the increase of this "
+            "Gear friction as a fraction of the transmitted torque, and the increase in this "
             "fraction at standstill."
     )  # fmt: skip
     joint_stribeck_speed: Positive = setting(
         0.12, "rad/s", "Joint speed at which the additional friction has fallen to 1/e."
     )
     joint_presliding: Positive = setting(
-        0.0005, "rad", "Elastic deflection of the gears before they start to move."
+        0.0005, "rad", "Elastic deflection of the gears before the gears start to move."
     )
     servo_heat: tuple[Factor, Factor, Factor] = setting(
         (1.0, 1.0, 1.0), "", "Factors for the servos' heating, cooling and heat capacity."

@@ -126,7 +126,7 @@ def _set_forces(settings: Settings) -> list[tuple[str, float]]:
 
 
 def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
-    """Yield key, force [N] and displacement [m] of an upright spring tip at the set forces.
+    """Yield key, force [N] and displacement [m] of an upright spring tip at the configured forces.
 
     The force is computed as in `Material.force_error`, by summing over strain steps.
     """
@@ -251,7 +251,7 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
 
 
 def _missing(settings: Settings, key: str, expected: str) -> Iterator[str]:
-    """Check a tactile setting, a string that must be given for each finger in the scene."""
+    """Check a tactile setting for which a string must be given for each finger in the scene."""
     for name in settings.scene.fingers:
         if not getattr(settings.tactile, key)[FINGERS.index(name)]:
             yield f'tactile.{key}: found "" for {name}, expected {expected}'
