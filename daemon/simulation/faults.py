@@ -72,7 +72,7 @@ class FaultSource:
         return bool(damage or rates.delay)
 
     def loses(self, reads: bool) -> bool:
-        """Return True if the next instruction is lost; set ``reads`` for a read instruction."""
+        """Return True if the next instruction is lost; ``reads`` is True for a read instruction."""
         rates = self.rates
         if rates.lose and self._random.random() < rates.lose:
             return True
@@ -186,7 +186,7 @@ _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?
 
 
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
-    """Parse fault words; return the faults sorted by time, then in the given order.
+    """Parse fault words; return the faults in order of time; simultaneous faults keep their order.
 
     - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated`` and ``zero`` affect
       both boards, or one board if prefixed with ``left:`` or ``right:``; see :class:`TactileBoard`.

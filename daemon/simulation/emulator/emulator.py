@@ -134,7 +134,7 @@ class EmulatedServos:
 
 
 class Emulator:
-    """Emulated hand on ptys, which are linked in ``folder``; :meth:`run` serves the ptys.
+    """Emulated hand on ptys that are linked in ``folder``; :meth:`run` serves the ptys.
 
     A finger that is not in the scene has no board. The ``none`` backend has no port.
     """
@@ -380,8 +380,8 @@ class Emulator:
         """Turn joints as if by hand: ``left=closed`` (to its stop), ``open`` or ``zero``.
 
         The joints are held until a client writes to the servos. The reply is ``error: `` and a
-        reason, or JSON that contains the remaining time, as in :meth:`press`. Without words, no
-        joint is turned.
+        reason, or JSON that contains the remaining time, as in :meth:`press`. If no words are
+        given, no joint is turned.
         """
         now = self.clock.now()
         turns = [word.partition("=") for word in words]
@@ -402,7 +402,7 @@ class Emulator:
         return json.dumps({"wait": max(0.0, self._turned - now)})
 
     def _answer(self, text: str) -> str:
-        """Handle a :meth:`request`; apply faults that begin now before the reply is sent."""
+        """Handle a :meth:`request`; before replying, apply the faults that are already due."""
         reply = self.request(text)
         self._advance(self.clock.now())
         return reply
@@ -439,7 +439,7 @@ class Emulator:
 
 
 def with_board(settings: Settings) -> Settings:
-    """Return ``settings``, with the default board if the tactile backend has no framing."""
+    """Return ``settings``, but with the default board if the tactile backend has no framing."""
     if settings.tactile.backend in (*ENCODERS, "none"):
         return settings
     tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})

@@ -1,4 +1,4 @@
-"""Manage an emulator's folder with links to its ports and a control socket.
+"""Manage an emulator's folder, which contains links to the ports and a control socket.
 
 Only one emulator may use a folder at a time. The socket replies to each text message with one line.
 The emulator's event loop serves the socket; `send_words` is the client.
@@ -244,5 +244,8 @@ def _directory(folder: Path) -> Iterator[int]:
 
 
 def _address(folder: int) -> str:
-    """Return a socket address with the folder's descriptor, because socket paths must be short."""
+    """Return a short socket address based on the folder's descriptor.
+
+    The length of socket paths is limited.
+    """
     return f"/proc/self/fd/{folder}/{_CONTROL}"

@@ -74,8 +74,8 @@ def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, lis
 
     Each press has either a depth (0 lifts off), a force or a pressure (uniform, like a bladder).
     The optional words are tilt, speed, hold and tip. The tip is left, right or both (default). If
-    ``hold`` is not given, the last press is held and every earlier press lasts one second. Forces
-    are ``scale`` times the ``table`` forces. Raises PlateError.
+    ``hold`` is not given, the last press is held indefinitely, and every earlier press lasts one
+    second. Forces are ``scale`` times the ``table`` forces. Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
     each = [part.split() for part in text.split(",")]

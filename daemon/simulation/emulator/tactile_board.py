@@ -1,7 +1,7 @@
 """Emulate a tactile board that sends the frames of the simulated sensor on a pty.
 
-The encoders (`ENCODERS`) are pure functions that convert counts to a board's framing. Board faults
-are also applied here.
+The encoders (`ENCODERS`) are pure functions that convert counts to a board's framing. This module
+also applies board faults.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class FrameSource(Protocol):
 
 
 class FrameWriter:
-    """Board side of a pty. Frames are sent completely or not at all.
+    """Board end of a pty. Frames are sent completely or not at all.
 
     A pty buffers tens of kilobytes. If there is no reader, frames are dropped early so that the
     next client does not receive old frames. A real board whose port is closed behaves in the same
@@ -104,7 +104,7 @@ class TactileBoard:
     - ``wrong-size``: the grid has half as many rows and columns.
     - ``saturated``, ``zero``: all cells read the maximum count, or 0.
 
-    The last five faults ignore the probability and affect every frame.
+    All faults except ``torn`` and ``noisy`` ignore the probability and affect every frame.
     """
 
     def __init__(
@@ -241,8 +241,8 @@ def encode_glove(
 ) -> bytes:
     """Encode a frame for a glove-style board: number + 11, count halves + 11, and a newline.
 
-    Each count is split into a high half and a low half. Each half has ``values`` possible values:
-    32, or 64 with a 12-bit converter. Counts that are too large saturate.
+    Each count is split into a high half and a low half. Each half can take ``values`` different
+    values: 32, or 64 with a 12-bit converter. Counts that are too large saturate.
     """
     counts = np.minimum(counts, values * values - 1)
     halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)

@@ -4,8 +4,8 @@ With smooth forces, the integration error is small, and shorter steps reduce it.
 smooth (for example, when a light object hits the stiff rim of the backing plate) or a step is too
 long, the energy could increase by more than the work of the motors and loads. The guard removes any
 excess energy from the kinetic energy. If the kinetic energy is smaller than the excess, the motion
-stops at an earlier point of the step. Without damping, the energy should be constant. In smooth
-steps, the guard then tolerates the small energy drift of the integration method.
+stops at an earlier point in the step. Without damping, the energy should stay constant. In smooth
+steps, the guard tolerates the small energy drift of the integration method.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def open_guard(plant: Plant) -> None:
 
 @inner_kernel
 def work_done(plant: Plant) -> float:
-    """Return an upper bound for the work of motors and loads since the previous state [J]."""
+    """Return an upper bound for the work [J] done by motors and loads since the previous state."""
     before, now = plant.last_state, plant.state
     work = 0.0
     for j in range(5):
@@ -94,7 +94,7 @@ def work_done(plant: Plant) -> float:
 
 @inner_kernel
 def guard_step(plant: Plant, was_on_rim: bool) -> int:
-    """Remove a step's excess energy from its velocities.
+    """Remove a step's excess energy by reducing the velocities.
 
     After a change, the caller must evaluate the state again and call :func:`allow_changed_energy`.
 

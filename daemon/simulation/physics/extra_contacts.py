@@ -1,19 +1,19 @@
 """Evaluate contacts that occur only in some scenes: object to palm, and tip to tip.
 
-The rows of these contacts are added to the step matrix (`solver`).
+The rows of the palm and tip-to-tip contacts are added to the step matrix (`solver`).
 
 The palm is a plane parallel to the x axis. Each corner of the object, or the lowest point of a
-disc, has two springs. The first spring pushes a corner that is below the palm up. Its viscous
-damping never pulls. The second spring acts along the palm and models Coulomb friction: it sticks
-until its force would exceed the friction coefficient times the normal force, and then slips.
-Therefore, a resting object does not creep.
+disc, has two springs. The first spring pushes up a corner that is below the palm. The viscous
+damping of the first spring never pulls the corner down. The second spring acts along the palm and
+models Coulomb friction: it sticks until its force would exceed the friction coefficient times the
+normal force, and then slips. Therefore, a resting object does not creep.
 
 Two equal hemispheres meet on the plane midway between their centres. Each tip is compressed by d =
 a − D/2, as if by a rigid plane, where D is the distance between the centres. The total energy of
 both tips is U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With
-different tilts, a real contact surface would bulge towards the softer tip, so this energy is
-slightly too high (second order in the difference of cos² θ). The plane sticks equally to both tips:
-the shear rate of each tip is half of the relative sliding velocity of the two surfaces, minus the
+different tilts, a real contact surface would bulge towards the softer tip, so the modelled energy
+is slightly too high (second order in the difference of cos² θ). The plane sticks equally to both
+tips: each tip's shear rate is half the relative sliding velocity of the two surfaces, minus the
 tip's tan θ ḋ.
 """
 
@@ -66,7 +66,7 @@ def palm_is_far(plant: Plant, now: Motion) -> bool:
 def touch_palm(
     plant: Plant, now: Motion, stage: Stage, nx: float, ny: float, is_first: bool
 ) -> None:
-    """Add the forces of the palm on the object; (nx, ny) is the normal n of the object's faces.
+    """Add the forces that the palm exerts on the object; (nx, ny) is the object's face normal n.
 
     In the first stage, this function also applies the friction limit to the shears and sets the
     rows of the full matrix.

@@ -26,7 +26,7 @@ from softfinger.kinematics.contact.table_record import Table
 
 @inner_kernel
 def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
-    """Return a servo's motor current command [A] after all of the servo's limits.
+    """Return a servo's motor current command [A] after applying all of the servo's limits.
 
     The voltage limit decreases linearly from the stall current at standstill to 0 at no-load speed.
     The PWM limit scales the supply voltage.
@@ -52,7 +52,7 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 
 @inner_kernel
 def set_motor_slopes(plant: Plant, g: float) -> None:
-    """Set the motor torque derivatives (angle and velocity), divided by (τ + g).
+    """Set the motor torque derivatives with respect to angle and velocity, divided by (τ + g).
 
     The derivatives are 0 unless the motors are stiff at the step size ``g``. The derivatives are
     upper bounds, because the current may enter or leave its limits within the step.
@@ -76,7 +76,7 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def joint_stiffness(plant: Plant, joint: int) -> float:
-    """Return the total stiffness of a joint's bristles and any end stop within reach [N·m/rad]."""
+    """Return the total stiffness [N·m/rad] of a joint's bristles and any end stop within reach."""
     p = plant.parameters
     stiffness: float = plant.gears[joint].stiffness
     q = plant.state.position[joint]
@@ -159,7 +159,7 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
 
 @inner_kernel
 def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
-    """Return the torque [N·m] due to a joint's friction and end stops, and set its drag."""
+    """Return the torque [N·m] due to a joint's friction and end stops; set the joint's drag."""
     p = plant.parameters
     q = now.position[finger]
     torque = -bend_bristles(plant, finger, now, is_first)

@@ -1,4 +1,4 @@
-"""Compute the contact geometry of the object outline with the tip and the backing plate rim.
+"""Compute the contact geometry between the object outline and a tip or its backing plate rim.
 
 The object is a rigid convex polygon or a disc.
 """
@@ -87,8 +87,8 @@ def rim_on_plane(p: Parameters, tip: TipContact) -> float:
 def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
     """Evaluate the rim on a disc like :func:`rim_on_plane`, but with one spring for the chord.
 
-    ``away`` is the distance between the disc centre and the tip centre. The depth, which is the
-    disc radius minus the distance of the disc centre from the chord, is a smooth function.
+    ``away`` is the distance between the disc centre and the tip centre. The depth is a smooth
+    function: the disc radius minus the distance between disc centre and chord.
     """
     across = away * tip.sine
     up = away * tip.cosine

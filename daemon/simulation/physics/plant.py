@@ -8,9 +8,9 @@ A two-stage Rosenbrock method (ROS2, γ = 1 − 1/√2) with fixed sub-steps adv
 The method is of second order for any matrix A, and L-stable if A is the Jacobian. Here, A contains
 the stiff parts: normal, rotational and shear stiffness of the contacts with their damping, end
 stops, gear bristles, the secant of table friction, motor lag and servo loops. Only the five
-accelerations are coupled, so a step costs two tip evaluations and one 5 × 5 factorisation. To model
-Coulomb slip, shears and bristles are limited at the start of each step. Finally, the energy guard
-checks the step.
+accelerations are coupled, so a step requires only two evaluations of the tips and one 5 × 5
+factorisation. To model Coulomb slip, shears and bristles are limited at the start of each step.
+Finally, the energy guard checks the step.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ def sensed_contact_of(plant: Plant, finger: int) -> TipContact:
 
 @inner_kernel
 def take_sample(plant: Plant, ring: Records[Sample]) -> None:
-    """Write the due sample to ``ring``, interpolated between the last and the current contact."""
+    """Write the due sample to ``ring``, interpolated between the previous and present contacts."""
     p = plant.parameters
     due = plant.sample_count * p.sample_period
     back = min((plant.step_count * p.step - due) / p.step, 1.0)

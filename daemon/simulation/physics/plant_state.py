@@ -40,7 +40,7 @@ Shears = Annotated[FloatArray, SHEARS]
 class Motion(Record):
     """Coordinates, velocities, shears and currents, or their rates of change.
 
-    The bristles change at the joint velocities.
+    The bristle deflections change at the joint velocities.
     """
 
     position: FloatFive  # joint angles [rad], object x and y [m], object angle [rad]

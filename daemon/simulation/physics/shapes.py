@@ -40,7 +40,7 @@ class Shape:
 
     @property
     def half_width(self) -> float:
-        """Half the width at the height of the centre."""
+        """Half of the object's width at the height of its centre."""
         x, y = np.vstack((self.corners, self.corners[:1])).T
         across = [
             x[k] - y[k] * (x[k + 1] - x[k]) / (y[k + 1] - y[k])
@@ -106,7 +106,7 @@ def rectangle(simulation: SimulationSettings) -> Shape:
 def wedge(simulation: SimulationSettings) -> Shape:
     """Create a wedge with faces tilted by half the taper and the given width at mid-height.
 
-    Raises ValueError if the faces meet; `profile.validation` checks profiles for this.
+    Raises ValueError if the faces meet; `profile.validation` checks profiles for this error.
     """
     leaning = 0.5 * simulation.object_height * math.tan(0.5 * simulation.object_taper)
     width = simulation.object_width

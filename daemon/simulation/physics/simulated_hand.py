@@ -198,8 +198,8 @@ def _script(p: Parameters, settings: Settings) -> None:
 class SimulatedHand:
     """Planar hand: two fingers with joints and soft tips, and an object between the fingers.
 
-    The tips touch the object, or each other if there is no object between the tips. If a tip has
-    two contacts, its sensor measures the stronger contact. The object may lie on the palm.
+    The tips touch the object, or each other if there is no object between them. If a tip has two
+    contacts, its sensor measures the stronger contact. The object may lie on the palm.
 
     ``settings.scene.fingers`` selects the tips. If only one finger is selected, the object is fixed
     to the test bench, as in a compression test. Without servos (``settings.servos.backend`` is
@@ -207,7 +207,7 @@ class SimulatedHand:
     ``simulation.compression_speed`` is above 0, the object moves back and forth between both tips
     and compresses each tip by 0.4 radii.
 
-    The array attributes are views of the state with shape (2,), left finger first. These views are
+    The array attributes are views of the state with shape (2,), left finger first. The views are
     valid until the next call to ``advance``.
     """
 
@@ -292,7 +292,7 @@ class SimulatedHand:
         return self.start + self._done * self.step
 
     def advance(self, t: float) -> None:
-        """Advance to the last sub-step at or before ``t`` [s], unless it has already passed."""
+        """Advance to the last sub-step at or before ``t`` [s], but never go back in time."""
         if t > self._torque_until:
             self._advance(self._torque_until)
             self.torque_on[:] = 0
@@ -347,7 +347,7 @@ class SimulatedHand:
         return scale * self.current.item(joint)
 
     def hold_torque_until(self, t: float) -> None:
-        """Switch the torque of both servos off at ``t`` [s]; infinity cancels this."""
+        """Switch the torque of both servos off at ``t`` [s]; infinity cancels the command."""
         self._torque_until = t
 
     def apply_load(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
@@ -357,8 +357,8 @@ class SimulatedHand:
     def load(self, push: float = 0.0, twist: float = 0.0) -> None:
         """Apply a permanent ``push`` [N] and ``twist`` [N·m] to the object; zeros remove the load.
 
-        The push acts along the faces and away from the palm. Its direction stays the same when the
-        object rotates.
+        The push acts along the faces and away from the palm. The direction of the push stays the
+        same when the object rotates.
         """
         angle = self.object_pose.item(2)
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)

@@ -9,47 +9,49 @@ modulus E, F = πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1, the second t
 d_t tan θ + d d_t²), the tangential energy of the parallel-distributed model. For other materials, F
 contains the effective modulus of the material. w(θ) is 1 on the soft hemisphere and fades to 0
 towards the side of the finger. U_rim is a stiff spring between the rim of the backing plate and the
-object. A plane reaches the rim at d = a(1 − |sin θ|), which is the end of the soft range. Beyond a
-slightly smaller d, a(1 − √(sin² θ + 0.03²)), U₀ is continued linearly in d, and F is constant.
+object. A plane reaches the rim at d = a(1 − |sin θ|), which is the end of the soft range. Beyond d
+= a(1 − √(sin² θ + 0.03²)), which is slightly smaller, U₀ is continued linearly in d, and F is
+constant.
 
 The formulas above are the contact law for ``simulation.tip_law = "springs"``. With ``"bristles"``,
 the term sin θ d_t is omitted. The tangential force T = 2 s F cos θ d_t/d (2πE s d d_t for a
 constant E) then comes from a bristle at the centre of the contact. Tilt and compression do not bend
-this bristle, and d_t only follows the sliding motion at that point. The upright force, the force at
-d_t = 0 and the sensor readings are the same for both laws. A controller that compensates the
-springs' tangential terms can therefore be tested with ``"bristles"``, a tip without these terms.
+the bristle, and d_t follows only the sliding motion at the centre of the contact. The upright
+force, the force at d_t = 0 and the sensor readings are the same for both laws. A controller that
+compensates for the springs' tangential terms can therefore be tested with ``"bristles"``, a tip
+without these terms.
 
 The tip touches the nearest point of the object. On a face, the contact direction is the face
 normal. At a corner, the contact direction is the line to the corner, as for a plane normal to that
 line. On a disc, the contact direction is the line to the disc centre. A disc's axis is normal to
-the hand plane, so its face is curved about one axis only, with radius R. To leading order in d, the
-spring model's contact with a disc differs in two ways from its contact with the tangent plane.
-First, the footprint is narrower along the tilt by the factor κ² = R/(R + a), because the curvatures
-add to 1/a + 1/R. Second, the force and energy are κ times the values for the plane at any θ. For a
-constant modulus, a = 20 mm and d up to 8 mm, integrals over the springs agree with these factors to
-within 1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9 % for R = 10 mm.
-The sensor frame is computed from the springs (`sensor.sensor_model`), so the sum of its cells
-differs from the force by the same amount. The force of a solid tip is proportional to d^(3/2) and
-√κ, as in Hertz's theory for a sphere on a cylinder in the limit of small d. The frame of a solid
-tip on a disc is the frame on a plane multiplied by √κ.
+the hand plane, so the disc's face is curved about one axis only, with radius R. To leading order in
+d, the spring model's contact with a disc differs in two ways from its contact with the tangent
+plane. First, the footprint is narrower along the tilt by the factor κ² = R/(R + a), because the
+curvatures add to 1/a + 1/R. Second, the force and energy are κ times the values for the plane at
+any θ. For a constant modulus, a = 20 mm and d up to 8 mm, integrals over the springs agree with
+both factors to within 1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9
+% for R = 10 mm. The sensor frame is computed from the springs (`sensor.sensor_model`), so the sum
+of its cells differs from the force by the same amount. The force of a solid tip is proportional to
+d^(3/2) and √κ, as in Hertz's theory for a sphere on a cylinder in the limit of small d. The frame
+of a solid tip on a disc is the frame on a plane multiplied by √κ.
 
 Coulomb friction limits d_t to the range between the two shears at which |T| = μN. In the model, the
 ratio |T|/N may be unable to reach μ: with a constant E and s = 1, the maximum ratio at θ = 0 is 1.
-In that case, the tip slips at the maximum ratio. Damping is viscous and proportional to the
-stiffness of the soft part, so it increases as the contact grows.
+If the ratio cannot reach μ, the tip slips at the maximum ratio. Damping is viscous and proportional
+to the stiffness of the soft part, so it increases as the contact grows.
 
 The shear of a stuck tip may relax by creep and by micro-slip. Both effects are off by default.
-Without these effects, a tip sticks or slips as a whole and has no memory. Micro-slip occurs because
-each spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed by w = ℓ
-− h, has the pressure Ew/ℓ. When the face has moved by u, the spring has the shear traction Eu/ℓ.
-The spring slips if u > μw. All layers w = 0 … d are equally stiff, because r dr = −ℓ dℓ. Starting
-from zero shear, integration gives
+Without creep and micro-slip, a tip sticks or slips as a whole and has no memory. Micro-slip occurs
+because each spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed
+by w = ℓ − h, exerts the pressure Ew/ℓ. When the face has moved by u, the spring has the shear
+traction Eu/ℓ. The spring slips if u > μw. All layers w = 0 … d are equally stiff, because r dr = −ℓ
+dℓ. Starting from zero shear, integration gives
 
     T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
 
 The whole tip slips at u = μd. The layers form an Iwan model with uniformly distributed limits. The
-layers scale with the footprint. The mean of the layer shears is the tip's d_t, and their variance
-adds to d_t² in the tip energy.
+layers scale with the footprint. The mean of the layer shears is the tip's d_t, and the variance of
+the layer shears adds to d_t² in the tip energy.
 """
 
 from __future__ import annotations
@@ -144,7 +146,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         losses: loss · stiffness · rate    stiffness = γ/cos θ (∂F/∂d, 2d/3 ∂U₀/∂d) and t1
 
     ``factor`` is κ. The function reads d, θ, travel, rates, slip rate, shear, shear variance and
-    rim from ``tip``. All other fields are set, except for the rows and the generalised forces.
+    rim from ``tip``. All other fields of ``tip`` are set, except for the rows and the generalised
+    forces.
     """
     d = tip.d
     sine = tip.sine
@@ -292,7 +295,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
 
 @inner_kernel
 def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: float) -> None:
-    """Set row ``r``, the derivatives with respect to (q, x, y, φ)."""
+    """Set row ``r`` to the derivatives with respect to (q, x, y, φ)."""
     tip.rows[r, 0] = q
     tip.rows[r, 1] = x
     tip.rows[r, 2] = y

@@ -1,11 +1,11 @@
 """Model the simulated pressure sensor: convert a contact to the counts that a board sends.
 
-`simulated_tactile` handles delayed and lost frames. The imperfections are standard models; the
-profiles ``velostat`` and ``capacitive`` use them.
+`simulated_tactile` handles delayed and lost frames. The imperfections follow standard models, which
+the ``velostat`` and ``capacitive`` profiles use.
 
 `sensing.pressure_grid` computes the pressure of a plane face; this module computes the pressure of
-a cylindrical face, as on a disc. Both calculations use the same spring model: above each point of
-the base, the face compresses a vertical spring whose length is the height of the hemisphere. An
+a cylindrical face, as on a disc. Both modules use the same spring model: above each point of the
+base, the face compresses a vertical spring whose length is the height of the hemisphere. An
 estimator that assumes a plane face interprets the narrower footprint as a smaller d: the estimated
 d is 0.72 of the true d for R = a, and 0.83 for R = 2a. The estimated θ is 1 % to 12 % too small
 (the error increases with d), and the estimated gain is above 1, which compensates for the
@@ -42,8 +42,8 @@ class SensorModel:
     """Pressure sensor under one simulated tip, with the board's range and imperfections.
 
     ``gain`` is the ratio of the reading to the pressure according to the material law. ``dead``
-    lists the cells (row, col) that always read 0. Two models with the same arguments and calls
-    produce the same frames.
+    lists the cells (row, col) that always read 0. Two models that are created and called with the
+    same arguments produce the same frames.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class SensorModel:
         t: float = 0.0,
         curvature: float = 0.0,
     ) -> None:
-        """Write the counts of the next frame to ``out``, contiguous uint16 [rows, cols].
+        """Write the counts of the next frame to ``out``, a contiguous uint16 array [rows, cols].
 
         ``d`` [m] ≤ 0 means no contact. Tilts [rad] are as in :meth:`SensorGrid.pressure`. ``t`` [s]
         is the frame time, which is used for creep, response and drift. ``curvature`` is as in
@@ -174,8 +174,9 @@ class SensorModel:
     def _points(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Sample point positions across the cylinder axis, and the hemisphere heights there [m].
 
-        Both arrays have the shape [lines, points per line]; the height is 0 beyond the rim. The
-        other two results are the weights of the points in a cell mean along y and along x.
+        The position and height arrays have the shape [lines, points per line]; the height is 0
+        beyond the rim. The third and fourth results are the weights of the points in a cell mean
+        along y and along x.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -218,7 +219,7 @@ class SensorModel:
     def read(
         self, out: NDArray[np.uint16], faults: MeasurementFaults | None = None, t: float = 0.0
     ) -> None:
-        """Write the cell counts to ``out``, with the ``faults`` at time ``t`` [s]."""
+        """Write the cell counts to ``out``, including the ``faults`` active at ``t`` [s]."""
         flaws = self._flaws
         felt = self._pressure
         if flaws.tactile_exponent != 1.0 or flaws.tactile_fold > 0.0:
@@ -253,7 +254,7 @@ def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
     In this Prandtl-Ishlinskii model, the output of a cell is the mean of PLAY_COUNT generalised
     play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each operator follows an
     increasing pressure p immediately. An operator follows a decreasing pressure only when its state
-    is above (1 + h_k) p, with h_k evenly distributed over 0 … 2·excess. Therefore, the loading
+    is above (1 + h_k) p. The h_k are evenly distributed over 0 … 2·excess. Therefore, the loading
     curve is the pressure itself, and the unloading curve ends at (1 + excess) p. Loops are closed,
     inner loops lie inside outer loops, and zero pressure always reads 0.
     """
@@ -264,7 +265,7 @@ def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
 
 
 def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) -> FloatArray:
-    """Return each cell's pressure p with a first-order lag: z in dz/dt = (p − z)/time.
+    """Return z, each cell's pressure p after a first-order lag: dz/dt = (p − z)/time.
 
     p + share · z is the creep of a standard linear solid. The solution is exact for a pressure that
     changes linearly during ``elapsed`` [s]. ``state`` [2, rows, cols] contains the last p and z and
@@ -285,8 +286,8 @@ def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) ->
 def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float) -> FloatArray:
     """Return the readings (p/full_scale)^exponent · full_scale for pressures p.
 
-    Above ``fold`` [Pa] (0 disables this), p is replaced by fold²/p: beyond the range of its contact
-    resistance, a cell's reading decreases with pressure.
+    If ``fold`` [Pa] is above 0, a pressure p above ``fold`` is replaced by fold²/p: beyond the
+    range of the contact resistance, a cell's reading decreases with pressure.
     """
     if fold > 0.0:
         pressure = np.minimum(pressure, fold * fold / np.maximum(pressure, fold))
@@ -309,7 +310,7 @@ def drift(
 
 
 def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: FloatArray) -> None:
-    """Compute the crosstalk of each line as a ``fraction`` of its mean signal.
+    """Compute the crosstalk of each line as a ``fraction`` of the line's mean signal.
 
     The cells of a resistive matrix share drive lines and sense lines, and current leaks along these
     lines. The results are written to ``rows`` [rows] and ``cols`` [cols].

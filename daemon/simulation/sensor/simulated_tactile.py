@@ -36,7 +36,7 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
 
 
 class StageTouch(NamedTuple):
-    """Contact of a tip with a body other than the object at one instant."""
+    """Contact of a tip, at one instant, with a body other than the object."""
 
     d: float  # m
     theta: float  # rad
@@ -151,7 +151,7 @@ class SimulatedTactile:
         return next(self._replayed)
 
     def _relaxation_factor(self, d: float, theta: float) -> float:
-        """Advance a tip's relaxation under the plate by one frame; return its factor."""
+        """Advance a tip's relaxation under the plate by one frame; return the relaxation factor."""
         lasting = float(self._hand.table(d, theta).force)
         state, factor = self._relaxation_state, 1.0
         for k, (strength, time) in enumerate(self._relaxation):
@@ -195,8 +195,8 @@ class Arrivals:
     """Arrival times of the frames 0, 1, … of a sensor.
 
     Frame k is sampled at start + k · period and is due ``delay`` [s] later. A frame is lost with
-    probability ``dropped``. A frame that is not lost is late by a uniformly distributed time of up
-    to ``jitter`` [s]. Frames always arrive in order.
+    probability ``dropped``. A frame that is not lost is delayed by a uniformly distributed time of
+    up to ``jitter`` [s]. Frames always arrive in order.
     """
 
     # Tolerance for clock rounding errors: a frame that is due now counts as arrived.

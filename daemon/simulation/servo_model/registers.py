@@ -35,7 +35,8 @@ _UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 class Item:
     """One register.
 
-    ``low`` and ``high`` are the limits in the manual's table. Other registers may narrow the range.
+    ``low`` and ``high`` are the limits in the manual's table. The values of other registers may
+    narrow the range.
     """
 
     address: int
@@ -136,7 +137,7 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
 
 
 class ControlTable:
-    """Register memory with access by value and by a packet's address range.
+    """Register memory that can be accessed by single register or by address range.
 
     Addresses between registers read as 0. The servo may write directly to ``memory``.
     """

@@ -40,7 +40,7 @@ _CLEAR_KEY = b"\x01DXL\x22"
 
 
 def prepared(model: ServoModel, mode: int) -> dict[int, int]:
-    """Return the EEPROM values that the daemon requires: a return delay of 0, and the mode."""
+    """Return the EEPROM values that the daemon requires: return delay 0 and the operating mode."""
     needed = {reg.RETURN_DELAY_TIME: 0}
     return needed | {reg.OPERATING_MODE: mode} if mode in model.modes else needed
 
@@ -94,7 +94,10 @@ class EmulatedServo:
 
     @property
     def shadow(self) -> int:
-        """Secondary ID, to which the servo listens without replying; 253 and above disable it."""
+        """Secondary ID; the servo executes instructions to this ID without replying.
+
+        The values 253 to 255 disable the secondary ID.
+        """
         return self._memory[reg.SHADOW_ID]
 
     @property
@@ -253,7 +256,7 @@ class EmulatedServo:
         return framing.OK
 
     def clear(self, parameters: bytes, t: float) -> int:
-        """Reset the position to a single turn; this fails while the shaft is moving."""
+        """Reset the position to a single turn. The reset fails while the shaft is moving."""
         if self.firmware < _CLEAR_FIRMWARE:
             return framing.INSTRUCTION_ERROR
         if parameters != _CLEAR_KEY:
@@ -384,7 +387,10 @@ class EmulatedServo:
             self._fail(bit)
 
     def _fail(self, bit: int) -> None:
-        """Set a hardware error and its alert bit; shut down if it is in the shutdown mask."""
+        """Set a hardware error and its alert bit.
+
+        The servo shuts down if the shutdown mask includes the error.
+        """
         status = self.table.get(reg.HARDWARE_ERROR_STATUS) | 1 << bit
         self.table.set(reg.HARDWARE_ERROR_STATUS, status)
         if self.table.shut_down and self.torque_on:
@@ -393,7 +399,7 @@ class EmulatedServo:
 
 
 class BusRecorder:
-    """Record of the goals sent to a servo, to test the daemon's limits.
+    """Record of the goals sent to a servo, used to test the daemon's limits.
 
     Goals are recorded in counts as received, even if the servo rejects them.
     """
@@ -411,7 +417,7 @@ class BusRecorder:
         self._fired_t: float | None = None
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
-        """Record a write, except for goals near the current angle while torque is off."""
+        """Record a goal write, except for goals near the current angle while torque is off."""
         goals = _WATCHED_REGISTERS & values.keys()
         self._refused += refused and bool(goals)
         for address in goals:

@@ -51,7 +51,7 @@ class TimedReply(NamedTuple):
 
 
 class ServoBus:
-    """Group of servos that share one wire and one plant. They do not reply to corrupted packets."""
+    """Group of servos that share one wire and one plant, and ignore corrupted packets."""
 
     def __init__(
         self,
@@ -82,9 +82,9 @@ class ServoBus:
     ) -> ServoBus:
         """Create the configured servos, one per joint, left finger first.
 
-        ``baud`` > 0 and ``ids`` replace the baud rate and the IDs in the settings. If ``factory``
-        is True, all other registers have their factory defaults. Raises ValueError if the model
-        does not support the baud rate.
+        If given, ``ids`` and a ``baud`` above 0 replace the IDs and the baud rate in the settings.
+        If ``factory`` is True, all other registers have their factory defaults. Raises ValueError
+        if the model does not support the baud rate.
         """
         servos = settings.servos
         model = by_name(servos.model)
@@ -127,7 +127,7 @@ class ServoBus:
         self._now = t
 
     def next_event(self) -> float:
-        """Return a time [s] that is not later than the next servo event."""
+        """Return a lower bound [s] for the time of the next servo event."""
         return self._due
 
     # --- bytes -----------------------------------------------------------------------------
@@ -137,7 +137,7 @@ class ServoBus:
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
-        """Return the replies to ``data`` with their delays. With ``baud`` 0, all servos respond."""
+        """Return the replies to ``data`` with their delays. If ``baud`` is 0, all servos reply."""
         if t >= self._due or t > self._now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []
@@ -364,8 +364,8 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
 def _at_once(replies: list[TimedReply]) -> list[TimedReply]:
     """Merge the replies of servos with the same ID into one corrupted reply; 0 bits dominate.
 
-    Servos never start at exactly the same time, so even identical replies collide. In this model,
-    each reply begins one byte after the previous one.
+    Servos never start at exactly the same time, so even identical replies collide. In the
+    emulation, each reply begins one byte after the previous reply.
     """
     if len(replies) < 2:
         return replies

@@ -3,7 +3,7 @@
 `ServoJoint` converts counts to angles (turns, homing offset, drive direction), follows the profile,
 drives the plant according to the operating mode, and writes the present values to the control
 table. `ServoHealth` models heat (`ServoHeat`), supply voltage and overload. The manuals do not
-specify when an overload error occurs. In this model, the error occurs after OVERLOAD_TIME at the
+specify when an overload error occurs. In the emulation, the error occurs after OVERLOAD_TIME at the
 configured current limit.
 """
 
@@ -72,7 +72,7 @@ class ServoJoint:
 
     @property
     def current_limit(self) -> float:
-        """Current limit according to the registers [A]."""
+        """Current limit [A] according to the registers."""
         if not self._model.senses_current:
             return self._model.stall_current
         return self._table.get(reg.CURRENT_LIMIT) * self._model.current_unit
@@ -102,7 +102,7 @@ class ServoJoint:
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_current(self, counts: int) -> float:
-        """Convert a goal current to A, positive when closing; ignore the sign of a limit."""
+        """Convert a goal current to A, positive when closing. The sign of a limit is ignored."""
         return self._scale.amperes(self.sign * counts)
 
     # --- trajectory --------------------------------------------------------------------------
@@ -221,7 +221,7 @@ _ARRIVAL_TOLERANCE = 1e-6
 
 
 class Profile:
-    """Velocity-based or time-based trajectory to a goal; stores the current position and velocity.
+    """Velocity-based or time-based trajectory to a goal, with its current position and velocity.
 
     A limit of 0 means no limit.
     """
@@ -361,11 +361,11 @@ class ServoHealth:
         return self.supply - reg.SAG * self._current
 
     def restart(self) -> None:
-        """Restart as after a power-up, but keep the temperatures."""
+        """Restart as if after a power-up, but keep the temperatures."""
         self._overload = 0.0
 
     def sense(self, table: ControlTable, current: float, pressed: bool) -> list[int]:
-        """Advance by SENSE_INTERVAL and return the bits of all current hardware errors.
+        """Advance by SENSE_INTERVAL and return the bits of all active hardware errors.
 
         ``pressed`` is True if ``current`` [A] is at the configured limit.
         """
