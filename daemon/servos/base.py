@@ -23,8 +23,8 @@ Status = Literal["pass", "note", "fixed", "warn", "FAIL"]
 class Finding:
     """Result of checking one device or the machine, and how to fix any problem.
 
-    ``FAIL`` prevents the daemon from running, and ``warn`` degrades its operation. All other status
-    values require no action.
+    ``FAIL`` means that the daemon cannot run, and ``warn`` means that the daemon runs with
+    restrictions. Findings with any other status require no action.
     """
 
     status: Status
@@ -57,7 +57,7 @@ class Servos(Protocol):
     """
 
     def connect(self) -> None:
-        """Open the port and check all servos. Raises ServoError listing all problems."""
+        """Open the port and check all servos. Raises ServoError, which lists all problems."""
 
     def read(self, reading: Reading) -> None:
         """Update ``reading`` in place.
@@ -74,7 +74,7 @@ class Servos(Protocol):
         """
 
     def torque_off(self, reading: Reading) -> bool:
-        """Request torque off once and read like `read`; return True once all servos have confirmed.
+        """Request torque off once, then read like `read`; return True once all servos confirm.
 
         This method takes no longer than `read`, so the loop can call it on every tick until it
         returns True. Raises ServoError if the port is lost.
@@ -91,7 +91,7 @@ class Servos(Protocol):
 
 
 class JointPlant(Protocol):
-    """Simulated joints with motors, which the simulated and emulated servos use.
+    """Simulated joints and motors, as used by simulated and emulated servos.
 
     Index 0 is the left finger's joint. Positive values close the finger.
     """
@@ -109,7 +109,7 @@ class JointPlant(Protocol):
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
     ) -> None:
-        """Set a servo's command, which is active until the next call.
+        """Set a servo's command; the command stays active until the next call.
 
         ``mode`` is 5 (current-based position), 3 (position) or 0 (current). In mode 5,
         ``goal_current`` limits the magnitude of the current. Mode 3 applies the servo model's own
@@ -121,14 +121,16 @@ class JointPlant(Protocol):
 
         Parameters
         ----------
-        stiffness : stiffness of the position loop relative to the factory value
-        damping : damping in addition to the factory value, per unit of that stiffness [s]
-        duty : maximum fraction of the supply voltage applied to the motor
+        stiffness : stiffness of the position loop relative to the factory value damping : damping
+        in addition to the factory value, per unit of ``stiffness`` [s] duty : maximum fraction of
+        the supply voltage applied to the motor
         """
 
 
 def make_servos(settings: Settings, clock: Clock, hand: object) -> Servos | None:
-    """Create the configured servo backend, not yet connected, or None in a scene without servos.
+    """Create the configured servo backend without connecting it.
+
+    Returns None if the scene has no servos.
 
     ``hand`` is the simulated hand, for backends that use it. Raises the same errors as the
     backend's constructor.

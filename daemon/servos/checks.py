@@ -55,7 +55,7 @@ class Registers(bytes):
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """Result of checking one servo, which is unusable if ``errors`` is not empty."""
+    """Result of checking one servo. A servo with ``errors`` is unusable."""
 
     finger: int
     id: int
@@ -168,7 +168,7 @@ def check_servo(
 
 
 def other_model(number: int, model: ServoModel) -> tuple[str, str]:
-    """Describe a servo whose model differs from the settings, and how to fix it."""
+    """Describe a servo whose model differs from the settings, and how to fix the mismatch."""
     if reg.by_number(number) is not None:
         return f"is an {reg.name_of(number)}, expected an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
@@ -186,7 +186,7 @@ def check_registers(
     finger: int,
     status: Status,
 ) -> list[Finding]:
-    """Return findings with this ``status`` for registers that lack the required value."""
+    """Return a finding with this ``status`` for each register with a wrong value."""
     found = []
     for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
         wrong = row.wrong_in(table)
@@ -240,7 +240,7 @@ def notice_servo(
 
 
 def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Finding]:
-    """Return warnings if torque constant or friction do not match the servo model.
+    """Return warnings if the torque constant or the friction does not match the servo model.
 
     `profile.validation.plausibility_warnings` compares the forces with the model.
     """
@@ -298,7 +298,7 @@ def check_position(
 ) -> Finding | None:
     """Check the angle of a servo from its registers.
 
-    A servo in reverse drive mode counts down from 0, also after a reboot.
+    A servo in reverse drive mode counts down from 0, even after a reboot.
     """
     counts = table.long(reg.PRESENT_POSITION)
     found = check_angle(name, scale, counts, hand, finger)
@@ -310,9 +310,10 @@ def check_position(
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
-    """Compare a USB adapter's latency timer with the reply time [s]; None if it has no timer.
+    """Compare a USB adapter's latency timer with the reply time [s]; return None without a timer.
 
-    The adapter holds a reply until the timer expires, so a value of 16 ms limits reads to 60 Hz.
+    The adapter holds back a reply until the timer expires, so a value of 16 ms limits reads to 60
+    Hz.
     """
     place = latency_file(path, *sysfs)
     if place is None:

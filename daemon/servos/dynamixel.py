@@ -153,9 +153,9 @@ class DynamixelServos:
         return reads
 
     def _judge(self, found: list[Examined], port: SerialPort, allowed: float) -> None:
-        """Set limits and notices from the results; ``allowed`` is the reply time during a tick [s].
+        """Set limits and notices from the results; ``allowed`` is the maximum reply time [s].
 
-        Raises ServoError listing all problems.
+        Raises ServoError, which lists all problems.
         """
         if not any(each.replies or each.errors for each in found):
             raise ServosSilent(
@@ -313,7 +313,7 @@ class DynamixelServos:
         self._torque.on()
 
     def torque_off(self, reading: Reading) -> bool:
-        """Request torque off and read; return True if the registers of all servos confirm it.
+        """Request torque off and read the servos; return True if all registers confirm torque off.
 
         Raises
         ------
@@ -353,7 +353,7 @@ class DynamixelServos:
     def close(self) -> None:
         """Switch torque off, verify it if possible, and close. Never raises.
 
-        If another program switched torque on, it stays on.
+        If another program switched torque on, the torque stays on.
         """
         if self._waiting is not None:
             with contextlib.suppress(Exception):

@@ -1,4 +1,4 @@
-"""Perform the group reads of a tick, choose their type, and measure their duration.
+"""Choose the type of a tick's group reads, perform the group reads, and measure their duration.
 
 The daemon and `doctor` share this code, so `doctor` tests the exchanges that the daemon uses.
 """
@@ -40,7 +40,7 @@ _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2
 
 
 class TickReads:
-    """Group reads of a tick: one read for each span length, all of the same type."""
+    """Group reads of a tick: one for each span length. All group reads are of the same type."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ def time_exchanges(
 def judge_exchanges(
     times: ExchangeTimes, settings: Settings, what: str, emulated: bool = False
 ) -> Finding:
-    """Compare exchange durations with the tick and with ``servos.reply_timeout``.
+    """Compare exchange durations with the tick period and with ``servos.reply_timeout``.
 
     ``what`` is the name of the timed exchanges in the report. An ``emulated`` hand shares the
     processors with its clients, so the fastest exchange is used instead of the 99th percentile.
@@ -189,7 +189,7 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
 
 
 def _remedy(duration: float, settings: Settings) -> str:
-    """Return settings that allow replies of this duration [s]."""
+    """Name the settings to change so that replies of this duration [s] are not too late."""
     rate = _REPLY_FRACTION_MAX / duration
     digit = 10.0 ** max(len(str(int(rate))) - 2, 0)
     parts = []

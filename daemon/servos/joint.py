@@ -124,7 +124,7 @@ class Joint:
         return servo_name(self.id, self.finger)
 
     def goal(self, servos: ServoSettings, mode: int, q: float, current: float) -> bytes:
-        """Return the register bytes for a goal [rad, A] in this mode."""
+        """Return the register bytes for a goal [rad, A] in operating mode ``mode``."""
         scale, position = self.scale, self.scale.position_counts(q)
         counts = bound = min(scale.bound_counts(current), self.bound)
         if mode == reg.POSITION_MODE:
@@ -136,7 +136,7 @@ class Joint:
 
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:
-    """Return the register bytes for a goal [counts] in this mode."""
+    """Return the register bytes for a goal [counts] in operating mode ``mode``."""
     if mode == reg.POSITION_MODE:
         return _POSITION.pack(position)
     if mode == reg.CURRENT_MODE:

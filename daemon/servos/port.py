@@ -51,7 +51,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
     def __init__(
         self, path: str, baud: int, reply_timeout: float, low_latency: bool = True
     ) -> None:
-        """Create a closed port; ``low_latency`` requests low-latency mode when it is opened."""
+        """Create a closed port; ``low_latency`` requests low-latency mode for the open port."""
         super().__init__(path)
         self._low_latency = low_latency
         self.baudrate = baud
@@ -90,8 +90,8 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         """Send a packet; return True if it was completely sent.
 
         If ``reply`` bytes are expected, older input is first discarded so that it is not mistaken
-        for the reply. The reply deadline then starts and is limited to ``until`` [s,
-        time.monotonic()].
+        for the reply. After sending, the reply deadline starts; the deadline is at most ``until``
+        [s, time.monotonic()].
         """
         remaining = packet
         try:

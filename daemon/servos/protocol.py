@@ -81,7 +81,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
     @property
     def damaged(self) -> int:
-        """Total count of corrupted, incomplete and unexpected input."""
+        """Sum of the counters for corrupted replies, incomplete replies and unexpected bytes."""
         return self.crc_errors + self.torn + self.skipped_bytes
 
     def txPacket(self, port: SerialPort, txpacket: list[int]) -> int:
@@ -186,7 +186,7 @@ class GroupRead:
         self._reply = (_STATUS_SIZE + length) * len(ids)
 
     def exchange(self, until: float = math.inf) -> int:
-        """Complete the exchange by ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Finish the exchange before ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler = self._handler
@@ -213,7 +213,7 @@ class FastGroupRead(GroupRead):
     instruction = _FAST_SYNC_READ
 
     def exchange(self, until: float = math.inf) -> int:
-        """Complete the exchange by ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Finish the exchange before ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler, length = self._handler, self._length

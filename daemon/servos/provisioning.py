@@ -49,7 +49,7 @@ _WRITE_TIME = 0.05  # time for sending a packet and storing its data in the EEPR
 
 @dataclass(frozen=True, slots=True)
 class FoundServo:
-    """Servo that replied to a search."""
+    """Servo found by a search."""
 
     id: int
     baud: int
@@ -60,7 +60,7 @@ class FoundServo:
         return self.describe(str(self.baud))
 
     def describe(self, rates: str) -> str:
-        """Return the report line for a servo and the baud rates at which it replies."""
+        """Return a line of text that names a servo and the baud rates at which it replies."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
@@ -189,9 +189,9 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
     """Assign the servos found at the baud ``rates`` to the joints.
 
     If a servo of the configured model replies at another baud rate with the ID of a missing servo,
-    it is assumed to be the missing servo. Otherwise, if exactly one servo is unassigned and exactly
-    one servo is missing, the unassigned servo is assumed to be the missing servo. Servos with
-    corrupted replies are not changed.
+    that servo is assumed to be the missing servo. Otherwise, if exactly one servo is unassigned and
+    exactly one servo is missing, the unassigned servo is assumed to be the missing servo. Servos
+    with corrupted replies are not changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
@@ -238,7 +238,7 @@ def provision(settings: Settings) -> list[Finding]:
 
     Returns
     -------
-    Findings with status ``fixed`` for each change and ``warn`` for each failure.
+    One finding for each change (status ``fixed``) and for each failure (status ``warn``).
 
     Raises
     ------

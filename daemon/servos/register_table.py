@@ -101,7 +101,10 @@ class Requirement(NamedTuple):
     then: str = ""  # action required after the value is corrected
 
     def wrong_in(self, table: bytes, start: int = 0) -> int | None:
-        """Return the value in ``table`` (from address ``start``) if it is wrong, otherwise None."""
+        """Return the value if it is wrong, otherwise None.
+
+        ``table`` contains the registers, beginning at address ``start``.
+        """
         value = self.register.value_in(table, start)
         return None if self.holds(value) else value
 

@@ -44,8 +44,8 @@ class SimulatedServos:
     """Servos of a simulated hand, with the resolution of the configured model.
 
     Every exchange first advances the hand to the clock time. If a watchdog is set and no exchange
-    occurs within its time, torque is switched off, and only :meth:`torque_on` switches torque on
-    again.
+    occurs within the watchdog time, torque is switched off, and only :meth:`torque_on` switches
+    torque on again.
     """
 
     def __init__(self, settings: Settings, hand: HandPlant, clock: Clock) -> None:
@@ -181,7 +181,7 @@ class SimulatedServos:
             self._connected = False
 
     def _exchange(self) -> float:
-        """Advance the hand to the current time, check its watchdog and restart it."""
+        """Advance the hand to the current time, and check and restart its watchdog."""
         now = self._clock.now()
         if self._torque and now > self._last + self._watchdog:
             self._torque = False

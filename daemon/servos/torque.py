@@ -1,4 +1,4 @@
-"""Switch torque on, verifying each step, switch torque off, and manage the bus watchdog.
+"""Switch torque on (verifying each step), switch torque off, and manage the bus watchdog.
 
 Torque is switched on at the current angle with zero motor current. Indirect addresses make goal
 current and goal position adjacent. Indirect addresses are in RAM and are therefore set whenever
@@ -32,7 +32,7 @@ _MOTION_MAX = 8  # allowed motion of a limp joint before torque is on, in counts
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
-    """Return the address for writing goals: a register, or indirect data if there are two goals."""
+    """Return the address for writing goals, an indirect data address if there are two goals."""
     if mode == reg.CURRENT_MODE:
         return reg.GOAL_CURRENT
     if mode == reg.POSITION_MODE:
@@ -104,7 +104,7 @@ class Torque:
     def ask_off(self) -> None:
         """Request torque off with one packet for all servos and one packet for each servo.
 
-        The servos do not reply to these packets; the caller must read the registers.
+        The servos do not reply to the packets; the caller must read the registers.
         """
         self.goals = None
         for _ in range(_PACKET_COUNT):
@@ -118,7 +118,7 @@ class Torque:
         self.may_be_on = False
 
     def _aim_here(self) -> dict[int, int]:
-        """Set the goals to the current positions until the joints stay there; return the goals."""
+        """Set goals to the current positions until the joints hold still, and return the goals."""
         while True:
             positions = self._positions()
             strayed = [
@@ -148,7 +148,10 @@ class Torque:
         self._store_all(reg.INDIRECT_ADDRESS, pointers, "indirect addresses")
 
     def _firmware(self) -> int:
-        """Return the servos' firmware version; all must use the same indirect data address."""
+        """Return the servos' firmware version.
+
+        All servos must use the same indirect data address.
+        """
         found = set()
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.FIRMWARE_VERSION, 1)
