@@ -3,9 +3,9 @@
 If a servo is predicted to reach ``safety.temperature_max`` within ``heat_warn``, `safety.limits`
 issues a warning, and the grip force is reduced to the maximum force that the servo can sustain
 indefinitely. The force is not reduced below the value required for the load, including the slip
-margin. If this reduction is insufficient, an error is reported _ERROR_TIME seconds before the
-limit, and ``heat_action`` is performed in the last _ACTION_TIME seconds. The reduction lasts until
-the grip ends, even if another force is commanded.
+margin. If the force reduction is insufficient, an error is reported _ERROR_TIME seconds before the
+temperature limit is reached. ``heat_action`` is performed _ACTION_TIME seconds before the limit.
+The reduction lasts until the grip ends, even if another force is commanded.
 """
 
 from __future__ import annotations

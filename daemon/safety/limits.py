@@ -1,4 +1,4 @@
-"""Define all limits of the hand, with their checks and consequences, in the table ``LIMITS``.
+"""Define all limits of the hand, with their checks and consequences, in the ``LIMITS`` table.
 
 - ``warn``: reported once on ``hand/event``, and again only after the problem has been absent for a
   while.
@@ -51,7 +51,7 @@ _GAP_TIME = 0.1  # interval between readings above which position steps are not 
 
 
 class JointMotion:
-    """Consistency check of joint angles with measured velocities and the maximum velocity.
+    """Consistency check between joint angles, measured velocities and the maximum velocity.
 
     An encoder may jump, freeze while the joint rotates, or drift while the joint is at standstill.
     A faulty encoder's angles are inconsistent with its velocity, and the finger's bit is then set
@@ -71,12 +71,12 @@ class JointMotion:
         self._drift = [0.0, 0.0]  # angle minus integrated velocity [rad]
 
     def restart(self) -> None:
-        """Forget all readings; the next reading has no predecessor to be compared with."""
+        """Discard all readings; the next reading is not compared with an earlier reading."""
         self.jumped = 0
         self._request_time = self._t = -math.inf
 
     def update(self, requested: float, reading: Reading) -> None:
-        """Check a reading requested at time ``requested``."""
+        """Check a reading that was requested at time ``requested``."""
         self.jumped = 0
         t = reading.t
         if not reading.valid or t == self._t:
@@ -136,7 +136,7 @@ class View:
         self.voltage = (low, high)
 
     def update(self, state: State) -> None:
-        """Store the parts of this tick's state that later checks compare."""
+        """Store the parts of this tick's state that later checks need for comparison."""
         # Readings taken while torque is off are not compared. The clock of an emulated hand does
         # not wait for the daemon while torque is off. The joints may therefore move further than
         # expected in the time between two readings.
@@ -190,7 +190,7 @@ FingerCheck = Callable[[View, State, float, int], str]
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """One row of the table. As a decorator, `Limit` adds the row with the decorated check.
+    """One row of the limit table. As a decorator, `Limit` adds the row with the decorated check.
 
     A row without a check is added directly, because its limit is applied elsewhere: in
     `Safety.write`, on the bus or in the gateway.
@@ -216,7 +216,7 @@ class Limit:
         return check
 
     def each(self, check: FingerCheck) -> FingerCheck:
-        """Add the row with a per-finger check; the first violation found is reported."""
+        """Add the row with a check that runs once per finger; the first violation is reported."""
 
         def judge(view: View, state: State, fraction: float) -> str:
             for i in view.fingers:
@@ -366,7 +366,7 @@ _CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 @Limit("joint.dead", "joint that is at least 0.05 rad from its goal, but neither moves nor draws "
     "current for 0.05 s", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
-    """Report a joint that is away from its goal, stationary and not drawing current.
+    """Report a joint that is stationary away from its goal without drawing current.
 
     A joint held back by a load draws current. In position mode, the expected current is unknown, so
     the check is skipped.
@@ -558,7 +558,7 @@ _TILT_TEXT = "|θ|; the limit is asin(1 − d/a) minus a margin"
     "tip.tilt", _TILT_TEXT, "warn", ("safety.theta_margin",), "sensors", fraction=_WARNING_FRACTION
 ).each
 def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
-    """|θ| ≤ fraction·(asin(1 − d/a) − margin).
+    """Check that |θ| ≤ fraction·(asin(1 − d/a) − margin).
 
     At asin(1 − d/a), the object plane reaches the rim of the tip's backing plate. The check uses
     the sine, which is defined for every finite angle.

@@ -1,6 +1,6 @@
 """Check every state, limit every goal, and send the goals to the servos.
 
-Goals reach the bus only through `Safety.write`, which limits them. The table `safety.limits.LIMITS`
+Goals reach the bus only through `Safety.write`, which limits them. The `safety.limits.LIMITS` table
 defines the checks. This module schedules the checks, reports each warning once, and raises a fault
 only after a violation has lasted long enough.
 """
