@@ -55,8 +55,8 @@ class TareStep(_StepModel):
 
     ``correlation[i][j]`` is the noise correlation of two cells that are i rows and j columns apart;
     it is empty for independent noise. ``drift`` is the standard deviation of the common-mode change
-    of all cells. ``excess`` is the mean reading above the zero offset: it is positive because
-    readings are clipped at 0 [counts].
+    of all cells. ``excess`` [counts] is the mean reading above the zero offset; it is positive
+    because readings are clipped at 0.
     """
 
     date: str
@@ -69,7 +69,7 @@ class TareStep(_StepModel):
 
 
 class EquilibrateStep(_StepModel):
-    """Gain of each cell (0 for dead cells) and relative spread before and after correction."""
+    """Gain of each cell (0 for dead cells), and relative spread before and after the correction."""
 
     date: str
     gain: list[list[Finite]]
@@ -79,7 +79,7 @@ class EquilibrateStep(_StepModel):
 
 
 class CurveStep(_StepModel):
-    """Curve p = c_1 x^b + c_2 x² + c_3 x³ [Pa] with coefficients (b, c_1, c_2, c_3); residual."""
+    """Curve p = c_1 x^b + c_2 x² + c_3 x³ [Pa], stored as (b, c_1, c_2, c_3), and its residual."""
 
     date: str
     kind: Literal["power", "cubic"]
@@ -99,7 +99,7 @@ class CentreStep(_StepModel):
 
 
 class ModulusStep(_StepModel):
-    """Modulus E [Pa] with its relative residual, or points of a stress-strain law [Pa]."""
+    """Modulus E [Pa] and its relative residual, or points of a stress-strain law [Pa]."""
 
     date: str
     modulus: Positive
@@ -211,7 +211,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """Describe how the sensor in a file differs from ``there``; return "" if both are equal."""
+    """Describe how the sensor in a file differs from ``there``; return "" if they are equal."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "unnamed", there.label or "unnamed"),
@@ -280,7 +280,8 @@ class Converter:
     def pressure(self, readings: FloatArray) -> FloatArray:
         """Convert readings to pressure [Pa].
 
-        The curve is an odd function, because noise may make readings negative.
+        The curve is extended to negative readings as an odd function, because noise may make
+        readings negative.
         """
         exponent, c1, c2, c3 = self._curve.tolist()
         x = np.abs(readings)
@@ -303,21 +304,21 @@ class Converter:
 
     @property
     def quantum(self) -> float:
-        """Typical pressure per count [Pa], which is the mean slope of the curve."""
+        """Typical pressure per count [Pa]: the mean slope of the curve."""
         return self.saturation / self._full
 
 
 def least_end(ends: FloatArray) -> float:
-    """Return the smallest reading above a cell's own zero offset at which a cell saturates.
+    """Return the lowest saturation limit of all cells, relative to each cell's zero offset.
 
-    Cells that are nearly saturated without load are ignored, because their low limit would make all
-    other cells count as saturated.
+    Cells that are nearly saturated without a load are ignored. Otherwise, the low limit of these
+    cells would make all other cells count as saturated.
     """
     return float(ends[ends >= _FAULTY * np.median(ends)].min())
 
 
 def _contradiction(calibration: Calibration) -> str:
-    """Return a message if values in the file contradict each other, otherwise ""."""
+    """Return a message if values in the file contradict each other; otherwise, return ""."""
     sensor = calibration.sensor
     tables = {}
     if calibration.tare:

@@ -53,7 +53,7 @@ def make_models(
 ) -> tuple[FingerModel, FingerModel]:
     """Create the models of both fingers.
 
-    If the modulus of a tip is not calibrated, its stress-strain law comes from the settings. The
+    If the modulus of a tip is not calibrated, the stress-strain law comes from the settings. The
     model of a finger that is not in the scene or has no sensor is based only on the settings.
 
     Raises the same exceptions as `profile.factory.make_table` and
@@ -101,7 +101,7 @@ def make_models(
 
 
 def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
-    """Return a finger's prior from `calibrate scales` or, without one, from the settings."""
+    """Return a finger's prior from `calibrate scales`, if available, or from the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales
         # The gain varies with temperature and load, so it remains uncertain even after a
@@ -118,7 +118,7 @@ def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
 
 
 def _measured_tip(settings: Settings, finger: int, calibration: Calibration | None) -> Fingertip:
-    """Return the tip with the measured curves of its calibration file.
+    """Return the tip with the measured curves from its calibration file.
 
     Raises SettingsError if the file has no curves or if the curves do not match the settings.
     """
@@ -159,7 +159,7 @@ def make_estimator(
 ) -> ContactEstimator | MeasuredEstimator:
     """Create a finger's estimator.
 
-    An estimator stores its last estimate, so each finger needs its own estimator.
+    Each finger needs its own estimator, because an estimator stores its last estimate.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def make_estimator(
         True for cells that exist [rows, cols]. The dead cells listed in the settings are also
         excluded.
     calibration
-        With a calibration, frames are pressures [Pa] from a `Converter`; without one, they are
+        With a calibration, frames are pressures [Pa] from a `Converter`; otherwise, frames are
         counts.
     """
     tactile = settings.tactile

@@ -6,9 +6,9 @@ footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain:                 frame
             ln F(D, θ) + MODULUS + GAIN − (∂ ln F/∂d) ḋ LATENCY
 amplitude   MODULUS + GAIN, if the gain was fitted                     2 %, frame covariance
 
-A frame shows the hand at the time of its scan. The frame is therefore compared with the state at
-that time, which is reconstructed from the joint history. `estimate.systematic`, the covariance that
-all frames share, is not part of the noise and is never estimated; it only increases the published
+A frame shows the hand at the time of the scan. Each frame is therefore compared with the state at
+the scan time, reconstructed from the joint history. `estimate.systematic`, the covariance that all
+frames share, is not part of the noise and is never estimated; it only increases the published
 standard deviations.
 """
 
@@ -84,7 +84,7 @@ class FrameContact(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """Predicted motion of one finger from a scan until now, and its state at the scan."""
+    """Predicted motion of one finger since a scan, and the finger's state at the scan."""
 
     d: float  # change in d since the scan [m]
     q: float  # joint motion since the scan [rad]
@@ -107,7 +107,7 @@ class FingerMotion(NamedTuple):
 
 @inner_kernel
 def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int) -> FingerMotion:
-    """Interpolate the history at time ``t``, clamped to its ends."""
+    """Interpolate the history at time ``t``, which is clamped to the ends of the history."""
     size = len(history)
     before = after = newest
     fraction = 0.0
@@ -137,7 +137,7 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
 def _rates(
     h: HandFilter, history: Records[HistoryRow], finger: int, scan: float, sense: float
 ) -> tuple[float, float]:
-    """Return the rates of d [m/s] and θ [rad/s] at the ``scan``, for the latency slopes.
+    """Return the rates of d [m/s] and θ [rad/s] at the ``scan``, used for the latency slopes.
 
     The rates are secants over ±1 standard deviation of the latency, because the joints may have
     stopped in between. Rates below the velocity resolution are set to 0.
@@ -160,7 +160,7 @@ def _rates(
 def _motion_since(
     h: HandFilter, history: Records[HistoryRow], finger: int, t: float, sense: float
 ) -> Scan:
-    """Return the motion since the scan that the frame with time stamp ``t`` shows."""
+    """Return the motion since the scan of the frame with time stamp ``t``."""
     scan = t - h.mean[LATENCY]
     row = _motion_at(history, h.newest_row, scan, finger)
     d_rate, theta_rate = _rates(h, history, finger, scan, sense)
@@ -280,7 +280,7 @@ def update(
 def _without_lag(
     h: HandFilter, found: FrameContact, scan: Scan, is_fitted: bool, log_slope: float
 ) -> tuple[float, float]:
-    """Return d and gain without the effects of slow cells and of the tip's relaxation."""
+    """Return d and gain, corrected for slow cells and for relaxation of the tip."""
     if is_fitted:
         spread = min(scan.spread / (found.d * found.d), _SPREAD_MAX)
         flattening = 1.0 - _FLATTENING * spread
@@ -294,9 +294,10 @@ def _without_lag(
 def _update_amplitude(
     h: HandFilter, finger: int, scan: Scan, found: FloatPair, noise: FloatArray
 ) -> None:
-    """Update with the fitted amplitude; ``found`` is (d, gain) with the covariance ``noise``.
+    """Update the state with the amplitude; ``found`` is (d, gain) with the covariance ``noise``.
 
-    The errors of d and gain are correlated, and the footprint has already used the common part.
+    The errors of d and gain are correlated, and the footprint update has already used the common
+    part.
     """
     d, gain = found
     d_noise = noise[0, 0]
@@ -323,7 +324,7 @@ def _is_finite(h: HandFilter) -> bool:
 def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> None:
     """Reset a finger's states on first contact; ``face`` is the angle in the first frame [rad].
 
-    If the other tip is not in contact, all states are reset.
+    If the other tip is not in contact either, all states are reset.
     """
     for pair in (MODULUS, GAIN, TORQUE, D_BIAS, ANGLE_BIAS):
         state = pair + finger

@@ -1,4 +1,4 @@
-"""State of the held object on this tick, written by perception and read by control and safety."""
+"""State of the held object on one tick. Perception writes the state; control and safety read it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ CHANNELS = (
 
 
 class GraspState(Record):
-    """Forces and lever arms on the held object, and consistency of each channel.
+    """Forces on the held object, their moment arms, and the consistency of each channel.
 
-    Pairs are (left, right). SI units.
+    Pairs are (left, right). All quantities are in SI units.
     """
 
     t: float  # time of the joint reading [s]

@@ -5,7 +5,8 @@ torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05
           while the joints close                                           held by the gears
 balance   ln N1 − ln N2 = 0, where N are the normal forces                 5 % and 0.4 N
 
-The force of a tip is ρ e^MODULUS F(D, θ), where F is its contact table and ρ its relaxation factor.
+The force of a tip is ρ e^MODULUS F(D, θ), where F is the tip's contact table and ρ is the tip's
+relaxation factor.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ _D_BIAS_MIN = 0.1  # fraction of d
 
 
 class TipResult(NamedTuple):
-    """Result for one tip with standard deviations [m, rad, N, J]."""
+    """Result for one tip, including standard deviations [m, rad, N, J]."""
 
     d: float
     theta: float
@@ -87,8 +88,8 @@ class GraspResult(NamedTuple):
 def _log_slope(h: HandFilter, finger: int) -> float:
     """Return ∂ ln F/∂d [1/m] of a tip.
 
-    With a fixed gain, this is the slope of the footprint channel. Using two different slopes would
-    make unobservable directions appear observable.
+    With a fixed gain, ∂ ln F/∂d is the slope of the footprint channel. Using two different slopes
+    would make unobservable directions appear observable.
     """
     tip = h.tip[finger]
     slope: float = tip.log_slope
@@ -147,7 +148,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _relative_law_error(tip: TrackedTip, fraction: float) -> float:
-    """Return the relative error of F at ``fraction`` = d/radius, due to table and material law."""
+    """Return the relative F error due to table and material law at ``fraction`` = d/radius."""
     t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)
     return interpolate(tip.law_error[k], tip.law_error[k + 1], t - k)
@@ -311,9 +312,9 @@ def _has_bias(grasp: GraspState, finger: int) -> bool:
 
 @inner_kernel
 def _is_larger_bias(bias: Pair, finger: int, smallest: float) -> bool:
-    """Return True if a sensor's bias exceeds ``smallest`` and is not below the other sensor's.
+    """Return True if a sensor's bias exceeds ``smallest`` and is not below the other sensor's bias.
 
-    A bias of one sensor also appears, more weakly, in the estimate for the other sensor.
+    A bias in one sensor also appears, with a smaller value, in the other sensor's estimate.
     """
     size = abs(bias[finger])
     is_larger: bool = size > smallest and size >= abs(bias[1 - finger])

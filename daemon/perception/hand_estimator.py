@@ -2,20 +2,20 @@
 
 Frames are precise but late and infrequent; joint readings are frequent but coarse. While an object
 is held, the joint motion predicts d and the object angle φ through the rolling constraints
-(`hand.grasp_state`), and each frame corrects them. `hand_state` contains the state and its
-prediction; `frame_channels` and `grasp_kernels` contain the measurements.
+(`hand.grasp_state`), and each frame corrects the predicted values. `hand_state` contains the state
+and its prediction; `frame_channels` and `grasp_kernels` contain the measurements.
 
 φ is the angle of the bisector of the object faces. The taper α between the faces is estimated from
 the frames of both tips, starting from ``object.taper``. A shifted sensor looks like a taper, so the
-limit ``hand.angle`` compares the frames with ``object.taper``.
+``hand.angle`` limit compares the frames with ``object.taper``.
 
 A disc has no faces. φ is then the direction of the line between the contacts, and ``rotate`` acts
-on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per unit of joint angle. This ratio
-is 0.4 for a radius R of 20 mm and the default hand, whereas the prediction for faces is 1.5. The
-frames correct the difference, so a rotation takes longer and the disc rolls further than commanded.
-A curved contact appears less tilted than it is, so φ is about 5 % too small. If the fingers are
-straight or lean outwards, the line does not follow the joints: a disc with R ≥ 30 mm can be held,
-but its rotation stops at the tip limits.
+on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per unit of joint angle. For a
+radius R of 20 mm and the default hand, the line rotates by 0.4 rad per rad of joint angle, whereas
+the prediction for faces is 1.5. The frames correct the difference, so a rotation takes longer and
+the disc rolls further than commanded. A curved contact appears less tilted than it is, so φ is
+about 5 % too small. If the fingers are straight or lean outwards, the line does not follow the
+joints: a disc with R ≥ 30 mm can be held, but its rotation stops at the tip limits.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ _GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal cur
 
 
 class HandEstimator:
-    """Estimator for one hand. Without contact, the estimator costs one comparison per tick."""
+    """Estimator for one hand.
+
+    Without contact, the estimator performs only one comparison per tick.
+    """
 
     def __init__(
         self,
@@ -61,8 +64,8 @@ class HandEstimator:
     ) -> None:
         """Create the estimator.
 
-        Each tip has a contact table, priors and a material. The material provides the error of its
-        stress-strain law.
+        Each tip has a contact table, priors and a material. The material provides the stress-strain
+        law error.
         """
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]

@@ -16,8 +16,8 @@ LATENCY         s      frame age beyond `tactile.latency`           (constant in
 FRICTION        N·m    mean joint torque not explained by the       slow drift
                        grip force
 
-States up to TORQUE are pairs: the left finger is at the index, the right finger at the next index.
-SI units.
+The states up to TORQUE are pairs: the left finger's state is at the index, and the right finger's
+state is at the next index. All quantities are in SI units.
 """
 
 from __future__ import annotations
@@ -167,10 +167,11 @@ def predicted_variance(h: HandFilter) -> float:
 def correct(h: HandFilter, channel: int, innovation: float, variance: float, gate: float) -> None:
     """Update the state with one scalar measurement, using `slopes`, then set the slopes to 0.
 
-    ``variance`` is the noise variance. It is increased if the innovation exceeds ``gate`` standard
-    deviations, so that the innovation equals ``gate`` standard deviations. An innovation that is
-    not finite is ignored. `grasp.nis` averages the normalised innovation squared of each
-    ``channel``, limited to ``gate`` squared, over as many measurements as frames arrive in 1 s.
+    ``variance`` is the noise variance. The variance is increased if the innovation exceeds ``gate``
+    standard deviations, so that the innovation then equals ``gate`` standard deviations. An
+    innovation that is not finite is ignored. `grasp.nis` contains the exponential moving average of
+    each ``channel``'s normalised innovation squared. Each value is limited to ``gate`` squared. The
+    averaging time constant is one second of frames.
     """
     expected = predicted_variance(h)
     square = innovation * innovation
@@ -310,10 +311,10 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 
 @inner_kernel
 def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
-    """Advance joints, tips and object with the measured velocities ``dq`` [rad/s].
+    """Advance joints, tips and object according to the measured velocities ``dq`` [rad/s].
 
     The object rolls by turn1 Δq1 − turn2 Δq2, and both displacements change by the same amount,
-    half the change of d1 + d2 (docs/estimation.md).
+    half the change in d1 + d2 (docs/estimation.md).
     """
     left = h.tip[0]
     right = h.tip[1]
@@ -364,7 +365,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
 def _add_rounding_noise(h: HandFilter, finger: int, by: float, turn: float, dt: float) -> None:
     """Add the effect of a joint's velocity rounding on its encoder state, the tips and the object.
 
-    An error of the joint angle changes all of them together: d by ``by`` [m/rad], φ by ``turn``.
+    A joint angle error also changes d by ``by`` [m/rad] and φ by ``turn``.
     """
     variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
     h.scratch[:] = 0.0
@@ -391,7 +392,7 @@ def is_held(h: HandFilter) -> bool:
 
 @inner_kernel
 def _add_process_noise(h: HandFilter, dt: float) -> None:
-    """Add ``dt`` seconds of random walk during a contact."""
+    """Add the process noise for ``dt`` seconds of contact."""
     if is_held(h):
         sideways = _WALK_SIDEWAYS
         if h.is_single:
@@ -413,7 +414,7 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
-    """Update the state with the encoder angle, which is precise at the moment the count changes.
+    """Update the state with the encoder angle, which is precise when the count changes.
 
     Between two changes, the angle is known to within one count. ``step`` [rad] is the joint motion
     since the last reading, computed from the velocity.
@@ -434,13 +435,13 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
 
 @inner_kernel
 def _edge(h: HandFilter, q: float, direction: float) -> float:
-    """Return the edge of the count ``q`` [rad] that a joint crosses in this ``direction``."""
+    """Return the edge [rad] of the count ``q`` that a joint crosses in this ``direction``."""
     return q - math.copysign(0.5 * h.encoder_resolution, direction)
 
 
 @inner_kernel
 def _encoder_measurement(h: HandFilter, finger: int, q: float, step: float) -> tuple[float, float]:
-    """Return the joint angle and the width of its uniform error [rad]; width 0: no information."""
+    """Return the joint angle and the width of its uniform error [rad]; 0 means no information."""
     tip = h.tip[finger]
     resolution = h.encoder_resolution
     jump = q - tip.encoder
@@ -460,10 +461,10 @@ def _encoder_measurement(h: HandFilter, finger: int, q: float, step: float) -> t
 def _measure_free_torque(
     h: HandFilter, finger: int, t: float, dt: float, speed_change: float
 ) -> None:
-    """Measure the maximum torque of a freely moving joint, which equals its friction.
+    """Measure the maximum torque of a freely moving joint; this torque is the joint friction.
 
-    The last `frame_age_max` is excluded, because the tip may already be in contact although no
-    frame has shown it yet.
+    Readings from the last `frame_age_max` are excluded, because the tip may already be in contact
+    although no frame has shown the contact yet.
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
@@ -481,7 +482,8 @@ def _measure_free_torque(
 def _check_current(h: HandFilter, finger: int, current: float, goal: float, dt: float) -> float:
     """Return a joint's current [A]: its ``goal`` during a grip, otherwise the measured current.
 
-    Also check how long the two have differed by more than a servo's current controller allows.
+    Also check how long the goal and the measured current have differed by more than a servo's
+    current controller allows.
     """
     tip = h.tip[finger]
     is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + _CURRENT_NOISE

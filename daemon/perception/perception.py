@@ -53,7 +53,7 @@ class Perception:
         )
 
     def tare(self) -> None:
-        """Start a tare: set each cell's zero offset to its mean over the next frames."""
+        """Start a tare: set each cell's zero offset to the mean of its next readings."""
         for each in self.fingers:
             each.tare()
 
@@ -82,7 +82,7 @@ class RepeatDetector:
     def __init__(self, rate: float, fault_count: float, enabled: bool = True) -> None:
         """Create a detector for a frame ``rate`` [Hz].
 
-        If ``enabled``, ``fault_count`` repeated frames are a fault.
+        If ``enabled``, ``fault_count`` repeated frames count as a fault.
         """
         self._enabled = enabled
         self.period = 0  # repetition period in frames, or 0 without repetition
@@ -93,7 +93,7 @@ class RepeatDetector:
 
     @property
     def is_repeating(self) -> bool:
-        """True if the last two frames have already arrived in this order."""
+        """True if the last two frames have arrived before in the same order."""
         return self._enabled and self._repeated_count > 1
 
     @property
@@ -118,7 +118,7 @@ class RepeatDetector:
 
 
 class FingerPerception:
-    """One finger's sensor, its newest frame, and the contact estimate from that frame alone."""
+    """Sensor of one finger, its newest frame, and the contact estimated from that frame alone."""
 
     def __init__(
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
@@ -182,7 +182,7 @@ class FingerPerception:
         return self._tare_remaining_count > 0
 
     def tare(self) -> None:
-        """Start a tare: set each cell's zero offset to its mean over the next frames."""
+        """Start a tare: set each cell's zero offset to the mean of its next readings."""
         self._tare_sum = 0
         self._tare_remaining_count = _TARE_FRAME_COUNT
         self._unloaded.reset_zero()
