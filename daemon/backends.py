@@ -1,16 +1,16 @@
 """Look up servo, tactile and shape backends by name, and import them on demand.
 
 Built-in backends are listed in `BUILT_IN`. Plugins are entry points of installed packages, in the
-groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A servo or tactile
-plugin is a class, and a shape plugin is a function. Plugins take the same arguments as the built-in
-backends. A plugin may define these attributes:
+groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. Servo and tactile
+plugins are classes, and shape plugins are functions. Plugins take the same arguments as the
+built-in backends. A plugin may define these attributes:
 
-- ``metal``: True (default) if the backend is real hardware.
-- ``hand``: True if the plugin needs the simulated hand. The daemon then passes the hand in the same
-  way as to a built-in backend. Instead of True, a servo plugin may specify a class that replaces
-  `SimulatedHand` and takes the same arguments.
+- ``metal``: True (default) if the backend drives real hardware.
+- ``hand``: True if the plugin needs the simulated hand. The daemon then passes the simulated hand
+  to the plugin in the same way as to a built-in backend. Instead of True, a servo plugin may
+  specify a class that replaces `SimulatedHand` and takes the same arguments.
 - ``Settings``: a pydantic model for the profile table ``[plugins.NAME]``, preferably derived from
-  `profile.fields.Section`. The validated settings are passed as the last argument.
+  `profile.fields.Section`. The daemon passes the validated settings as the last argument.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Kind = Literal["servos", "tactile", "shapes"]
 
 
 class Backend(NamedTuple):
-    """Loader and requirements of a backend."""
+    """Function that loads a backend, and the backend's requirements."""
 
     load: Callable[[], Any]
     metal: bool = True  # True for real hardware
@@ -131,7 +131,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
 def servo_model(name: str) -> Any:
     """Return the `ServoModel` with this name.
 
-    If the name is unknown, raises KeyError with a list of all model names.
+    Raises KeyError, which lists all model names, if the name is unknown.
     """
     table = import_module("softfinger.daemon.servos.control_table")
     try:

@@ -35,7 +35,7 @@ class Clock(Protocol):
 
 
 class LoopClock(Clock, Protocol):
-    """Clock of the loop, which also provides the machine's real time."""
+    """Clock that drives the loop and also provides the machine's real time."""
 
     behind: float  # total time by which `now` lags behind the machine's clock [s]
 
@@ -68,10 +68,10 @@ def emulated(settings: Settings) -> bool:
 
 
 class Deadline:
-    """Start time [s] of the daemon's next tick; an emulated hand must not advance past it.
+    """Start time [s] of the daemon's next tick; an emulated hand must not advance past this time.
 
     The time is measured by the daemon's clock. The deadline is stored in a file in the emulator's
-    port folder, and both processes map this file into memory.
+    port folder. The daemon and the emulator map this file into memory.
     """
 
     NAME = ".deadline"
@@ -131,12 +131,12 @@ class RealClock:
 
 
 class HandClock:
-    """Clock for a simulated or emulated hand, which pauses while the machine is late.
+    """Clock of a simulated or emulated hand; the clock pauses while the machine is late.
 
     The clock's time changes only during a sleep. After a sleep, the time equals the sleep's
     deadline, even if the machine woke up late. The clock makes up for any delay that is shorter
-    than the time to the next deadline. A longer delay is hidden from the hand, and the excess is
-    added to ``behind``. An emulated hand must not advance past ``due``.
+    than the time to the next deadline. If the delay is longer, the excess is added to ``behind``
+    and does not affect the hand's time. An emulated hand must not advance past ``due``.
     """
 
     pauses_when_late = True
@@ -175,7 +175,7 @@ class HandClock:
 class VirtualClock:
     """Clock that advances only when the loop sleeps, so the loop runs at full speed.
 
-    All times begin at ``start``, so two runs with the same seed are identical.
+    The clock begins at ``start``, so two runs with the same seed are identical.
     """
 
     behind = 0.0
@@ -192,7 +192,7 @@ class VirtualClock:
     host = now  # Computations take no virtual time.
 
     def sleep_until(self, t: float) -> float:
-        """Advance the time to ``t`` unless ``t`` has passed; return a wake-up delay of 0."""
+        """Advance the clock to ``t`` unless ``t`` has passed; return a wake-up delay of 0."""
         if t > self._now:
             self._now = t
         return 0.0

@@ -90,7 +90,7 @@ class RecordingError(SoftfingerError):
 
 
 class Reason(StrEnum):
-    """Machine-readable reason for rejecting a command, in the reply's field ``reason``."""
+    """Machine-readable reason for rejecting a command; the ``reason`` field of the reply."""
 
     LATE = "late"
     STOPPED = "stopped"
@@ -105,7 +105,7 @@ class Reason(StrEnum):
 
     @property
     def meaning(self) -> str:
-        """Explanation of the reason, for the documentation."""
+        """Explanation of the reason, which is shown in the documentation."""
         return _MEANINGS[self]
 
 
@@ -137,10 +137,10 @@ _MEANINGS = {
 
 
 class Refused(SoftfingerError):
-    """Rejected command. The reply to the client contains the message."""
+    """Rejected command. The reply to the client contains this exception's message."""
 
     def __init__(self, text: str, reason: Reason | str = Reason.STATE) -> None:
-        """``reason`` is a `Reason`, or another string if the client and daemon versions differ."""
+        """``reason`` is a `Reason`, or any string if the versions of client and daemon differ."""
         super().__init__(text)
         self.reason = reason
 

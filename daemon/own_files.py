@@ -29,7 +29,7 @@ _WORLD_WRITABLE = stat.S_IWOTH
 def open_regular(path: Path) -> BinaryIO:
     """Open a regular file for reading.
 
-    Raises OSError on failure, and if the path is a device or a pipe.
+    Raises OSError on failure or if the path is a device or a pipe.
     """
     mode = path.stat().st_mode  # Check the type first, because opening a device can affect it.
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
@@ -39,7 +39,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_file(path: Path, most: int = SIZE_MAX) -> bytes:
-    """Read a file. Raises OSError like `open_regular`, and if the file exceeds ``most`` bytes."""
+    """Read a file. Raises OSError like `open_regular`, or if the file exceeds ``most`` bytes."""
     with open_regular(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
@@ -59,7 +59,7 @@ def unpacked_size_max(file: BinaryIO) -> int:
 
 
 def runtime_folder() -> Path:
-    """Return the user's runtime folder, which by default contains an emulated hand's port links.
+    """Return the user's runtime folder, the default location of an emulated hand's port links.
 
     The folder is in XDG_RUNTIME_DIR or /run/user. If neither location is usable, the runtime folder
     is in the temporary folder and is named after the user. If another user owns a folder with that
@@ -92,12 +92,18 @@ def runtime_fault() -> str:
 
 
 def shared_folder() -> Path:
-    """Return the user's folder in the temporary folder; another user may have created it."""
+    """Return the path of the user's folder in the temporary folder.
+
+    The folder may belong to another user.
+    """
     return Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
 
 
 def home_folder() -> Path:
-    """Return the fallback folder in the user's home folder. Raises RuntimeError without a home."""
+    """Return the fallback folder in the user's home folder.
+
+    Raises RuntimeError if there is no home folder.
+    """
     return user_cache() / "run"
 
 

@@ -14,7 +14,7 @@ def port_group_remedy(path: str) -> str:
 
 
 def serial_group() -> str:
-    """Return the group of serial ports: ``dialout``, or ``uucp`` on systems without ``dialout``."""
+    """Return the owning group of serial ports: ``dialout`` or, if it does not exist, ``uucp``."""
     import grp  # Some client systems lack this module.
 
     groups = {each.gr_name for each in grp.getgrall()}
@@ -22,7 +22,7 @@ def serial_group() -> str:
 
 
 def grant(path: str) -> str:
-    """Return the command that gives this user access, usually by joining the port's group."""
+    """Return the command that gives this user access, usually by group membership."""
     import grp  # Some client systems lack this module.
 
     try:

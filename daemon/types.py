@@ -1,8 +1,8 @@
 """Define the plain records that the pipeline stages exchange.
 
 Per-finger lists have length 2, left finger first. For a finger that is not in the scene, the values
-stay 0 and ``valid`` is False. Values are plain floats because each tick accesses them one at a
-time. All units are SI. A positive joint angle closes the finger. ``t`` is the clock time in
+stay 0 and ``valid`` is False. Values are plain floats because each tick accesses single values. All
+quantities are in SI units. A positive joint angle closes the finger. ``t`` is the clock time in
 seconds.
 """
 
@@ -183,7 +183,7 @@ class SceneParts(NamedTuple):
 
 
 class TimeSpread(NamedTuple):
-    """Median, tail quantiles and maximum of one loop time since startup [s]."""
+    """Median, tail quantiles and maximum of one loop duration [s] since startup."""
 
     p50: float
     p99: float

@@ -97,7 +97,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return AsyncSubscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     async def collect(self, seconds: float) -> list[HandState]:
-        """Collect all states for ``seconds`` s, measured by the daemon's clock. Raises NoStream."""
+        """Collect all states for ``seconds`` of the daemon's clock time. Raises NoStream."""
         async with self.stream(self.timeout) as states:
             collected = [await anext(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)

@@ -1,4 +1,4 @@
-"""Send commands to a daemon: one function for any command, and one method per command."""
+"""Send commands to a daemon through one general function, or through one method per command."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ UNCONFIRMED_TEXT = "the servos have not confirmed torque off yet"
 
 
 class NoAnswer(SoftfingerError):
-    """The daemon did not reply in time."""
+    """The daemon did not reply before the timeout."""
 
 
 class Attempts:
     """Retry policy for one command, within the caller's timeout.
 
     After a stall, the daemon refuses outdated commands with the reason ``late``. A refused command
-    has no effect. All attempts have the same key, so the daemon executes the command at most once.
+    has no effect. All attempts use the same key, so the daemon executes the command at most once.
     The daemon refuses a repeated attempt if it has received a stop or another command in the
     meantime.
     """
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
-        """Create a policy; all attempts together may take ``timeout`` [s]."""
+        """Create a policy that limits the total duration of all attempts to ``timeout`` [s]."""
         harmless = request.get("command") in NO_LEASE_COMMANDS
         self.request = request if harmless else {**request, "key": secrets.token_hex(8)}
         self.timeout = timeout
@@ -72,7 +72,10 @@ class Attempts:
 
 
 def _now() -> float:
-    """Return the monotonic time [s], which includes suspended time on systems that support it."""
+    """Return the monotonic time [s].
+
+    On systems that support it, this time includes time spent in suspend.
+    """
     return time.clock_gettime(_CLOCK) if _CLOCK is not None else time.monotonic()
 
 
@@ -86,8 +89,8 @@ def send(
 
     If the daemon refuses the command as late, the client sends the command again until ``timeout``
     expires. If the reply takes longer than 1 s, a warning is logged. If no logging handler exists,
-    the warning is printed to standard error. A ``stop`` to a daemon of the same user on this
-    machine is sent over a local socket, which bypasses the queues of other clients.
+    the warning is printed to standard error. If the daemon runs on this machine as the same user,
+    the client sends ``stop`` over a local socket and thus bypasses other clients' queues.
     """
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
@@ -100,7 +103,7 @@ def send(
 
 
 def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) -> dict[str, Any]:
-    """Make one attempt to send a command and return the reply; see `send`."""
+    """Send a command once and return the reply; see `send`."""
     request, timeout, remaining = attempts.request, attempts.timeout, attempts.remaining()
     if request.get("command") == "stop":
         stopped = stop_locally(address, min(remaining, LOCAL_STOP_TIMEOUT))
@@ -140,7 +143,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
 def _number(what: str, value: Any) -> float:
     """Convert a number, including a NumPy scalar or 0-d array, to a float for msgpack.
 
-    Raises Refused for other types.
+    Raises Refused for values of other types.
     """
     if getattr(value, "shape", None) == ():
         value = value.item()
@@ -154,7 +157,7 @@ def _number(what: str, value: Any) -> float:
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """Return the reply without ``ok``. If the reply is a refusal, raises Refused with the reason.
+    """Return the reply without ``ok``. Raises Refused with the reason if the reply is a refusal.
 
     A warning is logged if the servos have not confirmed that torque is off.
     """
@@ -167,7 +170,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_done(command: str, status: dict[str, Any]) -> bool:
-    """Return True if the status shows that a refused command's goal is already reached."""
+    """Return True if the status shows that the goal of a refused command is already reached."""
     mode = status.get("mode", "fault")
     if command == "arm":
         return mode not in ("disarmed", "fault")
@@ -177,7 +180,7 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 
 
 class HandClient(Generic[_Done]):
-    """Base class of `Hand` and `AsyncHand`, which stores the addresses and defines the commands.
+    """Base class that stores the addresses and defines the commands of `Hand` and `AsyncHand`.
 
     If the daemon refuses a command, the command's method raises Refused with the reason. If the
     daemon does not reply, the method raises NoAnswer. If the daemon refuses a command as late, the
@@ -216,7 +219,7 @@ class HandClient(Generic[_Done]):
         return f"{type(self).__name__}: {self.stream_address}, {self.command_address}{ended}"
 
     def close(self) -> None:
-        """Close all sockets, including those of open subscriptions. The hand keeps its state."""
+        """Close all sockets, including the sockets of subscriptions. The hand keeps its state."""
         self._thread.claim()
         self._context.destroy(linger=0)
 
@@ -254,7 +257,10 @@ class HandClient(Generic[_Done]):
         return self._carry_out("move", left=left, right=right)
 
     def grasp(self, force: float | None = None) -> _Done:
-        """Close the fingers and grip with ``force`` [N] per tip; the default is in the settings."""
+        """Close the fingers and grip with ``force`` [N] per tip.
+
+        The default force is ``control.force_default``.
+        """
         return self._carry_out("grasp", force=force)
 
     def rotate(self, angle: float) -> _Done:

@@ -23,7 +23,7 @@ _MESSAGE_SIZE_MAX = 4_000_000
 
 
 def default_addresses() -> tuple[str, str]:
-    """Return the stream and command addresses in SOFTFINGER_ADDRESS; the default is this machine.
+    """Return the addresses in SOFTFINGER_ADDRESS, by default those of a daemon on this machine.
 
     Raises SettingsError like :func:`both_addresses`.
     """
@@ -36,8 +36,8 @@ def default_addresses() -> tuple[str, str]:
 def both_addresses(named: str, where: str) -> tuple[str, str]:
     """Parse a string into the stream and command addresses.
 
-    The string is ``tcp://HOST``, which implies the default ports, or both addresses separated by a
-    comma. Raises SettingsError for other strings; the message begins with ``where``.
+    The string is either ``tcp://HOST``, which implies the default ports, or both addresses
+    separated by a comma. Raises SettingsError for other strings; the message begins with ``where``.
     """
     addresses = [part.strip() for part in named.split(",")]
     if is_host(named):
@@ -60,9 +60,9 @@ def is_host(named: str) -> bool:
 
 
 def require_host(address: str) -> None:
-    """Raise SettingsError if this machine cannot resolve the host of a TCP address.
+    """Raise SettingsError if this machine cannot resolve the host name of a TCP address.
 
-    ZeroMQ does not report an unknown host; it retries forever.
+    ZeroMQ does not report an unknown host; instead, ZeroMQ retries forever.
     """
     if not address.startswith("tcp://"):
         return
@@ -79,7 +79,9 @@ def require_host(address: str) -> None:
 
 
 class OneThread:
-    """Owner of a hand's sockets: the first thread that uses them, until that thread ends.
+    """Owner of a hand's sockets: the first thread that uses the sockets.
+
+    The ownership lasts until the thread ends.
 
     If two threads use one ZeroMQ socket, messages are lost or the process aborts.
     """
@@ -106,7 +108,7 @@ class OneThread:
 def subscribe(
     context: zmq.Context[Any], address: str, *topics: bytes, queue: int = _QUEUE_LENGTH
 ) -> zmq.Socket[Any]:
-    """Create a socket that subscribes to the topics and queues up to ``queue`` messages.
+    """Create a socket that subscribes to ``topics`` and queues up to ``queue`` messages.
 
     Raises zmq.ZMQError if the address is malformed.
     """
@@ -135,7 +137,7 @@ def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
 
 
 def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
-    """Return a message's topic and map. Raises ValueError if the bytes are not a stream message."""
+    """Return the topic and map of a stream message. Raises ValueError for invalid bytes."""
     try:
         topic, packed = frames
         message = msgpack.unpackb(packed)
@@ -147,5 +149,5 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
 
 
 def still_waiting(what: str, timeout: float) -> str:
-    """Return the warning text for data that has not arrived yet."""
+    """Return the warning text to log while a client waits for data."""
     return f"no {what} yet; waiting up to {round(timeout, 2):g} s"

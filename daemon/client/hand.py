@@ -58,15 +58,16 @@ class Hand(HandClient[None]):
     """Client of one hand. Create one `Hand` in each thread.
 
     Commands may be sent from any thread. The first thread that reads the stream (`state`, `stream`,
-    `frames`, `events`, `collect`, `wait_for`) owns it until the thread ends. In other threads,
-    these methods and `close` raise WrongThread. All methods raise HandClosed after `close`.
+    `frames`, `events`, `collect`, `wait_for`) owns the stream until the thread ends. In other
+    threads, these methods and `close` raise WrongThread. All methods raise HandClosed after
+    `close`.
 
     Parameters
     ----------
     stream, commands
-        Addresses of the daemon. ``stream`` may also contain both addresses, as ``tcp://HOST`` or
-        ``STREAM,COMMANDS``. The default is the value of the environment variable SOFTFINGER_ADDRESS
-        or, if the variable is not set, this machine.
+        Addresses of the daemon. ``stream`` may also specify both addresses, as ``tcp://HOST`` or
+        ``STREAM,COMMANDS``. By default, the addresses are read from the SOFTFINGER_ADDRESS
+        environment variable or, if the variable is not set, refer to this machine.
     client
         Client name for the command lease.
     timeout
@@ -116,7 +117,7 @@ class Hand(HandClient[None]):
         return Subscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     def collect(self, seconds: float) -> list[HandState]:
-        """Collect all states for ``seconds`` s, measured by the daemon's clock. Raises NoStream."""
+        """Collect all states for ``seconds`` of the daemon's clock time. Raises NoStream."""
         with self.stream(self.timeout) as states:
             collected = [next(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)

@@ -1,7 +1,7 @@
 """Read the stream: decode messages into records, count lost messages, and wait for a state.
 
 Messages are untrusted input. Fields that are missing or have the wrong type become NaN, 0, False or
-empty. Unknown fields are ignored, so a program also works with a daemon that has a newer schema.
+empty. Unknown fields are ignored, so a program also works with a daemon that uses a newer schema.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _log = logging.getLogger(__name__)
 
 
 def read(record: type[_Record], message: object) -> _Record:
-    """Convert a topic's map to its `wire.schema` record.
+    """Convert a message map to the `wire.schema` record of its topic.
 
     Raises ValueError if the data size of a tactile frame does not match its grid.
     """
@@ -71,7 +71,7 @@ _CONVERTERS: dict[Any, Callable[[object], Any]] = {
 
 
 def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
-    """Convert states to one array per field, with nested names such as ``left.force``.
+    """Convert states to one array per field; nested fields have names such as ``left.force``.
 
     The result can be passed to ``pandas.DataFrame``. Records of other topics are also accepted.
     """
@@ -129,7 +129,7 @@ def no_stream(address: str, topic: bytes, timeout: float) -> NoStream:
 
 
 class Subscriber(Generic[_Record]):
-    """Base class of `Subscription` and `AsyncSubscription`: socket and decoder of one topic.
+    """Socket and decoder for one topic; base class of `Subscription` and `AsyncSubscription`.
 
     ``unreadable`` is the number of messages that were skipped because they could not be decoded.
     """
@@ -193,7 +193,7 @@ class Subscriber(Generic[_Record]):
         return record
 
     def _waits(self, timeout: float | None) -> Iterator[int | None]:
-        """Yield the durations [ms] of successive waits, until ``timeout`` s have passed.
+        """Yield the durations [ms] of successive waits until ``timeout`` [s] has expired.
 
         If there is a timeout, log a warning after 1 s of waiting.
         """
@@ -242,7 +242,7 @@ class Wait:
     def ends_with(self, state: HandState) -> bool:
         """Return True if the condition is met.
 
-        Raises HandFault if the condition is not met and the hand is in fault.
+        Raises HandFault if the condition is not met and the hand is in a fault.
         """
         self._last = state
         if self._condition(state):

@@ -30,20 +30,20 @@ _SECTIONS = ("hand", "tip", "material")
 
 
 def identity(settings: Settings) -> dict[str, Any]:
-    """Return the settings that identify the hand of a map."""
+    """Return the settings that determine whether a map is valid for a hand."""
     identifying = {name: getattr(settings, name).model_dump(mode="json") for name in _SECTIONS}
     return identifying | {"control": {"law": settings.control.law}}
 
 
 def increased_force_limit(settings: Settings, force: float) -> float:
-    """Return the maximum [N] to which the slip monitor may increase a commanded ``force`` [N]."""
+    """Return the maximum grip force [N] after slip for a commanded ``force`` [N]."""
     control, force_max = settings.control, GRIP_FRACTION * settings.safety.force_max
     increase = min(control.grip_raise_max, control.grip_raise_share * force)
     return max(min(force + increase, force_max), force)
 
 
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
-    """Describe the first setting that differs, with both values; return "" if none differs.
+    """Describe the first setting that differs between map and hand; return "" if none differs.
 
     If an older map does not contain a setting, the setting's default is used.
     """
@@ -93,7 +93,7 @@ class Envelope:
         self._settings = settings
 
     def warning(self, force: float) -> str:
-        """Return a warning if a grasp with ``force`` [N] may fail, otherwise "".
+        """Return a warning if a grasp with ``force`` [N] may fail; otherwise, return "".
 
         The lookup uses the nearest object size, the highest friction not above
         `control.tip_friction`, and the mass whose weight is `control.object_load`. The mass is

@@ -86,7 +86,7 @@ class Fingers:
             self._setpoints[index].reset(q)
 
     def set_target(self, index: int, q: float) -> None:
-        """Set the target of one joint's setpoint to ``q`` [rad]."""
+        """Set the setpoint target of one joint to ``q`` [rad]."""
         self._setpoints[index].target = q
 
     def close_fingers(self, touching: set[int]) -> set[int]:
@@ -107,7 +107,7 @@ class Fingers:
         return now_touching
 
     def advance_setpoints(self, rate: float) -> bool:
-        """Advance the setpoints at up to ``rate`` [rad/s]; return True once all have arrived."""
+        """Advance setpoints at up to ``rate`` [rad/s]; return True once all targets are reached."""
         arrived = [joint.step(rate) for joint in self._setpoints]
         return all(arrived)
 

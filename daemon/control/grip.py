@@ -1,25 +1,26 @@
 """Compute joint torques from tip forces and object angle, once both tips are in contact.
 
 `control.grip_kernels` contains the computations. Two fingers have one motion that changes the grip
-(both close) and one that moves the object (q1 + δ, q2 − δ). Every control law therefore has two
+(both close) and another that moves the object (q1 + δ, q2 − δ). Every control law therefore has two
 parts:
 
 1. *grip*: a feed-forward torque (moment arm × target force + joint friction), proportional and
    integral feedback of the force error, and damping matched to the tip stiffness;
-2. *steering*, the serial two-phased controller of the soft-fingertip literature: the integrated
+2. *steering*, the serial two-phased controller from the soft-fingertip literature: the integrated
    object angle error is added to the joint goals with opposite signs, and a PD controller follows
    these goals. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
 
-With ``control.law = "energy"``, the moment arms are the gradient of the contact-table energy along
-the rolling increments. These moment arms account for the moments and shear forces of the tips.
+With ``control.law = "energy"``, the moment arms follow from the derivatives of the contact-table
+energy with respect to the joint angles while the tips roll. The moment arms therefore account for
+the moments and shear forces of the tips.
 
-With ``"upright"``, the control law ignores the object angle until a command steers it. The upright
-law gives both joints the same torque plus damping, as in the literature on blind grasping. A
-virtual spring between the fingers places the minimum of the tips' elastic energy at the upright
+With ``"upright"``, the control law ignores the object angle until a command steers the object. The
+upright law gives both joints the same torque plus damping, as in the literature on blind grasping.
+A virtual spring between the fingers places the minimum of the tips' elastic energy at the upright
 object pose, regardless of residual shear in the tips (`hand.upright`). Antisymmetric dither of the
-fingers overcomes joint friction until the object has settled in that minimum. The control law then
-holds the antisymmetric joint angle. Once a command steers the object, the moment arm is the
-distance from the pivot to the force's line of action.
+fingers overcomes joint friction until the object has settled in that minimum. Afterwards, the
+control law holds the antisymmetric joint angle. Once a command steers the object, the moment arm is
+the distance from the pivot to the force's line of action.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class Grip:
 
     @property
     def target(self) -> float:
-        """Commanded force, increased if necessary to prevent slip [N]."""
+        """Commanded force [N], increased if necessary to prevent slip."""
         return self.force.target
 
     @property
@@ -102,7 +103,7 @@ class Grip:
 
     @property
     def stopping_ratio(self) -> float:
-        """Ratio of the earliest stop angle to the current angle; 0 unless |angle| increases."""
+        """Smallest possible stop angle divided by the current angle; 0 unless |angle| increases."""
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
             return 0.0
@@ -122,7 +123,8 @@ class Grip:
     def retarget(self, force: float) -> None:
         """Change the commanded force [N].
 
-        If the commanded force decreases, the force increase due to slip decreases in proportion.
+        If the commanded force decreases, the force required to prevent slip is reduced in
+        proportion.
         """
         force = min(force, self.commanded_max)
         if force < self.commanded:
@@ -136,7 +138,7 @@ class Grip:
         self._state.force_rate = change / self._control.force_time
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the force to ``force_max`` [N] from now on and reach it within ``duration`` [s]."""
+        """Limit the force to ``force_max`` [N], and ramp to this limit within ``duration`` [s]."""
         self.commanded_max = force_max
         self.retarget(force_max)
         self._state.force_rate = abs(self.force.value - force_max) / duration
@@ -171,7 +173,7 @@ class Grip:
     def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
         """Return joint torques [N·m], positive when closing, 0 for an unused finger.
 
-        Set ``holding`` once the grip has settled, so that only loads move the joints.
+        ``holding`` must be True only in a settled grip, in which only loads move the joints.
         """
         if self._single_finger is not None:
             return self._single_torque(reading, False)

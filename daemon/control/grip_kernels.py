@@ -1,7 +1,7 @@
 """State and kernels of the grip control laws; `control.grip` explains the control laws.
 
 The kernels called from Python take the controller state, this tick's grasp, and the windows of both
-setpoints. Pairs are (left, right). SI units.
+setpoints. Pairs are (left, right). All quantities are in SI units.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def grip_torques(
     """Return both joint torques [N·m].
 
     ``angle`` is the object angle [rad] (NaN if unknown) and ``dq`` are the joint velocities
-    [rad/s]. ``holding`` is True in a settled grip, where only loads move the joints.
+    [rad/s]. ``holding`` is True in a settled grip, in which only loads move the joints.
     """
     g = grips[0]
     grasp = grasps[0]
@@ -154,7 +154,7 @@ def hold_goal(
 ) -> tuple[float, float]:
     """Return joint torques while frames are late: hold the force and end any rotation.
 
-    Call this instead of :func:`grip_torques`.
+    Call this kernel instead of :func:`grip_torques`.
     """
     g = grips[0]
     g.offset_rate *= g.law.turn_decay
@@ -234,7 +234,7 @@ def _grip_force(g: GripState, target: float, measured: float, bound: float, limi
 
 @inner_kernel
 def _force_limit(g: GripState, load: float, arm: float) -> float:
-    """Return an upper limit for the grip force [N] that is independent of the sensors.
+    """Return a sensor-independent upper limit for the grip force [N].
 
     The limit is the target force, increased to allow for the torque constant error, joint friction
     and the torque due to the detected ``load`` [N·m]. ``arm`` is the force's moment arm [m].
@@ -266,7 +266,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
     """Equalise the tip forces if friction between object and support keeps them unequal.
 
     The force controller acts only on the mean tip force. To equalise the forces, both fingers shift
-    sideways by a small angle, which rotates the object by at most _DISTRIBUTE_ANGLE.
+    sideways by a small angle, so the object rotates by at most _DISTRIBUTE_ANGLE.
     """
     off = (
         0.5
@@ -283,7 +283,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
 
 @inner_kernel
 def _closing_rate(grasp: GraspState, rate: float, offset_rate: float) -> float:
-    """Return the closing rate [rad/s] that changes the force at ``rate`` [N/s] while rotating."""
+    """Return the closing rate [rad/s] for a force ``rate`` [N/s], also while the object rotates."""
     arm = grasp.moment_arm
     rotation = grasp.jacobian_rotation
     d_rate = 2.0 * rate / _mean_stiffness(grasp)
@@ -321,7 +321,7 @@ def _torques(
 def _equal_torques(
     g: GripState, grasp: GraspState, target: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return joint torques that push with equal force at any object angle.
+    """Return joint torques with which both tips push equally hard at any object angle.
 
     After the dither, the joints hold their antisymmetric angle.
     """

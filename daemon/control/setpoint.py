@@ -68,7 +68,7 @@ def _add(mean: RunningMean, windows: FloatArray, start: int, value: float) -> fl
 
 @inner_kernel
 def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
-    """Advance by one tick towards the target at up to ``rate`` [1/s]; return the new value."""
+    """Advance towards the target by one tick at up to ``rate`` [1/s]; return the new value."""
     remaining = s.target - s.ramp
     last = s.value
     if remaining == 0.0:
@@ -108,7 +108,7 @@ class Setpoint:
 
     The first mean limits the acceleration to rate/window; the second limits the jerk to
     rate/(window · window/2). The value never overshoots, for any sequence of targets. The value
-    reaches the target 1.5 windows after the ramp does.
+    reaches the target 1.5 windows later than the ramp.
     """
 
     def __init__(self, dt: float, window: float, state: SetpointState) -> None:
@@ -126,7 +126,7 @@ class Setpoint:
         _reset(self.state.array, self.windows, value)
 
     def step(self, rate: float) -> bool:
-        """Advance by one tick at up to ``rate`` [1/s]; return True once stopped at the target."""
+        """Advance by one tick at up to ``rate`` [1/s]; return True once settled at the target."""
         return _step(self.state.array, self.windows, rate)
 
     @property

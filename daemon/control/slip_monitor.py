@@ -10,11 +10,11 @@ The following is computed on each tick, with the names from `SlipLaw`, `SlipStat
     force     min(max(commanded, needed), force_limit)
 
 **Offset.** Gear friction and errors in modulus and torque constant cause a residual even without a
-load. The offset is measured when holding begins, and again after force or angle have changed. A
-load detected during the previous hold is not part of the offset. The offset then follows r̄ slowly
-(_SETTLING_TIME). While the joints are at standstill, the offset follows the commanded torque
-immediately, because friction carries any torque that is added to a stuck joint. The offset stays
-within ±`friction` of its initial value. Because rubber relaxes, the offset may fall below this
+load. The offset is measured when holding begins, and again after the force or the angle has
+changed. A load detected during the previous hold is not part of the offset. The offset then follows
+r̄ slowly (_SETTLING_TIME). While the joints are at standstill, the offset follows the commanded
+torque immediately, because friction carries any torque that is added to a stuck joint. The offset
+stays within ±`friction` of its initial value. Because rubber relaxes, the offset may fall below the
 range by up to _RELAXATION_SHARE of the tip moment.
 
 **Load.** Friction hides a load of up to friction/load_arm, which is 2 N per tip for the default
@@ -22,9 +22,9 @@ hand. Loads below half of the hidden load are ignored. Larger loads are increase
 friction may hide. Increasing the grip force by more than _UNCONFIRMED_SHARE requires confirmation:
 the object has rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
 
-**Sudden events** increase the force immediately. A torque jump beyond the noise while both joints
-yield, or a shear jump in the frames of solid tips, increases the force to its limit. An object
-rotation beyond the tips' shear deformation μ (d1 + d2)/2W increases the force by
+**Sudden events** increase the force immediately. The force increases to its limit if the torques
+jump beyond the noise while both joints yield, or if the shear in the frames of solid tips jumps. An
+object rotation beyond the tips' shear deformation μ (d1 + d2)/2W increases the force by
 _ROTATION_INCREASE. A sliding tip transmits only its friction force, so the size of a sudden load is
 unknown. In a pull, the two torques jump in the same direction; in a twist, they jump in opposite
 directions. A sideways push looks like a twist.
@@ -83,7 +83,7 @@ class SlipLaw(Record):
 
 
 class SlipState(Record):
-    """Load, friction and force increase of one held object."""
+    """Estimated load, friction and force increase for one held object."""
 
     law: SlipLaw
     friction: float  # joint friction, including the force-dependent part [N·m]
@@ -135,7 +135,10 @@ def configure(s: SlipState, settings: Settings) -> None:
 
 @inner_kernel
 def reset(s: SlipState) -> None:
-    """Reset everything except the law and the torque when the object is released or replaced."""
+    """Reset everything except the law and the torque.
+
+    Call this kernel when the object is released or replaced.
+    """
     s.is_watched = s.is_confirmed = s.has_turned = s.reflex_triggered = False
     s.friction = s.offset = s.start_offset = s.deviation = s.moment = s.holding_time = 0.0
     s.load = s.assumed_load = s.pull = s.twist = 0.0
@@ -146,10 +149,11 @@ def reset(s: SlipState) -> None:
 
 @inner_kernel
 def begin(s: SlipState, grasp: GraspState) -> None:
-    """Begin holding, or continue after force or angle have changed.
+    """Begin holding, or continue after the force or the angle has changed.
 
-    Without a load, the offset equals the current residual. A load from the previous hold is assumed
-    to persist, unless this would move the offset out of its range. The range scales with the force.
+    Without a load, the offset equals the residual on this tick. A load from the previous hold is
+    assumed to persist, unless this assumption would move the offset out of its range. The range is
+    proportional to the force.
     """
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
@@ -231,9 +235,9 @@ def update(
 
 @inner_kernel
 def _update_friction(s: SlipState, grasp: GraspState) -> float:
-    """Set the joint friction and the usable tip friction; return the tip friction before its bound.
+    """Set the joint friction and the usable tip friction; return the unbounded tip friction.
 
-    Rolling uses a part of the tip friction that increases with the grip force.
+    Rolling uses up part of the tip friction, and this part increases with the grip force.
     """
     law = s.law
     free_torque = max(mean(grasp.free_torque), law.joint_friction)
@@ -281,7 +285,7 @@ def _update_needed_force(s: SlipState, needed_force: float, commanded: float) ->
 
 @inner_kernel
 def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
-    """Return the maximum force [N] to which the grip may be increased.
+    """Return the highest grip force [N] that an increase may reach.
 
     The force may be increased without confirmation up to the force that the ``declared`` load
     requires.
@@ -326,16 +330,17 @@ def _has_jumped(
     dq: FloatPair,
     sudden_min: float,
 ) -> bool:
-    """Return True if ``changes`` of both residuals [N·m] show a pull (kind 0) or a twist (kind 1).
+    """Return True if the residual ``changes`` [N·m] show a pull (kind 0) or a twist (kind 1).
 
     A pull changes both residuals equally, whereas a twist changes them in opposite directions. Four
     tests exclude other causes:
 
-    1. Both residuals change. A wrong current or frame affects only one joint.
-    2. The change exceeds the noise. Soon after holding began, friction may also be released.
+    1. Both residuals change. A wrong current measurement or frame affects only one joint.
+    2. The change exceeds the noise. The noise threshold is higher soon after holding begins,
+       because friction may be released.
     3. Both joints yield to the load.
-    4. The load increases to a large fraction of the friction force. Half of the load that joint
-       friction may hide is added.
+    4. The load increases to a large fraction of the friction force. For this test, half of the load
+       that joint friction may hide is added to the measured load.
     """
     sense = 1.0 - 2.0 * kind
     change = 0.5 * (changes[0] + sense * changes[1])
@@ -362,7 +367,7 @@ def _has_jumped(
 def _detect_shear_jump(
     s: SlipState, pull: float, twist: float, is_held: bool, sudden_min: float
 ) -> bool:
-    """Average the load [N] measured by solid tips; return True if it jumped."""
+    """Average the load [N] measured by solid tips; return True if this load jumped."""
     pull_jump = pull - s.pull
     twist_jump = twist - s.twist
     s.pull += pull_jump * s.law.dt / _AVERAGE_TIME
@@ -374,9 +379,9 @@ def _detect_shear_jump(
 
 @inner_kernel
 def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> None:
-    """Estimate the load from the residual that friction cannot explain.
+    """Estimate the load from the part of the residual that friction cannot explain.
 
-    ``torque_change`` is the change of the mean joint torque since the previous tick [N·m].
+    ``torque_change`` is the change in mean joint torque since the previous tick [N·m].
     """
     law = s.law
     smaller = 0.0
@@ -420,7 +425,7 @@ def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_chan
 
 @inner_kernel
 def _has_turned(s: SlipState, grasp: GraspState) -> bool:
-    """Return True if the object has rotated by more than the tips can shear.
+    """Return True if the object has rotated further than shear of the tips allows.
 
     Both tips must show the rotation, because a single faulty sensor can simulate a rotation.
     """

@@ -27,7 +27,7 @@ Several states share these transitions:
 - Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for _EMPTY_TIME →
   Travelling (RELEASING)
 - Pressing, Settled, Changing, Turning: a contact is missing for `safety.frame_age_fault` frame
-  periods → Armed. Until then, the joints hold their positions.
+  periods → Armed. The joints hold their positions while a contact is missing.
 
 Each transition creates a new instance of a state class. Timers and flags are attributes of the
 state that uses them and are discarded with it. `control.modes` lists the commands for each mode,
@@ -107,7 +107,7 @@ class Travelling(ControlState):
 
 @dataclass
 class GraspCommand:
-    """Values commanded for a grasp, stored until the grasp has settled."""
+    """Force and angle commanded for a grasp, stored until the grasp has settled."""
 
     force: float  # [N]
     is_streamed: bool  # True if the client streams the force
@@ -127,7 +127,7 @@ class Approaching(ControlState):
 
 @dataclass
 class GripHistory:
-    """Data shared by the states of one grip, from the contact of all fingers until its end."""
+    """Data shared by the states of a grip, from contact of all fingers to the end of the grip."""
 
     lost_for: float = 0.0  # [s]
     lost_current: float = 0.0  # current limit while a contact is missing [A]
@@ -174,7 +174,7 @@ class Turning(Gripping):
 
 
 class Control:
-    """State machine of the hand and its commands. Only the loop thread may use this class."""
+    """State machine that executes the hand's commands. Only the loop thread may use this class."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
         """Create the machine; ``state`` and ``grasp`` are read on each tick but never written."""
@@ -220,7 +220,7 @@ class Control:
     def fail(self, reason: str, name: str) -> None:
         """Latch a fault: torque stays off until ``clear``.
 
-        ``name`` is its row in `safety.limits`.
+        ``name`` is the name of the violated limit in `safety.limits`.
         """
         self._enter(Off(Mode.FAULT))
         self.events.append(("error", name, reason))
@@ -256,10 +256,10 @@ class Control:
         self._enter(Travelling(Mode.RELEASING))
 
     def grasp(self, force: float, is_streamed: bool = False) -> None:
-        """Close until all fingers touch. Then increase the mean tip force to ``force`` [N].
+        """Close the fingers until all touch; then increase the mean tip force to ``force`` [N].
 
         If the hand is already gripping, only the force changes and the mode stays the same. Set
-        ``is_streamed`` if the force may change again before it is reached.
+        ``is_streamed`` if a client streams setpoints, so the force may change before it is reached.
         """
         state = self.state
         if isinstance(state, Gripping):
@@ -288,8 +288,9 @@ class Control:
     def hold(self, force: float | None = None, angle: float | None = None) -> float | None:
         """Follow streamed setpoints for the grip ``force`` [N] and the object ``angle`` [rad].
 
-        If the hand is not gripping yet, it first grasps with ``force``. The setpoints move
-        smoothly: the angle at `control.rotate_speed`, the force within `control.force_time`.
+        If the hand is not gripping yet, it first grasps with ``force``. The angle setpoint moves
+        smoothly at `control.rotate_speed`, and the force setpoint reaches its target within
+        `control.force_time`.
 
         Returns
         -------
@@ -313,7 +314,7 @@ class Control:
         return None
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the grip force to ``force_max`` [N] and reach it within ``duration`` [s]."""
+        """Limit the grip force to ``force_max`` [N]; reach this limit within ``duration`` [s]."""
         if isinstance(self.state, Gripping):
             self.grip.limit_force(force_max, duration)
             self._change(self.state)
@@ -357,7 +358,7 @@ class Control:
             goal.force = self.state.command.force
 
     def hold_goal(self, goal: Goal) -> None:
-        """Hold the goals while frames are late; called instead of :meth:`step`.
+        """Hold the goals while frames are late. Call this method instead of :meth:`step`.
 
         In a grip, the goals are torques: the joints stay damped, and any rotation stops.
         """
@@ -365,7 +366,7 @@ class Control:
             self.fingers.apply_torques(goal, self.grip.hold_goal(self.fingers.reading))
 
     def _current(self) -> float:
-        """Return the current limit [A] for joints that follow their setpoints."""
+        """Return the motor current limit [A] for joints that follow their setpoints."""
         state, law = self.state, self._settings.control
         if isinstance(state, Armed):
             return state.current
@@ -410,7 +411,7 @@ class Control:
                 self._enter_armed()
 
     def _empty_for(self, before: float, dt: float) -> float:
-        """Return the duration [s] of apparent tip-to-tip contact; release after _EMPTY_TIME.
+        """Return the duration [s] of apparent tip-to-tip contact; after _EMPTY_TIME, release.
 
         Tips that press against each other would roll off to one side. When the tips touch each
         other, both sensors measure the same contact, so the estimated object width is 0 to within
@@ -445,7 +446,7 @@ class Control:
         history.empty_for = self._empty_for(history.empty_for, dt)
 
     def _handle_contact_loss(self, history: GripHistory, dt: float, goal: Goal) -> None:
-        """Hold the joints while a contact is missing; end the grip if it remains missing."""
+        """Hold the joints while a contact is missing; end the grip if it does not return."""
         if not history.lost_for:
             self.fingers.hold_here()
             # A sensor failure must not cause the joints to press harder.
@@ -487,7 +488,8 @@ class Control:
     def _is_force_reached(self, is_streamed: bool) -> bool:
         """Return True if the mean tip force has reached its target or a setpoint near the target.
 
-        The mean is used because friction between object and support may unbalance the tip forces.
+        The mean is used because friction between object and support may make the tip forces
+        unequal.
         """
         grip = self.grip
         wanted = grip.force.value if is_streamed else grip.target

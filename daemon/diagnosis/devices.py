@@ -59,7 +59,7 @@ _POISSON_TOLERANCE = 0.02  # tolerance for ν, limited by the accuracy of the ca
 
 
 def check_servos(settings: Settings) -> list[Finding]:
-    """Check each servo in the scene; if a servo does not reply, search at every baud rate."""
+    """Check each servo in the scene. If a servo does not reply, search all baud rates."""
     servos = settings.servos
     model = by_name(servos.model)
     try:
@@ -94,11 +94,11 @@ def _wait_for(line: ServoLine, settings: Settings) -> None:
 def _try_exchange(
     line: ServoLine, settings: Settings, model: ServoModel, found: list[Examined]
 ) -> list[Finding]:
-    """If all servos are usable, measure the duration of the reads and writes in a tick.
+    """If all servos are usable, measure how long the reads and writes of a tick take.
 
-    The writes have the same length and address as those of a tick, but contain the current register
-    values, so nothing changes. If a servo has torque on, or might switch it on when a goal is
-    written, only the reads are measured.
+    The writes have the same length and address as in a tick. The writes contain the values that the
+    registers already have, so nothing changes. If a servo has torque on, or might switch it on when
+    a goal is written, only the reads are measured.
     """
     if not all(each.table and not each.errors for each in found):
         return []
@@ -124,7 +124,7 @@ def _try_exchange(
 
 
 def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -> list[Finding]:
-    """Return the findings for one servo. ``late`` is True if the servo replied after a wait."""
+    """Return the findings for one servo. ``late`` is True if the servo did not reply at once."""
     name = servo.name
     if not servo.replies:
         if servo.errors:
@@ -178,7 +178,7 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
 
 
 def _blame_power(examined: list[Examined]) -> list[Finding]:
-    """Report the most likely cause if servos are missing and a search finds no others."""
+    """Report the most likely cause if servos are missing and the search finds no other servos."""
     at = reg.PRESENT_INPUT_VOLTAGE
     volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
     problem = "no other servo replies at any baud rate"
@@ -196,7 +196,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
 
 
 def check_law(settings: Settings, finger: int) -> Finding:
-    """Compare the contact law of a tip with the contact law that `calibrate law` identified."""
+    """Compare a tip's configured contact law with the law that `calibrate law` identified."""
     name, tip = f"tip {FINGERS[finger]}", settings.tip
     try:
         calibration = calibration_for(settings, finger)
@@ -260,7 +260,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
 
 
 def _rest(settings: Settings, finger: int, frame: Frame) -> float:
-    """Return the pressure of an unloaded cell [Pa]: the median of all cells.
+    """Return the median pressure of all cells [Pa], which is the pressure of an unloaded cell.
 
     A contact loads fewer than half of the cells.
     """

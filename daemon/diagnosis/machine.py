@@ -1,4 +1,4 @@
-"""Check scheduling, memory, idle states and clock, which determine if ticks run on time.
+"""Check the scheduling, memory, idle states and clock, which affect whether ticks run on time.
 
 The problems found here only degrade the timing, so they are reported as warnings. The checks read
 the limits of this process. A daemon that is started from the same shell has the same limits.
@@ -64,7 +64,7 @@ def check_memory_lock(limit: int) -> Finding:
 
 
 def check_idle_states(path: Path) -> Finding:
-    """Check that the daemon can disable deep processor idle states, which wake up slowly."""
+    """Check that the daemon can disable deep idle states, from which processors wake up slowly."""
     name = str(path)
     if not path.exists():
         return Finding("warn", name, "not provided by this kernel: deep idle states delay wake-ups")
@@ -84,7 +84,7 @@ def check_wall_clock(now: float) -> Finding:
 
 
 def wake_ups() -> list[float]:
-    """Measure wake-up delays [s] after the kind of sleep that is used between ticks."""
+    """Measure wake-up delays [s] after sleeping in the same way as between ticks."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UP_COUNT):

@@ -47,7 +47,7 @@ def check_runtime_folder() -> Finding:
 
 
 def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
-    """Check that a port exists, can be opened, and is not used by another process.
+    """Check that a port exists, can be opened, and is not in use by another process.
 
     The port is closed afterwards. ``key`` is the setting that names the port. ``mode_of_daemon`` is
     the mode of a running daemon that may be using the port; it is empty if no daemon runs.
@@ -163,7 +163,7 @@ _TIMEOUT = 0.5  # timeout for a daemon's reply [s]
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
-    """Check that all addresses can be bound; if not, report if a daemon uses the addresses."""
+    """Check that all addresses can be bound; if not, report whether a daemon is using them."""
     found = [
         _check(settings, "stream.address", settings.stream.address),
         _check(settings, "commands.address", settings.commands.address),

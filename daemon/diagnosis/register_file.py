@@ -1,6 +1,6 @@
-"""Save the registers of the scene's servos to a file before changes, and restore them.
+"""Save the registers of the scene's servos to a file, and restore registers from a file.
 
-The file is JSON, with the register names and values of `servos.register_table.REGISTERS`:
+The file contains JSON; the register names are those in `servos.register_table.REGISTERS`:
 ``{"servos": [{"id": 1, "model": "XM430-W350", "firmware": 48, "registers": {NAME: value}}]}``.
 """
 
@@ -27,7 +27,7 @@ _PASS_COUNT = 2  # number of passes; a servo may reject a lower limit until the 
 
 
 class StoredServo(Section):
-    """Entry for one servo in the file."""
+    """Entry for one servo in a register file."""
 
     id: int
     model: str
@@ -47,7 +47,7 @@ class StoredServo(Section):
 
 
 class StoredServos(Section):
-    """Contents of the file."""
+    """Contents of a register file."""
 
     servos: tuple[StoredServo, ...]
 
@@ -141,7 +141,7 @@ def _restore(
 
 
 def _stored(path: Path) -> dict[int, StoredServo]:
-    """Return a file's servos as a dictionary with the ID as key.
+    """Return the servos in a register file as a dictionary, keyed by ID.
 
     Raises ServoError if the file format is invalid.
     """

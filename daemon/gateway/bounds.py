@@ -1,7 +1,7 @@
 """Define the gateway's limits for messages, queues, rates and memory; see `docs/security.md`.
 
 The profile's limits (`commands.max_bytes`, `commands.per_second`, `stream.queue`) are part of
-`Config`, which the gateway receives at startup.
+`Config`, which is passed to the gateway at startup.
 """
 
 from __future__ import annotations
@@ -57,7 +57,10 @@ READY = "ready"  # printed by the process once its sockets are bound
 
 
 class Config(NamedTuple):
-    """Addresses, limits and stream topics of a gateway. Empty addresses are not bound."""
+    """Addresses, limits and stream topics of a gateway.
+
+    If an address is empty, the gateway does not open that socket.
+    """
 
     stream: str
     commands: str

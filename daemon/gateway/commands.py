@@ -1,9 +1,9 @@
 """Forward requests to the loop, within the limits in `bounds`, and forward replies to clients.
 
-The gateway does not unpack requests. Requests that look like a stop bypass the queues, one at a
-time for each client. Apart from stops, only a few requests are forwarded to the loop at a time.
-Further requests wait in queues, and the clients are served in turn. If a client exceeds its rate,
-its requests are refused until it pauses.
+The gateway does not unpack requests. Requests that look like a stop bypass the queues; each client
+may have one such request at a time. Other requests are forwarded to the loop a few at a time.
+Further requests wait in queues, and the clients are served in turn. If a client exceeds its rate
+limit, its requests are refused until the client pauses.
 
 Each request is stamped with its arrival time and the number of stops that preceded it. The libzmq
 thread reads ahead, so the gateway can't determine whether a request arrived before or after a stop.
@@ -51,7 +51,7 @@ class Client:
         self.last = -math.inf  # time of the last request
 
     def floods(self, per_second: float, now: float) -> bool:
-        """Count one request; return True if the client has exceeded its rate and must pause."""
+        """Count one request; return True if the client must pause because of the rate limit."""
         passed, self.last = now - self.last, now
         tokens = min(self._tokens + passed * per_second, per_second) - 1.0
         self._tokens = max(tokens, 0.0)
@@ -99,9 +99,9 @@ class CommandEndpoint:
         self._under_way = [0, 0]  # number of requests that await the loop's reply: normal, urgent
 
     def fence(self, stops: int) -> None:
-        """Stamp new requests as older than the last stop until all earlier requests are read.
+        """Stamp requests as older than the last stop until all earlier requests are read.
 
-        Until then, hold replies back for a limited time.
+        Replies are held back for a limited time until all earlier requests are read.
         """
         if self.stops == self._fence:
             self._held_for = 0.0
@@ -109,7 +109,7 @@ class CommandEndpoint:
         self._since, self._arrived = self._clock(), 0
 
     def read(self) -> None:
-        """Read requests for up to `bounds.TURN_TIME`, forward them, and send the due replies."""
+        """Read and forward requests for up to `bounds.TURN_TIME`, and send replies that are due."""
         began = self._clock()
         gap, self._last_poll = began - self._last_poll, began
         if gap > bounds.POLL_GAP_MAX:

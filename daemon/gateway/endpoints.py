@@ -1,8 +1,8 @@
 """Open the client sockets, authenticate the clients and publish the stream.
 
-Without keys all clients are accepted, but libzmq disconnects peers that do not send a ZMTP 3
-greeting. The greeting excludes web pages, whose POST requests are valid messages in older protocol
-versions.
+Without keys, all clients are accepted, but libzmq disconnects peers that do not send a ZMTP 3
+greeting. This requirement excludes web pages, because their POST requests are valid messages only
+in older protocol versions.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class RestartNeeded(SoftfingerError):
 
 
 class ClientSockets:
-    """Sockets with the gateway's limits, restricted to clients whose keys are in the key folder."""
+    """Sockets that enforce the gateway's limits and admit only clients with a stored key."""
 
     def __init__(self, config: bounds.Config) -> None:
         """Load the keys; without a key folder, all clients are accepted. Raises KeyFileError."""
@@ -85,7 +85,7 @@ class ClientSockets:
                 self.handshakes.send_multipart([version, number, status, b"", user.encode(), b""])
 
     def name(self, part: zmq.Frame) -> str:
-        """Return the client name for the sender's key, or an empty string if no keys are used."""
+        """Return the client name that belongs to the sender's key, or "" if no keys are used."""
         return "" if self._keys is None else str(part.get("User-Id"))
 
     def _update_keys(self, now: float) -> None:
@@ -133,7 +133,7 @@ def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
 
 
 def read_parts(source: zmq.Socket[Any]) -> list[zmq.Frame]:
-    """Read the next message's parts, but at most one part more than allowed.
+    """Read the parts of the next message, but at most one part more than allowed.
 
     Returns an empty list if there is no message.
     """

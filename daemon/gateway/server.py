@@ -1,8 +1,8 @@
 """Run the gateway process. One thread serves the loop and the clients.
 
 The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's
-file descriptor and a `Config` as JSON. It prints `READY` once its sockets are bound, and exits when
-the loop disconnects. If it exits for another reason, it prints the reason.
+file descriptor and a `Config` as JSON. The process prints `READY` once its sockets are bound, and
+exits when the loop disconnects. If the process exits for another reason, it prints the reason.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Server:
 
 
 def main(words: list[str]) -> int:
-    """Serve clients until the loop ends.
+    """Serve clients until the loop disconnects.
 
     Returns 1 if the sockets could not be bound or if all clients must reconnect, otherwise 0.
     """

@@ -1,4 +1,4 @@
-"""Start the gateway process and restart it if it dies."""
+"""Start the gateway process and restart it if it exits unexpectedly."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _START_INTERVAL = 2.0  # minimum time between two starts [s]
 
 
 class Gateway:
-    """Gateway process, which is restarted whenever it dies until `close` is called.
+    """Gateway process that is restarted if it exits before `close` is called.
 
     The loop communicates through `link`.
     """
@@ -92,7 +92,7 @@ class Gateway:
                     self.link.notices.append(f"the gateway can't start: {error}")
 
     def _wait(self) -> None:
-        """Wait for the process to end, and report the reason.
+        """Wait for the process to exit, and report the reason.
 
         A suspended process is killed, because its timers don't run.
         """
@@ -127,7 +127,7 @@ class Gateway:
 
 
 def _is_suspended(process: int, options: int = 0) -> bool:
-    """Wait until a child process is suspended or has ended; return True if it is suspended."""
+    """Wait until a child process is suspended or has exited; return True if it is suspended."""
     states = os.WEXITED | os.WSTOPPED | os.WNOWAIT
     found = os.waitid(os.P_PID, process, states | options)
     return found is not None and found.si_code == os.CLD_STOPPED

@@ -1,7 +1,8 @@
 """Build, connect and warm up a daemon from its settings.
 
 Sockets are bound before any hardware is accessed, so a second daemon exits without disturbing the
-first. All kernels are compiled before the loop is created, and therefore before torque can be on.
+first. All kernels are compiled before the loop is created, and therefore before torque can be
+switched on.
 """
 
 from __future__ import annotations
@@ -61,9 +62,9 @@ class Daemon:
 
         Parameters
         ----------
-        on_event : called with the level, kind and text of each event
-        wire : True to serve clients over ZeroMQ, or a `Link` whose owner exchanges the messages
-        hand : settings of the simulated hand, if they differ from the daemon's settings
+        on_event : called with the level, kind and text of each event wire : True to serve clients
+        over ZeroMQ, or a `Link` whose owner exchanges the messages hand : settings of the simulated
+        hand; None to use the daemon's settings
         """
         self.settings = settings
         self._hand_settings = settings if hand is None else hand
@@ -106,7 +107,7 @@ class Daemon:
             )
 
     def _connect(self, servos: Servos, on_event: EventSink | None) -> None:
-        """Connect, retrying for up to ``servos.open_timeout`` while servos do not respond."""
+        """Connect; if servos do not respond, retry for up to ``servos.open_timeout``."""
         patience = self.settings.servos.open_timeout
         began = time.monotonic()
         was_reported = False
@@ -200,7 +201,7 @@ class Daemon:
 
 
 def hand_info(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandInfo:
-    """Return the settings, calibrations and table errors, which each subscriber receives once."""
+    """Return the settings, calibrations and table errors that are sent once to each subscriber."""
     calibrations = [
         "" if model.calibration is None else model.calibration.model_dump_json() for model in models
     ]

@@ -56,7 +56,7 @@ class Commands(Protocol):
 
 
 class Loop:
-    """Pipeline that a clock drives; the pipeline runs entirely in the thread that calls `run`."""
+    """Clock-driven pipeline that runs entirely in the thread that calls `run`."""
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class Loop:
         self._stopping = True
 
     def report(self, level: str, kind: str, text: str) -> None:
-        """Emit an event on the next tick. Thread-safe."""
+        """Emit an event on the next tick. This method is thread-safe."""
         self._reports.append((level, kind, text))
 
     def publish_truth(self, truth: Truth | None) -> None:
@@ -144,7 +144,9 @@ class Loop:
                 self.emit("info", "end", "ended; torque is off")
 
     def advance(self, duration: float | None = None) -> None:
-        """Run ticks for ``duration`` [s] of machine time or until `end`; leave torque unchanged.
+        """Run ticks for ``duration`` [s] of machine time or until `end` is called.
+
+        The torque state does not change.
 
         Deadlines are absolute. After a late tick, the next deadline is set to the current time to
         avoid a burst of ticks. Real hardware continues to move during a late tick, whereas the
@@ -291,7 +293,7 @@ class Loop:
     ) -> dict[str, Any]:
         """Execute one request on the current tick.
 
-        A request from another source ends the running task.
+        If a task is running and the request comes from another source, the task ends.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
-"""Re-run a recording's readings, frames and commands through the current code, tick by tick.
+"""Run the installed code, tick by tick, on a recording's readings, frames and commands.
 
 The servos, sensors, clock and commands are replayed from the recording. The estimator, tables,
-filter, control and limits come from the installed code. The states are reproduced bit for bit if
-the recording contains all inputs since the first tick and the code and settings are unchanged.
+filter, control and limits come from the installed code. If the recording contains all inputs since
+the first tick, and code and settings are unchanged, the states are reproduced bit for bit.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from softfinger.daemon.wire.loop_link import Link
 
 
 class ProcessReplay:
-    """A loop that runs on recorded inputs."""
+    """Loop that runs on recorded inputs."""
 
     def __init__(self, settings: Settings, calibrations: Sequence[str]) -> None:
         """Build the loop from recorded settings.
@@ -64,7 +64,7 @@ class ProcessReplay:
 
     @property
     def fingers(self) -> tuple[int, ...]:
-        """Fingers for which frames must be supplied."""
+        """Fingers for which the caller must supply frames."""
         return tuple(self._sensors)
 
     def tick(
@@ -77,9 +77,8 @@ class ProcessReplay:
 
         Parameters
         ----------
-        taken : the tick's ``hand/input`` message
-        frames : new frames by finger index
-        commands : commands that were executed in the tick
+        taken : the tick's ``hand/input`` message frames : new frames by finger index commands :
+        commands that were executed on the tick
         """
         loop = self._loop
         self._clock.sleep_until(taken["t"])
@@ -119,7 +118,7 @@ class _Clock(VirtualClock):
 
 
 class _Servos:
-    """Servos that replay recorded readings and failures and discard all writes."""
+    """Servos that replay recorded readings and failures, and discard all writes."""
 
     def __init__(self) -> None:
         self.taken: Mapping[str, Any] = {}

@@ -29,7 +29,7 @@ def every(rate: float, wanted: float) -> int:
 
 
 def parts(settings: Settings) -> SceneParts:
-    """List the components of the scene defined by the settings."""
+    """List the components of the configured scene."""
     return SceneParts(
         fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
         has_servos=settings.servos.backend != "none",
@@ -106,7 +106,7 @@ class Publishing:
         self._publisher.send(schema.TACTILE, frame, data, *sensor, wall, n, number)
 
     def _rates(self, state: State) -> Rates:
-        """Return the rates [Hz] since the previous call, measured in machine time."""
+        """Return the message rates [Hz] since the previous call, measured in machine time."""
         frames = [0, 0]
         for perception in self._perceptions:
             frames[perception.finger] = perception.frame_count

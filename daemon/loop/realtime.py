@@ -125,7 +125,7 @@ class RealTime:
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
     def _schedule(self, priority: int) -> None:
-        """Set SCHED_FIFO for the loop thread, and one level lower for other interpreter threads.
+        """Set SCHED_FIFO for the loop thread and, one level lower, for other interpreter threads.
 
         If a reader thread is preempted while it holds the interpreter lock, the loop is delayed.
         Native threads, such as ZeroMQ's, and child processes keep normal scheduling.
@@ -184,9 +184,9 @@ class RealTime:
     def _lock_memory(self) -> None:
         """Lock each page in memory on first access. Warm-up has already accessed the loop's pages.
 
-        Two thirds of the pages of the compiler libraries are never accessed, and loading all pages
-        would take almost a second. If there is a limit on locked memory, only existing mappings are
-        locked, because later mappings would otherwise fail.
+        Locking all pages immediately would take almost a second, although two thirds of the
+        compiler libraries' pages are never accessed. If locked memory is limited, only existing
+        mappings are locked, because later mappings would otherwise fail.
         """
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         flags = _MCL_CURRENT | _MCL_ONFAULT
@@ -201,7 +201,7 @@ class RealTime:
             self._granted("memory locked", libc.munlockall)
 
     def _hold_latency(self) -> None:
-        """Prevent deep processor idle states until the opened file is closed."""
+        """Prevent deep processor idle states until the file that this method opens is closed."""
         try:
             descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -217,7 +217,7 @@ class RealTime:
             self._granted("deep idle states disabled", partial(os.close, descriptor))
 
     def _sharpen_timer(self, nanoseconds: int) -> None:
-        """Reduce the timer slack by which the kernel may delay wake-ups to merge them."""
+        """Reduce the timer slack, i.e. the time by which the kernel may delay wake-ups."""
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
             why = os.strerror(ctypes.get_errno())
@@ -233,7 +233,7 @@ def _threads() -> list[int]:
 
 
 def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
-    """Set a thread's time slice (0: system default); return True if it took effect."""
+    """Set a thread's time slice (0: system default); return True if the change took effect."""
     set_call, get_call = calls
     libc = ctypes.CDLL(None, use_errno=True)
     size = _ATTRIBUTES.size
@@ -280,7 +280,7 @@ class Service:
         return cls(address, watchdog)
 
     def alive(self, t: float) -> None:
-        """Send a keep-alive message if due at time ``t`` [s]; the first message reports READY."""
+        """Send a keep-alive message if due at ``t`` [s]. The first message reports READY."""
         if t < self._due:
             return
         self._due = t + self._every

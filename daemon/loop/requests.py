@@ -80,7 +80,7 @@ def _malformed(text: str) -> Refused:
 
 
 def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
-    """Return a command parameter's range, or an infinite range if it depends on the grip.
+    """Return the range of a command parameter, or an infinite range if it depends on the grip.
 
     A force must be greater than the lower bound.
     """
@@ -93,7 +93,9 @@ def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
 
 
 class Lease:
-    """Exclusive control of the hand by one client until a timeout after its last command.
+    """Exclusive control of the hand by one client.
+
+    The lease expires after a period without commands from the client.
 
     All unnamed clients share one lease. Commands that can only make the hand safer require no
     lease.
@@ -124,14 +126,14 @@ class Lease:
         return self._owner or "the client in control"
 
     def renew(self, command: Command, now: float) -> None:
-        """Take or extend the lease after a command has been executed."""
+        """Take or extend the client's lease after a command has been executed."""
         if command.name not in NO_LEASE_COMMANDS:
             self._owner = command.client
             self._until = now + self.seconds
 
 
 class Requests:
-    """Request executor, called between two stages of a tick, only by the loop thread."""
+    """Request executor. Only the loop thread may call it, between two stages of a tick."""
 
     def __init__(
         self,
@@ -230,7 +232,7 @@ class Requests:
             self._emit("warning", "silence", text)
 
     def end_grip(self, action: str) -> bool:
-        """Perform ``stop`` or ``release``; return False if it has no effect in this state."""
+        """Perform ``stop`` or ``release``; return False if the action would have no effect."""
         control = self._control
         if action == "stop" and control.torque:
             control.stop()
@@ -259,7 +261,7 @@ class Requests:
             raise Refused(f"{text}; send it again", Reason.LATE)
 
     def _check(self, name: str, numbers: dict[str, float]) -> None:
-        """Raise Refused if the state, scene or limits rule out a valid command."""
+        """Raise Refused if the state, the scene or a limit rules out an otherwise valid command."""
 
         def refuse_if(condition: object, reason: Reason, text: str) -> None:
             if condition:
@@ -354,7 +356,7 @@ class Requests:
         self._emit("info", "servos", "reconnected")
 
     def _reopen(self, name: str) -> None:
-        """Reopen the sensors whose port was lost.
+        """Reopen the sensors that have lost their port.
 
         Sensors are reopened only by ``clear`` and ``arm``, while torque is off.
 

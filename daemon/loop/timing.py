@@ -1,8 +1,9 @@
-"""Measure loop timing: histograms of the stages, and tick delays.
+"""Measure the loop timing: histograms of the stage durations, and tick delays.
 
-A single kernel call per tick updates the histograms, which are published once per second. Each
-octave above 1 ns is divided into 32 bins. A quantile is reported as the upper edge of its bin, so
-it is never too small and at most 3.2 % too large. The maximum is exact.
+A single kernel call per tick updates the histograms. The daemon publishes the quantiles of the
+histograms once per second. Each octave above 1 ns is divided into 32 bins. A quantile is reported
+as the upper edge of its bin, so it is never too small and at most 3.2 % too large. The maximum is
+exact.
 
 Tick delays, measured in machine time, are reported in occasional events and as a possible cause of
 faults. While a tick is late, real hardware is uncontrolled, whereas a simulated hand on its own
@@ -62,7 +63,7 @@ def _bin(value: float) -> int:
 
 @kernel
 def record(counts: Counts, largest: FloatArray, times: tuple[float, float, float, float]) -> None:
-    """Count one tick's times [s], in the order of `TIMES`.
+    """Add one tick's times [s], in the order of `TIMES`, to the histograms.
 
     ``counts`` int64 [times, bins] and ``largest`` float64 [times] are updated in place.
     """
@@ -72,7 +73,7 @@ def record(counts: Counts, largest: FloatArray, times: tuple[float, float, float
 
 
 class Statistics:
-    """Histograms of one loop, which passes both arrays to `record` once per tick."""
+    """Timing histograms of one loop. The loop passes both arrays to `record` once per tick."""
 
     def __init__(self) -> None:
         self.counts: Counts = np.zeros((len(TIMES), _BIN_COUNT), np.int64)
@@ -109,7 +110,7 @@ class Lateness:
     """Delay monitor for one loop's ticks."""
 
     def __init__(self, settings: Settings, timing: Timing, waits: bool) -> None:
-        """Create the monitor, which writes only the field ``busy_s`` of the loop's ``timing``.
+        """Create the monitor; it writes only the ``busy_s`` field of the loop's ``timing``.
 
         ``waits`` is True if the hand's clock pauses while the machine is late.
         """
@@ -151,7 +152,7 @@ class Lateness:
         return f"this machine is busy: {did}, {self._sum:.1f} s in total"
 
     def with_cause(self, name: str, text: str, at_work: float) -> str:
-        """Return the fault text, prefixed with "this machine was busy" if this may be the cause.
+        """Return the fault text, prefixed with "this machine was busy" if a delay may be the cause.
 
         Parameters
         ----------

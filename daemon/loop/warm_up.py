@@ -1,9 +1,9 @@
 """Compile a scene's kernels by running each part of the pipeline once before the first tick.
 
 `loop.build` runs all parts before the loop is created, and therefore before torque can be on. On
-first use, `processes.compile` compiles the parts in parallel processes beforehand. Each part builds
-the objects that it needs, runs them on an artificial contact and discards them. Components that are
-not in the scene are skipped.
+first use, `processes.compile` first compiles the parts in parallel processes. Each part builds the
+objects that it needs, runs them on an artificial contact and discards them. Components that are not
+in the scene are skipped.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from softfinger.kinematics.hand.servo_heat import (
 
 
 class WantedScene:
-    """Scene to compile for; ``on_event`` receives events about its finger models."""
+    """Scene whose kernels are compiled; ``on_event`` receives events about its finger models."""
 
     def __init__(
         self, settings: Settings, on_event: Callable[[str, str, str], None] | None = None
@@ -70,7 +70,7 @@ def parts(settings: Settings) -> list[Part]:
 
     One process compiles the estimator and the simulated sensor, because they share kernels. The
     second process compiles the contact table before the simulated hand and the filter, because both
-    use the table. The shorter parts balance the load.
+    use the table. The shorter parts are distributed so that both processes take about equally long.
     """
     simulated = needs_hand(settings.servos.backend, settings.tactile.backend)
     servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"

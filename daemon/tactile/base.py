@@ -34,7 +34,9 @@ class TactileSensor(Protocol):
 def make_sensor(
     settings: Settings, clock: Clock, hand: object, finger: int
 ) -> TactileSensor | None:
-    """Create a finger's tactile backend, not yet open, or None in a scene without sensors.
+    """Create a finger's tactile backend without opening it.
+
+    Returns None if the scene has no sensors.
 
     ``hand`` is the simulated hand, for backends that use it. Raises the same errors as the
     backend's constructor.

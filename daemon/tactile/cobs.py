@@ -25,17 +25,18 @@ The firmware sends each scan without being asked, at any baud rate (USB boards m
                        eight times:  crc = (crc << 1) ^ (crc & 0x8000 ? 0x1021 : 0)   in 16 bits
 
 3. Encode the message with COBS, which removes all zero bytes. Split the message at its zero bytes
-   and drop them. Write each piece as one byte with the value length + 1, followed by the piece.
-   Split pieces of 254 bytes or more into blocks of 254, each preceded by the byte 255. The rest of
-   the piece, which may be empty, follows as a separate piece. (An empty piece at the end of the
-   message may be omitted.)
+   and drop the zero bytes. Write each piece as one byte with the value length + 1, followed by the
+   piece. Split pieces of 254 bytes or more into blocks of 254 bytes, each preceded by the byte 255.
+   The rest of the piece, which may be empty, follows as a separate piece. (An empty piece at the
+   end of the message may be omitted.)
 
 4. Send a zero byte. An additional zero byte before the first frame is allowed.
 
-A 44 × 44 frame of uint16 takes at most 3903 bytes on the wire. `encode` is the reference
-implementation. A reader that starts within a frame synchronises at the next zero byte. Incomplete
-and corrupted frames are dropped: the CRC detects every error within 16 adjacent bits, and all but 1
-in 65536 other errors. Gaps in the sequence numbers indicate the number of missed frames.
+A 44 × 44 frame of uint16 counts takes at most 3903 bytes on the wire. `encode` is the reference
+implementation. A reader that starts in the middle of a frame synchronises at the next zero byte.
+Incomplete and corrupted frames are dropped: the CRC detects every error within 16 adjacent bits,
+and all but 1 in 65536 other errors. Gaps in the sequence numbers indicate the number of missed
+frames.
 """
 
 from __future__ import annotations
@@ -58,9 +59,10 @@ _BLOCK = 254  # maximum length of a COBS block [bytes]
 
 
 def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
-    """Encode a frame: counts [rows, cols], sequence number and board time ``t`` [s].
+    """Encode a frame with counts [rows, cols], a sequence number and the board time ``t`` [s].
 
-    This function is the reference for firmware. Raises ValueError if the counts have another type.
+    `encode` is the reference implementation for firmware. Raises ValueError if the counts are
+    neither uint8 nor uint16.
     """
     if counts.dtype not in (np.uint8, np.uint16) or counts.ndim != 2:
         raise ValueError(f"counts must be uint8 or uint16 [rows, cols], got {counts.dtype}")
@@ -85,10 +87,11 @@ def longest_frame(rows: int, cols: int) -> int:
 
 @kernel
 def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
-    """Decode COBS: write the message in ``packet``, which contains no zero byte, to ``out``.
+    """Decode the COBS ``packet`` and write the message to ``out``.
 
-    ``out`` must be as long as the packet. Returns the message length, or -1 if the packet ends
-    within a block. The code has no data-dependent branches, because these would be unpredictable.
+    The packet must not contain zero bytes, and ``out`` must be as long as the packet. Returns the
+    message length, or -1 if the packet ends within a block. The code has no data-dependent
+    branches, because the processor would often mispredict them.
     """
     code = np.int64(_BLOCK + 1)  # code of the current block
     left = np.int64(0)  # number of bytes that remain in the block
@@ -104,7 +107,7 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
 
 
 class CobsDecoder(DelimitedDecoder):
-    """Decoder for COBS framing, which contains the board's sequence number and time."""
+    """Decoder for COBS frames, which contain the board's sequence number and time."""
 
     def __init__(self, rows: int, cols: int) -> None:
         super().__init__(rows, cols, b"\0", longest_frame(rows, cols))

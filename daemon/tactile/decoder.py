@@ -47,7 +47,7 @@ class Decoder(ABC):
 
     @abstractmethod
     def feed(self, data: bytes, t: float) -> Decoded | None:
-        """Add bytes read at time ``t`` [s]; return the newest frame completed by them, or None."""
+        """Add bytes read at time ``t`` [s]; return the newest frame that they complete, or None."""
 
     @abstractmethod
     def diagnosis(self) -> str:
@@ -73,7 +73,7 @@ class Decoder(ABC):
 
     @property
     def lost(self) -> bool:
-        """True if no frame was found in the bytes of the last ten frame lengths."""
+        """True if no frame was found in the last ten frame lengths of data."""
         behind = self._skipped - self._skipped_at_frame + len(self._buffer)
         return behind > _LOST_AFTER * self.frame_bytes
 

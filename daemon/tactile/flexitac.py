@@ -37,8 +37,8 @@ class FlexiTacDecoder(Decoder):
     position, which proves that no byte of the frame was lost. On a line with gaps between frames,
     waiting for the next marker would delay every frame by one period. On a line with gaps, a
     complete frame is therefore returned immediately if it can't consist of parts of two frames: its
-    counts contain no ``AA 55``, and its bytes arrived within their transmission time. Any other
-    frame is returned at the next marker or by ``settle``.
+    counts contain no ``AA 55``, and its bytes arrived within their transmission time. All other
+    frames are returned at the next marker or by ``settle``.
 
     *Loss.* If a marker is not at its expected position, the preceding frame is dropped, and the
     search restarts.
@@ -82,7 +82,7 @@ class FlexiTacDecoder(Decoder):
 
     @property
     def found_cells(self) -> int:
-        """Number of cells per frame, from the most common marker distance; 0 while locked."""
+        """Number of cells per frame, based on the most common marker distance; 0 while locked."""
         apart = Counter(b - a for a, b in combinations(self._markers, 2))
         spacings = [each for each in apart if each >= _CELL_COUNT_MIN + len(MARKER)]
         spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)
@@ -142,7 +142,7 @@ class FlexiTacDecoder(Decoder):
         """Check whether the marker at the start of the buffer is the only consistent marker.
 
         Each level of the search adds one frame, so the result depends only on the stream, not on
-        its division into pieces.
+        how the stream is split into reads.
         """
         buffer, stride = self._buffer, self.frame_bytes
         rivals = self._between()
@@ -160,7 +160,7 @@ class FlexiTacDecoder(Decoder):
         return "ambiguous"
 
     def _between(self) -> list[int]:
-        """Return the positions of ``AA 55`` between the first marker in the buffer and the next."""
+        """Return the positions of ``AA 55`` between the first two markers in the buffer."""
         markers = []
         marker = self._buffer.find(MARKER, len(MARKER), self.frame_bytes)
         while marker >= 0:

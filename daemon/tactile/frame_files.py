@@ -10,9 +10,10 @@ Supported files:
   ``t.npy`` [n].
 - Other files are read as Tekscan-style ASCII exports.
 
-Integer frames contain counts. Other frames are in Pa and are converted with ``pascal_per_count``. A
-cell that is NaN in all frames counts as dead. Negative readings are set to 0 if noise around a
-tared zero can explain them. Times are in seconds, unless their step or date indicates another unit.
+Integer frames contain counts. Floating-point frames are in Pa and are converted with
+``pascal_per_count``. A cell that is NaN in all frames counts as dead. Negative readings are set to
+0 if noise around a tared zero can explain them. Times are in seconds unless their step size or a
+date indicates another unit.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ _INTERVAL_RATIO_NOTED = 10.0  # ratio of actual to expected frame interval that 
 
 @dataclass(frozen=True)
 class FrameRecording:
-    """Counts uint16 [n, rows, cols] at the times t float64 [n] [s], which increase from 0.
+    """Counts uint16 [n, rows, cols] and times t float64 [n] [s]; the times increase from 0.
 
     ``live`` [rows, cols] is False where the sensor has no cell. ``truths`` contains the true
     contact of each frame. ``largest`` is the maximum reading in the file's unit: counts if
@@ -214,7 +215,7 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
 def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
     """Read the array in a .npy file.
 
-    Raises ValueError if its header states more than ``size`` bytes.
+    Raises ValueError if the file header states more than ``size`` bytes.
     """
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
@@ -296,7 +297,7 @@ def _check_below(
 ) -> None:
     """Add a note about negative readings caused by noise.
 
-    Raises ValueError for other negative readings.
+    Raises ValueError for negative readings that noise cannot explain.
     """
     lowest = float(frames.min())
     if lowest >= 0.0:

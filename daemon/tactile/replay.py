@@ -1,4 +1,4 @@
-"""Provide recorded frames in place of a sensor, at recorded times or as set by the caller."""
+"""Replace a sensor with recorded frames, at recorded times or as set by the caller."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PITCH_TOLERANCE = 0.01
 def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:
     """Describe how the cell size in a file differs from ``pitch`` (x, y) [m]; y = 0 means y = x.
 
-    The text is empty if both agree or if the file does not state a cell size.
+    The text is empty if the cell sizes agree or if the file does not state a cell size.
     """
     if recording.pitch is None:
         return ""
@@ -56,7 +56,7 @@ class GivenFrames:
         """Do nothing: there is no port."""
 
     def latest(self) -> Frame | None:
-        """Return the frame that was set last."""
+        """Return the frame that was set most recently."""
         return self.frame
 
     def counters(self) -> dict[str, int]:
@@ -68,10 +68,10 @@ class GivenFrames:
 
 
 class ReplayTactile:
-    """Backend that replays a recording at its recorded times, starting at ``open``.
+    """Backend that replays a recording at its recorded times, starting when ``open`` is called.
 
-    The recording restarts one mean interval after its last frame. If ``tactile.replay_again`` is
-    false, the last frame is instead repeated once with ``valid`` False. ``live`` [rows, cols] is
+    The recording restarts one mean frame interval after the last frame. If ``tactile.replay_again``
+    is false, the last frame is instead repeated once with ``valid`` False. ``live`` [rows, cols] is
     False where the recording has no cell. ``full_count`` is the reading of saturated cells, or None
     if the recording does not state it. ``notes`` describes suspicious properties of the recording.
     """

@@ -1,7 +1,7 @@
 """Read a tactile board's serial port in a thread and provide its newest complete frame.
 
-All framings for serial ports share this module. This module handles the port, the thread and the
-timing, so that a :class:`Decoder` handles only bytes.
+All serial framings share this module, which handles the port, the thread and the timing. A
+:class:`Decoder` therefore handles only bytes.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class SensorClock:
     """Converter from a board's clock to the local clock; the minimum recent delay is the offset.
 
     Frames arrive with varying delays but never early, so using the minimum delay removes port
-    jitter from t_sample. The offset may increase by 200 ppm, which exceeds the difference between
-    two quartz clocks. A jump of more than one second is treated as a board restart.
+    jitter from t_sample. The offset may increase at up to 200 ppm, which exceeds the difference
+    between two quartz clocks. A jump of more than one second is treated as a board restart.
     """
 
     _DRIFT = 2e-4
@@ -66,9 +66,9 @@ class SerialReader:
 
     A frame's ``t_arrival`` is the time at which its last byte was read. ``t_sample`` estimates the
     mid-scan time: ``t_arrival`` minus the transmission time of the frame's bytes and of later bytes
-    in the same read, minus ``latency`` [s] from mid-scan to the frame's first byte. ``t_sample``
-    never decreases from frame to frame. If frames contain the board time, :class:`SensorClock`
-    removes port jitter.
+    in the same read, minus the ``latency`` [s] from mid-scan to the frame's first byte.
+    ``t_sample`` never decreases from frame to frame. If frames contain the board time,
+    :class:`SensorClock` removes port jitter.
 
     A polled board receives ``request`` at the start, after each frame, and again if no frame
     arrives within its transmission time plus 0.1 s.

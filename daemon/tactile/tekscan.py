@@ -6,10 +6,10 @@ position without a cell. A line ``@@`` may end the file. An export with a single
 ``Frame`` line.
 
 Encoding, decimal sign and separator depend on the locale of the exporting machine. The parser
-detects them from the file. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings
-are raw counts, pressures, or forces per cell. Free text follows ``COMMENTS:``; within this text,
-only words in capitals are keys. Spreadsheets may add quotation marks and may append separators to
-lines.
+detects the encoding, sign and separator from the file. Lengths are in mm, cm, m or inches,
+abbreviated or spelt out. Readings are raw counts, pressures, or forces per cell. Free text follows
+``COMMENTS:``; within this text, only words in capitals are keys. Spreadsheets may add quotation
+marks and may append separators to lines.
 """
 
 from __future__ import annotations
@@ -277,7 +277,7 @@ _GROUPS = str.maketrans("", "", "'\N{RIGHT SINGLE QUOTATION MARK}\N{NO-BREAK SPA
 def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
-    If point and comma both occur, the last of them is the decimal sign, and the other character
+    If both a point and a comma occur, the last one is the decimal sign, and the other character
     groups digits. Apostrophes and narrow spaces only group digits.
     """
     text = text.translate(_GROUPS)
@@ -313,7 +313,7 @@ def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> floa
 
 
 def _pitch(header: dict[str, str]) -> tuple[float, float]:
-    """Return the pitch (x, y) from the spacings in the header [m]."""
+    """Return the pitch (x, y) [m] computed from the spacings in the header."""
     found = []
     for key in ("COL_SPACING", "ROW_SPACING"):
         value = _quantity(header, key, _LENGTHS) if key in header else math.nan

@@ -1,4 +1,4 @@
-"""Define wire format and transport of stream and commands: schema, packing, sockets and keys.
+"""Define how the stream and the commands are sent: schema, packing, sockets and keys.
 
 The `gateway` package contains the process that serves the client connections.
 """

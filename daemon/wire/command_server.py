@@ -1,9 +1,9 @@
 """Unpack and answer the requests that the gateway forwards to the loop.
 
 The command server runs in the loop's thread, once per tick, without a lock. A ``stop`` takes
-precedence. Each request carries the number of stops that preceded it. A request that carries fewer
-stops than the current number is refused, unless it is ``status``. A ``hold`` replaces a queued
-``hold`` that directly precedes it on the same connection.
+precedence. Each request carries the number of stops that preceded it. A request whose stop count is
+below the current stop count is refused, unless the request is ``status``. A ``hold`` replaces a
+queued ``hold`` that directly precedes it on the same connection.
 
 A client may add a unique ``key`` to a request and repeat the request if it was refused as late. The
 daemon executes a command with a key at most once. If another command has been executed since the
@@ -135,7 +135,7 @@ class CommandServer:
 
 
 def _replaces(request: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Return True if both are holds and ``request`` sets every value that ``other`` sets."""
+    """Return True if both are ``hold`` and ``request`` sets every value that ``other`` sets."""
     is_hold = request["command"] == other["command"] == "hold"
     return is_hold and other.keys() - {"key"} <= request.keys()
 
@@ -153,7 +153,7 @@ def refusal(error: str, reason: str) -> bytes:
 
 
 def decode(payload: bytes) -> dict[str, Any]:
-    """Unpack a command: a flat map of numbers and strings, with a string under ``command``.
+    """Unpack a command: a flat map of numbers and strings; the value of ``command`` is a string.
 
     Raises Refused for other data. Additional fields of a stop are ignored.
     """

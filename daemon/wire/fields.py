@@ -40,7 +40,7 @@ TOPICS: dict[bytes, Topic] = {}
 
 
 class FieldSource(Generic[_From]):
-    """Source object of declared fields, which is ``get`` applied to the outer source."""
+    """Source object of declared fields: the result of applying ``get`` to the outer source."""
 
     def __init__(
         self, outer: "FieldSource[Any] | None" = None, get: Getter = lambda it: it
@@ -49,7 +49,7 @@ class FieldSource(Generic[_From]):
         self.get = get
 
     def of(self, get: Callable[[_From], _Within]) -> "FieldSource[_Within]":
-        """Declare a source that is ``get`` applied to this source."""
+        """Declare a source: the result of applying ``get`` to this source."""
         return FieldSource(self, get)
 
     def __call__(

@@ -1,6 +1,6 @@
 """Manage CurveZMQ keys for the daemon and its clients: key files and socket options.
 
-The server and every client have their own key pairs. A client needs the server's public key. The
+The server and the clients each have their own key pair. A client needs the server's public key. The
 server needs the public keys of its clients and rejects all other clients. `make_keys` creates a
 folder with these files:
 
@@ -12,8 +12,8 @@ folder with these files:
     the folder to copy to the client's machine; ``local`` is for this machine
 
 The files are ZeroMQ certificates, which other ZeroMQ programs can also read. Files and folders are
-refused if another user owns them or may write to them or to any folder above them, because that
-user could add a key.
+refused if another user owns them, because that user could add a key. The same applies if another
+user may write to them or to any parent folder.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class ClientKeys:
     secret: bytes
 
     def guard(self, socket: zmq.Socket[Any] | zmq.Context[Any]) -> None:
-        """Use these keys for a socket before it connects, or for all new sockets of a context."""
+        """Use these keys for an unconnected socket, or for all new sockets of a context."""
         socket.setsockopt(zmq.CURVE_SERVERKEY, self.server)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
@@ -105,8 +105,8 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     Raises
     ------
     KeyFileError
-        If a file can't be written, or if a client already exists. In the latter case, no files are
-        written.
+        If a file can't be written, or if a client already exists. If a client already exists, no
+        files are written.
     """
     check_curve()
     server = folder / "server"
@@ -173,7 +173,7 @@ def load_server(folder: Path) -> ServerKeys:
 
 
 def load_client(folder: Path) -> ClientKeys:
-    """Load a client's keys from its own folder, or the local client's from a `make_keys` folder.
+    """Load a client's keys from its folder, or the local client's keys from a `make_keys` folder.
 
     Raises KeyFileError.
     """
@@ -216,7 +216,7 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
 
 
 def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
-    """Raise KeyFileError if another user owns or may write a file, or may read a secret key."""
+    """Raise KeyFileError if another user owns a file, may write to it, or may read a secret key."""
     mode = stat.S_IMODE(status.st_mode)
     if secret and mode & 0o077:
         raise KeyFileError(

@@ -28,7 +28,7 @@ _SENDER_COUNT_MAX = 16  # maximum number of senders that await a reply
 
 
 class LocalStop:
-    """The daemon's end of the socket, which is named after the command address.
+    """The daemon's end of the socket. The socket is named after the command address.
 
     If another user can write to the preferred folder, ``notice`` gives the reason and the folder
     that is used instead.
@@ -103,7 +103,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
 
 def free_socket_path(path: Path, kind: socket.SocketKind) -> str:
-    """Remove the socket file that a killed process left; return a reason if the path is in use."""
+    """Remove the socket file left by a killed process; return a reason if the path is in use."""
     if not path.exists():
         return ""
     if not path.is_socket():
@@ -130,7 +130,7 @@ def _name(address: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Yield candidate folders: those of a login session and of the system service, then others."""
+    """Yield candidate folders, first those of a login session and of the system service."""
     session = f"/run/user/{os.geteuid()}"
     for place in (os.environ.get("XDG_RUNTIME_DIR"), "/run/softfinger", session):
         if place:

@@ -1,4 +1,4 @@
-"""Connect loop and gateway with a socket pair; define the messages and the loop's end.
+"""Connect the loop and the gateway with a socket pair; define the messages and the loop's end.
 
 Each message is a msgpack list whose first element is the message kind. Sending never blocks. If the
 socket buffer is full, the remaining bytes are sent later. While bytes remain, stream messages are
@@ -132,7 +132,7 @@ class Link:
         self._channel.close()
 
     def offer(self, channel: Channel) -> None:
-        """Switch to this channel at the next `look`. Any thread may call this method."""
+        """Switch to this channel at the next call of `look`. Any thread may call this method."""
         self._offered = channel
 
     def look(self) -> bool:
@@ -169,7 +169,7 @@ class Link:
         self._channel.send(REPLY, ask.urgent, ask.route, reply)
 
     def publish(self, topic: int, message: bytes, keep: int = 0) -> None:
-        """Publish a message. Late subscribers receive the last ``keep`` messages of its topic."""
+        """Publish a message. Late subscribers receive the last ``keep`` messages of the topic."""
         if keep:
             self._kept.setdefault(topic, deque(maxlen=keep)).append(message)
         self._channel.send(PUBLISH, topic, keep, message, droppable=True)

@@ -102,7 +102,7 @@ class Publisher:
         return self._link.wanted
 
     def look(self) -> None:
-        """Read the gateway's messages; the loop does the same when it reads commands."""
+        """Read the gateway's messages, as the loop also does when it reads commands."""
         self._link.look()
 
     def send(self, topic: bytes, *arguments: object) -> None:

@@ -25,7 +25,7 @@ _FULL = 10e3
 
 
 def state_parts(state: HandState) -> list[str]:
-    """Return mode, tip forces, and object angle and width; in a fault, return mode and fault."""
+    """Return mode, tip forces, object angle and object width; in a fault, return mode and fault."""
     if state.fault:
         return [state.mode, state.fault]
     parts = [state.mode]
@@ -108,7 +108,7 @@ def state_html(state: HandState) -> str:
 
 
 def frame_html(frame: TactileFrame) -> str:
-    """Return an SVG picture of the pressures, with row 0 at the bottom, above the frame's text."""
+    """Return the frame's text below an SVG picture of the pressures; row 0 is at the bottom."""
     aspect = frame.rows * frame.pitch_y / (frame.cols * frame.pitch or math.nan)
     if not 0.01 < aspect < 100.0:  # The values may be invalid, because the stream is not trusted.
         aspect = frame.rows / frame.cols
@@ -126,7 +126,7 @@ def frame_html(frame: TactileFrame) -> str:
 
 
 def _outlines(pressure: NDArray[np.float64]) -> Iterator[tuple[int, str]]:
-    """Yield each shade in a frame with an SVG path of its cells; adjacent cells are merged."""
+    """Yield each shade of a frame and the SVG path of its cells; adjacent cells are merged."""
     full = max(pressure.max(), _FULL)
     levels = np.rint(np.nan_to_num(pressure / full) * _SHADES).astype(int)[::-1]
     for level in range(1, _SHADES + 1):
