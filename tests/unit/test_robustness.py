@@ -43,7 +43,12 @@ def test_unknown_hand_parameters_do_not_change_the_force(name, seed):
     ("name", "seed"),
     [
         ("zero -5% in 20 s", 1),
-        *(pytest.param(name, 2, marks=LONG) for name in ROW if "zero -" in name),
+        # The slowest drift is tested with one board only, because it takes 120 s of virtual time.
+        *(
+            pytest.param(name, 2, marks=LONG)
+            for name in ROW
+            if "zero -" in name and name != "zero -5% in 120 s"
+        ),
     ],
 )
 def test_a_falling_zero_offset_is_named_and_the_grip_continues(name, seed):
