@@ -217,15 +217,18 @@ def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
 
 
 def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
-    """Return the row for one law: residual angles on ``plants``, and the number of lost objects."""
-    found = [left(way, plant) for plant in plants]
-    held = [each for each in found if not math.isnan(each)]
-    more = {"not held": len(found) - len(held)}
+    """Return the row for one law: residual angles on ``plants``, and the number of lost objects.
+
+    ``angles`` lists the residual angle on each plant [°], or None if the object is not held.
+    """
+    angles = [left(way, plant) for plant in plants]
+    held = [each for each in angles if each is not None]
+    more = {"not held": len(angles) - len(held), "angles": angles}
     return figure(name, "°", held, way.aim, **more) if held else {"name": name, **more}
 
 
-def left(way: Way, simulation: Mapping[str, Any]) -> float:
-    """Return the residual object angle [°] on one plant; NaN if the object is not held."""
+def left(way: Way, simulation: Mapping[str, Any]) -> float | None:
+    """Return the residual object angle [°] on one plant, or None if the object is not held."""
     sections = merged({"simulation": simulation, "control": way.control}, way.tips)
     with SimulatedDaemon(sections) as hand:
         if way.law is not None:
@@ -243,4 +246,4 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float:
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERING_TIME)
         is_held = min(hand.plant.force) > 0.0
-        return math.degrees(abs(float(hand.plant.object_pose[2]))) if is_held else math.nan
+        return math.degrees(abs(float(hand.plant.object_pose[2]))) if is_held else None

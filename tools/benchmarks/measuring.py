@@ -33,8 +33,9 @@ class Report:
     failed: bool = False
 
     def __str__(self) -> str:
-        """Format as aligned text: four digits for numbers, blanks for None and NaN."""
-        keys = list(dict.fromkeys(key for row in self.rows for key in row)) or ["name"]
+        """Format as aligned text: four digits for numbers, blanks for None and NaN, no lists."""
+        shown = (key for row in self.rows for key in row if not isinstance(row[key], list))
+        keys = list(dict.fromkeys(shown)) or ["name"]
         table = plain_table()
         for key in keys:
             left = any(isinstance(row.get(key), str) for row in self.rows)
