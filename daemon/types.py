@@ -160,7 +160,7 @@ class State:
     mode: str = "disarmed"
     fault: str = ""
     fault_name: str = ""  # limit name in `safety.limits`
-    torque: bool = False  # True if torque is on or torque off is not confirmed
+    torque: bool = False  # True if torque is on, or if the servos have not confirmed torque off
     torque_off: bool = False  # True if the servos confirmed torque off on this tick
     read_error: str = ""  # error of this tick's servo bus read
     write_error: str = ""

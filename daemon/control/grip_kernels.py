@@ -27,7 +27,7 @@ _INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
 _DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to equalising the tip forces [rad]
 _DITHER_STEP_MAX = 0.05  # maximum time step of the dither, even after a late tick [s]
-_STIFFNESS_MIN = 100.0  # lower bound of the stiffness [N/m]; gains are divided by the stiffness
+_STIFFNESS_MIN = 100.0  # minimum stiffness by which gains are divided [N/m]
 ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
 
 

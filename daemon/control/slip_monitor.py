@@ -425,7 +425,7 @@ def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_chan
 
 @inner_kernel
 def _has_turned(s: SlipState, grasp: GraspState) -> bool:
-    """Return True if the object has rotated further than shear of the tips allows.
+    """Return True if the object has rotated further than the shear of the tips allows.
 
     Both tips must show the rotation, because a single faulty sensor can simulate a rotation.
     """

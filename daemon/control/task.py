@@ -28,8 +28,8 @@ class TaskEnded(SoftfingerError):
 class Task:
     """Issue a script's commands, each after the hand has reached the previous command's mode.
 
-    If ``restarts`` is set, the script restarts after a fault. Only simulated hands restart the
-    script, because real hardware must not start moving by itself after a fault.
+    ``restarts`` is True for simulated hands: the script then restarts after a fault. Real hardware
+    must not start moving by itself after a fault.
     """
 
     def __init__(self, settings: Settings) -> None:

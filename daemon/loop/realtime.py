@@ -260,7 +260,7 @@ class Service:
         systemd terminates the service if no message arrives for ``watchdog`` [s]; 0 disables the
         watchdog.
         """
-        # A name starting with @ denotes an abstract socket, whose first byte is zero.
+        # A name starting with @ denotes an abstract socket, whose address begins with a zero byte.
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._every = watchdog * _KEEP_ALIVE_FRACTION if watchdog > 0.0 else _NEVER
         self._due = -_NEVER

@@ -100,7 +100,7 @@ def _log_slope(h: HandFilter, finger: int) -> float:
 
 @inner_kernel
 def _set_torque_slopes(h: HandFilter) -> float:
-    """Set the slopes of the mean joint torque due to the tip forces; return this mean torque [N·m].
+    """Set the derivatives of the mean joint torque that the tip forces cause; return it [N·m].
 
     Each joint contributes (1 + TORQUE) M, where M is the moment of the tip force about the joint. M
     is the scaled joint torque minus the torque residual. M is proportional to the tip force ρ

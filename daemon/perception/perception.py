@@ -85,7 +85,7 @@ class RepeatDetector:
         If ``enabled``, ``fault_count`` repeated frames count as a fault.
         """
         self._enabled = enabled
-        self.period = 0  # repetition period in frames, or 0 without repetition
+        self.period = 0  # repetition period in frames, or 0 if frames do not repeat
         self._repeated_count = 0  # number of consecutive frames that repeat with this period
         self._fault_count = fault_count
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first

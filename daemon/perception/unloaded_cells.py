@@ -1,10 +1,10 @@
 """Zero shift and noise of a sensor, measured with the cells beyond the tip.
 
 An unloaded cell reads its zero offset plus noise. With a 20 mm tip, about 60 % of a 58 mm grid lies
-beyond the tip. The cells beyond the tip show the zero offset and noise during any contact of the
-tip. A second contact on a few of the cells beyond the tip does not change the median. Readings are
-clipped at 0, so a zero offset below 0 cannot be detected here. A negative offset is detected from
-the joint motion during closing (`perception.frame_channels`).
+beyond the tip. These cells show the zero offset and noise even while the tip is in contact. A
+second contact on a few of the cells beyond the tip does not change the median. Readings are clipped
+at 0, so a zero offset below 0 cannot be detected here. A negative offset is detected from the joint
+motion during closing (`perception.frame_channels`).
 """
 
 from __future__ import annotations

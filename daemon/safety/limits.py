@@ -204,7 +204,7 @@ class Limit:
     check: Check | None = None
     lasts: float | str = 0.0  # minimum duration of a violation [s], or the name of a setting
     fraction: float = 1.0  # fraction of the bound to apply
-    in_turn: bool = False  # True if the row is checked in turn with others, one per tick
+    in_turn: bool = False  # True for rows of which only one is checked per tick, in rotation
     gripping: bool = False  # True if the limit applies only while gripping
 
     def __call__(self, check: Check) -> Check:

@@ -68,7 +68,7 @@ class WiringWatch:
         other = 1 - finger
         closed, other_closed = q[finger] - self._q[finger], q[other] - self._q[other]
         tilted = _TILT_SIGNS[finger] * (contact.theta - self._tilt)
-        # The tilt is nearer to the motion of the other joint than to that of this joint.
+        # Beyond the threshold, the tilt matches the other joint's motion better than this joint's.
         threshold = 0.5 * (closed + other_closed) + _TILT_SIGMA * contact.theta_std
         follows_other = other_closed - closed > _CLOSING_MIN and tilted > threshold
         pressed = contact.force - self._force > _FORCE_RISE_MIN

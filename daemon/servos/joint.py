@@ -145,7 +145,7 @@ def pack_goal(mode: int, current: int, position: int) -> bytes:
 
 
 def goal_in(mode: int, table: bytes, start: int) -> bytes:
-    """Extract a servo's goal from its registers ``table``, which begin at address ``start``."""
+    """Extract a servo's goal from ``table``, its registers from address ``start`` on."""
     current = table[reg.GOAL_CURRENT - start : reg.GOAL_CURRENT - start + _CURRENT.size]
     position = table[reg.GOAL_POSITION - start : reg.GOAL_POSITION - start + _POSITION.size]
     if mode == reg.POSITION_MODE:

@@ -196,7 +196,7 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
     - ``unplug`` and ``plug`` affect the servo port, and ``left:unplug`` affects a board's port.
     - ``push=15`` and ``twist=0.3`` apply a permanent load to the object; 0 removes it.
     - ``well`` ends all faults; ``left:well`` ends the faults of one finger's board and
-      measurements. Loads on the object remain.
+      measurements. Loads on the object are not removed.
 
     The suffix ``@START`` is the start time [s]. With ``@START..END``, a measurement fault increases
     linearly from START to END.

@@ -40,7 +40,7 @@ TOPICS: dict[bytes, Topic] = {}
 
 
 class FieldSource(Generic[_From]):
-    """Source object of declared fields: the result of applying ``get`` to the outer source."""
+    """Object from which fields are read; ``get`` returns this object from the outer object."""
 
     def __init__(
         self, outer: "FieldSource[Any] | None" = None, get: Getter = lambda it: it

@@ -169,7 +169,7 @@ def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatA
     """Return the torque and its standard deviation for each slow start from standstill, [n, 2].
 
     The goal and the torque increase in whole counts, so the break-away torque lies between the
-    maximum torque and the preceding value.
+    highest torque reached and the torque one step earlier.
     """
     found = []
     speed, steps = _BREAK_AWAY_RATE

@@ -90,8 +90,8 @@ class ContactEstimate:
     example on a curved face.
 
     Without a contact, d and the tilts are 0, the estimate is valid, and ``d_std`` is the smallest
-    detectable d. A single frame does not reveal two errors: a wrong modulus if the gain is fixed,
-    and a displacement of the tip on the sensor.
+    detectable d. Two errors cannot be detected from a single frame: a wrong modulus (if the gain is
+    fixed), and a displacement of the tip on the sensor.
     """
 
     contact: bool = False

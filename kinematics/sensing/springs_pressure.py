@@ -54,7 +54,7 @@ class SpringPoints(NamedTuple):
     y: FloatArray  # one value per row
     across: FloatArray  # weights along x [position, cell offset], see `blur.axis_points`
     along: FloatArray  # weights along y
-    law: FloatArray  # coefficients of the material's σ(ε), by increasing powers
+    law: FloatArray  # coefficients of the material's σ(ε), in order of increasing power
     sums: FloatArray  # scratch, three rows of cells [3, cells]
 
 

@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Ring edges on the base. The rings are narrow at the rim, where the stress of a bonded base is
-# singular. The rings continue beyond the rim as a mirror image, because a lying base spreads.
+# singular. The rings are mirrored beyond the rim, because a base that is not bonded spreads.
 RING_EDGES = np.sin(np.linspace(0, np.pi / 2, 97))
 RING_EDGES = np.concatenate([RING_EDGES, 2 - RING_EDGES[RING_EDGES > 0.8][-2::-1]])
 MIDDLES = (RING_EDGES[1:] + RING_EDGES[:-1]) / 2

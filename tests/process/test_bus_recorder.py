@@ -63,7 +63,7 @@ def test_goals_by_group_writes_and_indirect_addresses_are_recorded():
     data = struct.pack("<HHB", 224, 6, 1) + goal + b"\x02" + goal
     hand.bus.feed(frame(BROADCAST, framing.SYNC_WRITE, data), hand.t)
     assert hand.report(1)["goal_q"] == pytest.approx([40 * RADIAN] * 2)
-    # The right joint has the opposite direction.
+    # The right joint turns in the opposite direction.
     assert hand.report(2)["goal_q"] == pytest.approx([-40 * RADIAN] * 2)
     assert hand.report(2)["goal_current"] == pytest.approx([-10 * UNIT] * 2)
 

@@ -111,7 +111,7 @@ def test_a_sensor_fault_has_a_bounded_effect_and_is_the_only_one_reported(rig, l
     rig.send(lie)
     reports = list(watched(rig))
     assert max(max(report["force"]) for report in reports) < 1.3 * FORCE
-    if lie != GAIN:  # The estimator may accept part of a gain error without a report.
+    if lie != GAIN:  # A partly corrected gain error may not be reported.
         until(lambda: any(false in line for line in rig.log()[before:]))
     assert not [line for line in rig.log()[before:] if "consistency." in line and false not in line]
     if lie == REFUSED:

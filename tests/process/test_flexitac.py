@@ -78,8 +78,8 @@ def test_frames_are_received_through_a_port_with_their_times(own_threads, board)
     first = tactile.latest()
     until(lambda: tactile.latest().seq >= first.seq + 20)
     now = tactile.latest()
-    # Wait for a frame that was read on its own. If several frames are read together, the earlier
-    # frames arrived before the read.
+    # Wait for a frame that was read on its own. If several frames are read together, all but
+    # the last one have waited in the buffer.
     until(lambda: (n := tactile.latest()).t_arrival - n.t_sample == pytest.approx(LATE))
     assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1

@@ -166,7 +166,7 @@ def record(kind, robot, first, action, moved, root):
     """Write two observations with LeRobot's own recorder and read them back."""
     try:
         from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
-    except ImportError:  # LeRobot 0.4 has a different module.
+    except ImportError:  # In LeRobot 0.4, the functions are in this module.
         from lerobot.datasets.utils import build_dataset_frame, hw_to_dataset_features
     features = hw_to_dataset_features(robot.action_features, "action", False)
     features |= hw_to_dataset_features(robot.observation_features, "observation", False)

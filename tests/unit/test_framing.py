@@ -12,7 +12,7 @@ from softfinger.daemon.simulation.servo_model.framing import (
     frame,
 )
 
-# The first bytes of the header occur often, because the encoder stuffs them.
+# Most pieces belong to the header, because only its first bytes require byte stuffing.
 PIECES = [b"\xff\xff\xfd", b"\xff", b"\xfd", b"\x00", b"\x55", b"\x12"]
 payloads = st.lists(st.sampled_from(PIECES), max_size=40).map(b"".join)
 

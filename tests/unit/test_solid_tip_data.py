@@ -68,7 +68,7 @@ def test_the_extent_hardly_depends_on_the_depth(arrays, d):
 
 @pytest.mark.extended
 def test_frames_match_three_dimensional_elements(arrays):
-    """The frames come from tests/harness/solid_reference.py, which uses other meshes and no fit."""
+    """The frames come from solid_reference.py in tests/harness, which uses different meshes."""
     with np.load(REFERENCE) as data:
         names = ("base", "nu", "d", "theta", "push", "energy", "force", "frame")
         rows = list(zip(*(data[name] for name in names), strict=True))

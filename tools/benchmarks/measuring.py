@@ -77,7 +77,7 @@ def interleave(
 ) -> dict[str, NDArray[np.float64]]:
     """Measure each subject's time per call [ns], with one value per round.
 
-    The subjects take turns, so that slow periods of the machine affect all subjects. The first call
+    The subjects take turns, so that a slow phase of the machine affects all of them. The first call
     to each subject, which compiles it, is not counted. Each measurement repeats the call to fill a
     time slice. Garbage collection is disabled during the measurement.
     """

@@ -96,7 +96,7 @@ class Step:
 
     @cached_property
     def converter(self) -> Converter:
-        """Conversion from counts to pressure, according to the completed steps."""
+        """Conversion from counts to pressure, based on the calibration steps completed so far."""
         return Converter(self.calibration, self.settings.tactile.pascal_per_count)
 
     @property

@@ -37,7 +37,7 @@ faults; any number can be given, each in the form KIND[=VALUE][@START]:
                    factor to 1 or its other value to 0
   the object       push=N along its faces, away from the palm, twist=N·m; 0 ends the load
   recovery         well ends all faults; left:well ends those of one board and its measurements.
-                   Loads on the object remain, and so do hardware errors of servos until a reboot
+                   Loads on the object are not removed. Hardware errors remain until a reboot
   @START           start time [s]; without it, the fault starts immediately. With gain=0.5@3..5, a
                    measurement changes linearly from 3 to 5 s
 

@@ -144,7 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until the q key is pressed, a signal arrives, the duration is over or the daemon exits.
+    """Run until the q key, a signal, the end of the duration or the daemon's exit.
 
     Returns 1 if no stream was received. Raises KeyFileError.
     """

@@ -160,7 +160,7 @@ class Pictures:
         self._read_settings(Settings())
 
     def clear(self) -> None:
-        """Discard all data except the hand's settings, before data from another time are read."""
+        """Discard all data except the hand's settings, for example before a jump in a recording."""
         self.feed = StreamState()
         self.states = 0  # number of states since the last `clear`
         self.time = math.nan  # Unix time of the newest state [s]

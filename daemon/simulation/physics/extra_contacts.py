@@ -145,7 +145,7 @@ def tips_are_far(plant: Plant) -> bool:
 
 @inner_kernel
 def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
-    """Evaluate the tip-to-tip contact and add its torques; return True if they may touch."""
+    """Evaluate the tip-to-tip contact and add its torques; return True if the tips may touch."""
     p = plant.parameters
     left, right = plant.fingers[0], plant.fingers[1]
     apart_x = right.x - left.x
