@@ -220,7 +220,7 @@ def add_daemon(
     parser: argparse.ArgumentParser, kind: Callable[[str], Any], client: bool = False
 ) -> None:
     """Add ``--address`` and ``--keys``; add ``--client`` if the program sends commands."""
-    where = "daemon address: tcp://HOST, STREAM,COMMANDS, or a single socket"
+    where = "daemon address: tcp://HOST, a pair STREAM,COMMANDS, or the address of one socket"
     parser.add_argument("--address", type=kind, default="", help=where)
     parser.add_argument(
         "--keys",

@@ -78,8 +78,8 @@ softfinger {version}: two rotational fingers with soft tips. To start:
   softfinger help                   list all subcommands; help SUBCOMMAND lists its arguments"""
 _EPILOG = """\
 Arguments of a subcommand: softfinger help SUBCOMMAND. To start: softfinger run --monitor
-Exit status: 0 success; 1 failure, with the reason; 2 invalid arguments or settings; 130 interrupted
-by Ctrl-C. The help of a subcommand lists its additional exit statuses."""
+Exit status: 0 success; 1 failure (the reason is printed); 2 invalid arguments or settings; 130
+interrupted by Ctrl-C. The help of a subcommand lists its additional exit statuses."""
 
 
 def _open_standard_streams() -> None:

@@ -39,7 +39,7 @@ RETRY_DELAY = 0.05  # delay before a late command is sent again [s]
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux only
 LOCAL_STOP_TIMEOUT = 0.5  # timeout for a stop over the local socket [s]
 # Warning that is logged if ``torque_off`` is ``unconfirmed``.
-UNCONFIRMED_TEXT = "the servos have not confirmed torque off yet"
+UNCONFIRMED_TEXT = "the servos have not yet confirmed that torque is off"
 
 
 class NoAnswer(SoftfingerError):

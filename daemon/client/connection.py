@@ -73,8 +73,8 @@ def require_host(address: str) -> None:
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or "not a host name"
         raise SettingsError(
-            f"{address}: found the unknown host {host!r} ({why}), expected an IP address or a "
-            "host name that this machine can resolve"
+            f"{address}: unknown host {host!r} ({why}); expected an IP address or a host name "
+            "that this machine can resolve"
         ) from None
 
 
@@ -99,9 +99,9 @@ class OneThread:
             owner = self._owner
         if owner is not thread:
             raise WrongThread(
-                f"thread {thread.name}: the stream of this Hand is already used by thread "
-                f"{owner.name}, but only one thread can use a Hand; create another Hand in this "
-                "thread"
+                f"thread {thread.name}: thread {owner.name} already uses the stream of this Hand, "
+                "and only one thread can use a stream; create another Hand in "
+                "each additional thread"
             )
 
 

@@ -189,7 +189,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
         Finding(
             "note",
             "found",
-            f"{problem}; the supply voltage is {min(volts):.1f} V at the servos that reply",
+            f"{problem}; the supply voltage of the servo that replies is {min(volts):.1f} V",
             fix,
         )
     ]
@@ -246,15 +246,15 @@ def check_board(settings: Settings, finger: int) -> Finding:
     rest = 0.0 if frame is None else _rest(settings, finger, frame)
     if rest > _REST_NOISE_RATIO * tactile.noise:
         text = (
-            f"{found}, but half of the cells read {rest / 1e3:.1f} kPa or more without load, "
-            "expected 0"
+            f"{found}, but half of the cells read {rest / 1e3:.1f} kPa or more without load "
+            "(expected 0 kPa)"
         )
         fix = "run `softfinger calibrate tare` once, or `softfinger send tare` after each start"
         return Finding("warn", name, text, fix)
     # Depending on the timing, the frame count may be off by one.
     if abs(frames - tactile.rate * spent) > max(_RATE_TOLERANCE * tactile.rate * spent, 1.5):
         text = f"{found}, expected {tactile.rate:g}"
-        fix = f"set tactile.rate = {rate:.0f} unless this machine is busy"
+        fix = f"if this machine is not busy, set tactile.rate = {rate:.0f}"
         return Finding("warn", name, text, fix)
     return Finding("pass", name, found)
 

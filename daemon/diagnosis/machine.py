@@ -42,7 +42,7 @@ def check_scheduling() -> Finding:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
     except OSError:
         soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
-        problem = f"not allowed (RLIMIT_RTPRIO {soft}): other processes can delay a tick"
+        problem = f"not allowed (RLIMIT_RTPRIO {soft}), so other processes can delay a tick"
         return Finding("warn", "scheduling", f"SCHED_FIFO is {problem}", GRANT_PRIORITY)
     os.sched_setscheduler(0, *before)
     return Finding("pass", "scheduling", "SCHED_FIFO is allowed")
@@ -58,7 +58,8 @@ def check_memory_lock(limit: int) -> Finding:
     if limit >= _MEMORY:
         return Finding("pass", "memory lock", size)
     problem = (
-        f"only {size} of {_MEMORY >> 20} MiB may be locked: the loop's memory can be swapped out"
+        f"only {size} may be locked, expected {_MEMORY >> 20} MiB: the loop's memory can be "
+        "swapped out"
     )
     return Finding("warn", "memory lock", problem, GRANT_MEMORY_LOCK)
 
@@ -67,10 +68,12 @@ def check_idle_states(path: Path) -> Finding:
     """Check that the daemon can disable deep idle states, from which processors wake up slowly."""
     name = str(path)
     if not path.exists():
-        return Finding("warn", name, "not provided by this kernel: deep idle states delay wake-ups")
+        return Finding(
+            "warn", name, "not provided by this kernel, so deep idle states delay wake-ups"
+        )
     if os.access(path, os.W_OK):
         return Finding("pass", name, "can be opened")
-    problem = "no permission to open it: deep idle states delay wake-ups"
+    problem = "can't be opened (no permission), so deep idle states delay wake-ups"
     return Finding("warn", name, problem, GRANT_LATENCY)
 
 
@@ -79,7 +82,7 @@ def check_wall_clock(now: float) -> Finding:
     if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
-    problem = f"is set to {date}: published timestamps will be wrong"
+    problem = f"is set to {date}, so published timestamps will be wrong"
     return Finding("warn", "wall clock", problem, "sudo timedatectl set-ntp true")
 
 
@@ -117,12 +120,12 @@ def check_kernels(settings: Settings) -> list[Finding]:
         fix = "export NUMBA_CACHE_DIR=FOLDER, where FOLDER is your own folder"
         return [Finding("warn", "kernel cache", problem, fix)]
     if spoilt:
-        problem = f"found {spoilt} corrupted files in {place}: the next start will recompile them"
+        problem = f"found {spoilt} corrupted files in {place}, which the next start will recompile"
         return [
             Finding("warn", "kernels", problem, "run `softfinger compile`, or start the daemon")
         ]
     cold = [part.name for part in parts(settings) if not is_built(part, settings)]
     if not cold:
         return [Finding("pass", "kernels", f"compiled, in {place}")]
-    problem = f"{', '.join(cold)} not compiled yet: the next start will take longer"
+    problem = f"not compiled yet: {', '.join(cold)}; the next start will take longer"
     return [Finding("warn", "kernels", problem, "run `softfinger compile`, or start the daemon")]

@@ -66,7 +66,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     if not stat.S_ISCHR(mode.st_mode):
         return Finding("FAIL", path, "is not a serial port", f"set {key}")
     if not os.access(path, os.R_OK | os.W_OK):
-        return Finding("FAIL", path, "no permission to open it", grant(path))
+        return Finding("FAIL", path, "no permission to open the port", grant(path))
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:

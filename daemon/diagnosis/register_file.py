@@ -92,7 +92,9 @@ def restore_registers(settings: Settings, path: Path) -> list[Finding]:
             name, kept = servo_name(servo_id, finger), stored.get(servo_id)
             if kept is None:
                 result.append(
-                    Finding("warn", name, f"not restored: {path} does not contain ID {servo_id}")
+                    Finding(
+                        "warn", name, f"not restored: {path} contains no servo with ID {servo_id}"
+                    )
                 )
                 continue
             number = line.ping(servo_id)

@@ -32,8 +32,8 @@ from softfinger.daemon.wire.loop_link import ASK, Ask, Channel
 # Packed strings cannot contain the byte sequence of a packed stop command.
 _PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")
 _MALFORMED_REFUSAL = refusal(
-    "envelope: expected a single frame with the command; an envelope may precede this frame if "
-    f"the envelope ends with an empty frame and has at most {bounds.PART_COUNT_MAX - 2} frames and "
+    "envelope: expected one frame that contains the command, optionally after an envelope that "
+    f"ends with an empty frame and has at most {bounds.PART_COUNT_MAX - 2} frames and "
     f"{bounds.ENVELOPE_SIZE_MAX} bytes",
     Reason.REQUEST,
 )

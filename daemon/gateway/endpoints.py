@@ -101,8 +101,7 @@ class ClientSockets:
         gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
         if gone or found.secret != self._keys.secret:
             raise RestartNeeded(
-                "access.keys: disconnected the clients that have no key file: "
-                f"{', '.join(gone) or 'all'}"
+                f"access.keys: disconnected clients without a key file: {', '.join(gone) or 'all'}"
             )
         self._keys = found
 

@@ -139,9 +139,9 @@ class Loop:
             self._control.stop()
             self.torque.end()
             if self.state.torque:
-                self.emit("error", "end", "ended; torque MAY STILL BE ON")
+                self.emit("error", "end", "exited; torque MAY STILL BE ON")
             else:
-                self.emit("info", "end", "ended; torque is off")
+                self.emit("info", "end", "exited; torque is off")
 
     def advance(self, duration: float | None = None) -> None:
         """Run ticks for ``duration`` [s] of machine time or until `end` is called.

@@ -272,7 +272,7 @@ class Requests:
             refuse_if(
                 state.torque and not self._control.torque,
                 Reason.STATE,
-                "the servos have not confirmed torque off yet: check the power supply "
+                "the servos have not yet confirmed that torque is off: check the power supply "
                 "and the cable",
             )
         begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING_MODES)

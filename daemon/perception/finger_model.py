@@ -93,7 +93,8 @@ def make_models(
         if material.misfits is not None and on_event is not None:
             text = (
                 f"{name}: the material law deviates from the measured points by up to "
-                f"{material.fit_error:.0f} Pa ({material.worst_force_error:.1%} of the force)"
+                f"{material.fit_error:.0f} Pa, which changes the force by up to "
+                f"{material.worst_force_error:.1%}"
             )
             on_event("info", "material", text)
     left, right = (made.get(k) or replace(made[1 - k], finger=k) for k in range(len(FINGERS)))

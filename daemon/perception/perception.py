@@ -269,7 +269,7 @@ class FingerPerception:
             self._estimator.saturation = least_end(ends)
         middle, most = float(np.median(moved)), float(moved[np.argmax(np.abs(moved))])
         text = (
-            f"the {side} sensor's zero offsets changed by {middle:+.1f} counts "
-            f"({middle * self._quantum:+.0f} Pa); the largest change was {most:+.1f} counts"
+            f"the {side} sensor's zero offsets changed: median {middle:+.1f} counts "
+            f"({middle * self._quantum:+.0f} Pa), largest change {most:+.1f} counts"
         )
         self._events.append(("info", "tare", text))

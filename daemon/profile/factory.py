@@ -30,8 +30,8 @@ def law_problem(material: Material, limit: float) -> str:
         return ""
     return (
         "the material law deviates from the measured points by up to "
-        f"{material.fit_error:.4g} Pa ({found:.1%} of the force); expected at most {limit:.1%} "
-        "(material.force_error_max)"
+        f"{material.fit_error:.4g} Pa, which changes the force by up to {found:.1%}; expected at "
+        f"most {limit:.1%} (material.force_error_max)"
     )
 
 

@@ -90,8 +90,8 @@ def _deep_grip(settings: Settings) -> Iterator[str]:
     for key, force, d in _set_depths(settings):
         if d > settings.safety.d_max:
             yield (
-                f"{key}: found {force:g} N, which compresses the tip by {d * 1e3:.3g} mm, "
-                f"expected at most safety.d_max = {settings.safety.d_max * 1e3:.3g} mm"
+                f"{key}: found {force:g} N, which compresses the tip by {d * 1e3:.3g} mm; "
+                f"safety.d_max allows at most {settings.safety.d_max * 1e3:.3g} mm"
             )
 
 
@@ -193,7 +193,7 @@ def _joints(settings: Settings) -> Iterator[str]:
     for index, finger in enumerate(FINGERS):
         low, open_, high = hand.q_min[index], hand.open_angle[index], hand.q_max[index]
         if not low < high:
-            yield f"hand.q_max: found {high:g} for {finger}, expected above q_min {low:g}"
+            yield f"hand.q_max: found {high:g} for {finger}, expected more than q_min = {low:g}"
         elif not low <= open_ <= high:
             yield f"hand.open_angle: found {open_:g} for {finger}, expected {low:g} to {high:g}"
 
@@ -232,7 +232,8 @@ def _timing(settings: Settings) -> Iterator[str]:
         value = getattr(settings.servos, key)
         if 0.0 < value <= 2.0 * period:
             yield (
-                f"servos.{key}: found {value:g} s, expected more than two ticks, {2.0 * period:g} s"
+                f"servos.{key}: found {value:g} s, expected more than {2.0 * period:g} s, the "
+                "duration of two ticks"
             )
 
 
@@ -274,7 +275,7 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
         return
     if settings.material.law != "constant":
         yield f'material.law: found "{settings.material.law}", expected "constant" for a solid tip'
-    why = "0.4 of a solid tip's radius"
+    why = "0.4 times the radius of a solid tip"
     yield from _too_large("safety.d_max", settings.safety.d_max, "m", 0.4 * tip.radius, why)
     if tactile.backend == "none":
         return
@@ -343,7 +344,8 @@ def _dither(settings: Settings) -> Iterator[str]:
     limit = settings.safety.current_max * control.torque_constant
     why = "the torque at safety.current_max"
     yield from _too_large("control.dither_torque", control.dither_torque, "N·m", limit, why)
-    limit, why = settings.loop.rate / _DITHER_TICKS_MIN, f"{_DITHER_TICKS_MIN} ticks per period"
+    limit = settings.loop.rate / _DITHER_TICKS_MIN
+    why = f"which is {_DITHER_TICKS_MIN} ticks per period"
     yield from _too_large("control.dither_frequency", control.dither_frequency, "Hz", limit, why)
 
 
@@ -353,8 +355,8 @@ def _cells(settings: Settings) -> Iterator[str]:
         for cell in cells:
             if cell[0] >= tactile.rows or cell[1] >= tactile.cols:
                 yield (
-                    f"tactile.dead: found {shown(cell)} for {FINGERS[index]}, expected a cell of "
-                    f"the grid of {tactile.rows} × {tactile.cols}"
+                    f"tactile.dead: found {shown(cell)} for {FINGERS[index]}, expected a cell in "
+                    f"the grid of {tactile.rows} × {tactile.cols} cells"
                 )
 
 
@@ -381,7 +383,7 @@ def _limits(settings: Settings) -> Iterator[str]:
     safety = settings.safety
     if safety.frame_age_hold >= safety.frame_age_fault:
         yield (
-            f"safety.frame_age_hold: found {safety.frame_age_hold:g}, expected a value below "
+            f"safety.frame_age_hold: found {safety.frame_age_hold:g}, expected less than "
             f"safety.frame_age_fault = {safety.frame_age_fault:g}"
         )
 
@@ -390,7 +392,7 @@ def _forces(settings: Settings) -> Iterator[str]:
     low, high = settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
     if low >= high:
         yield (
-            f"control.contact_force: found {low:g} N, expected below {GRIP_FRACTION:g} × "
+            f"control.contact_force: found {low:g} N, expected less than {GRIP_FRACTION:g} × "
             f"safety.force_max = {high:g} N"
         )
         return

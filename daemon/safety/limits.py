@@ -399,8 +399,7 @@ def _joint_current(view: View, state: State, _: float, i: int) -> str:
 _FULL_CURRENT = 0.9  # minimum fraction of the goal's current limit that counts as saturation
 
 
-@Limit("joint.stall", "joint that is stalled at maximum current before it reaches its "
-    "goal",
+@Limit("joint.stall", "joint that stalls at maximum current before it reaches its goal",
     "fault", ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
     lasts="stall_time").each  # fmt: skip
 def _joint_stall(view: View, state: State, _: float, i: int) -> str:
@@ -448,8 +447,8 @@ _OVERLAP_RATIO = 0.5
 
 
 @Limit("joint.opens",
-    "overlap of the tips during the approach according to the joint angles, while one tip "
-    "measures no contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
+    "tip overlap during the approach, computed from the joint angles, although one tip has no "
+    "contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 
@@ -490,8 +489,8 @@ def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     )
 
 
-LIMITS.append(Limit("torque.off", "the servos did not confirm torque off within half the time "
-    "servos.watchdog; the bus is then kept silent until the watchdogs stop the servos", "fault",
+LIMITS.append(Limit("torque.off", "the servos did not confirm within half of servos.watchdog that "
+    "torque is off; the bus is then kept silent until the watchdogs stop the servos", "fault",
     ("servos.watchdog",)))  # fmt: skip
 
 
@@ -520,7 +519,7 @@ def _goal_number(view: View, _: State, __: float) -> str:
 LIMITS += [
     Limit("goal.angle", "goal angle", "limit", ("hand.q_min", "hand.q_max")),
     Limit("goal.current", "goal current", "limit", ("safety.current_max",)),
-    Limit("goal.step", "step of the goal angle while the goal is far from the joint angle", "limit",
+    Limit("goal.step", "goal angle step while the goal is far from the joint angle", "limit",
         ("safety.goal_reach", "safety.goal_speed")),
     Limit("goal.slew", "increase in goal current per tick", "limit", ("safety.current_rate",)),
 ]  # fmt: skip
@@ -572,11 +571,13 @@ def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
         return ""
     if not contact.inside and view.settings.tip.physics != "springs":
         tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
-        deep = f"the {FINGERS[i]} tip is {contact.d * 1e3:.2f} mm deep at a tilt of {tilt:.1f}°"
-        return f"{deep}, outside the range of its contact model"
+        deep = f"the {FINGERS[i]} tip is compressed by {contact.d * 1e3:.2f} mm"
+        return f"{deep} at a tilt of {tilt:.1f}°, outside the range of its contact model"
     limit = fraction * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
     tilt, largest = math.degrees(contact.theta), math.degrees(limit)
-    return f"the {FINGERS[i]} tip tilt is {tilt:.1f}°, above {largest:.1f}° at this depth"
+    return (
+        f"the {FINGERS[i]} tip tilt is {tilt:.1f}°, expected at most {largest:.1f}° at this depth"
+    )
 
 
 # --- sensors --------------------------------------------------------------------------------------
@@ -679,7 +680,7 @@ def _add_consistency_checks(finger: int, side: str) -> None:
             return ""
         return (
             f"the {side} joint's measured current is {state.reading.current[finger]:.2f} A, but "
-            f"its goal current is {state.goal.current[finger]:.2f} A: the measured current is "
+            f"its goal current is {state.goal.current[finger]:.2f} A, so the measured current is "
             "ignored"
         )
 

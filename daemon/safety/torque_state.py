@@ -169,7 +169,8 @@ class TorqueState:
         if self._reported:
             self._reported = False
             waited = state.t - self._first
-            self._emit("info", TORQUE_OFF, f"the servos confirmed torque off after {waited:.2f} s")
+            text = f"the servos confirmed after {waited:.2f} s that torque is off"
+            self._emit("info", TORQUE_OFF, text)
 
     def _is_silent(self) -> bool:
         """Return True if the bus must stay silent on this tick to trip the servo watchdogs."""
@@ -189,7 +190,8 @@ class TorqueState:
             return
         self._reported = True
         state = self._state
-        text = f"the servos have not confirmed torque off for {state.t - self._first:.2f} s: "
+        waited = state.t - self._first
+        text = f"the servos did not confirm within {waited:.2f} s that torque is off: "
         if not self._silence:
             text += (
                 "switch off their supply, because servos.watchdog = 0 disables the watchdogs "

@@ -215,8 +215,8 @@ def notice_servo(
         ),
         (
             servos.fault_after > _FAULT_AFTER_LONG,
-            f"servos.fault_after = {servos.fault_after:g} s: if replies are missing, the last "
-            "reading is used for up to this time",
+            f"servos.fault_after = {servos.fault_after:g} s: if replies are missing, the daemon "
+            "uses the last reading for up to this time",
         ),
         (
             table[reg.DRIVE_MODE] & DRIVE_REVERSE,
@@ -229,8 +229,8 @@ def notice_servo(
         ),
         (
             not model.fast_read(firmware),
-            f"firmware {firmware} does not support fast sync reads (version "
-            f"{model.fast_read_firmware} or later does); the daemon uses slower sync reads",
+            f"firmware {firmware} does not support fast sync reads, which require version "
+            f"{model.fast_read_firmware} or later; the daemon uses slower normal sync reads",
         ),
         (present >= limit - _TEMPERATURE_MARGIN, f"{present} °C, close to its limit of {limit} °C"),
     )

@@ -369,8 +369,7 @@ class DynamixelServos:
                 self.torque_off(reading)
             if torque.may_be_on:
                 _log.error(
-                    "the servos have not confirmed torque off; the bus watchdogs will stop the "
-                    "servos"
+                    "servos: torque off was not confirmed; the bus watchdogs will stop the servos"
                 )
         except PortLost:
             _log.error(
@@ -378,7 +377,7 @@ class DynamixelServos:
                 "the servos"
             )
         except Exception as error:
-            _log.error("servos: torque off not confirmed: %s", error)
+            _log.error("servos: torque off was not confirmed: %s", error)
         self._line = self._torque = self._reads = None
         with contextlib.suppress(Exception):
             line.port.closePort()

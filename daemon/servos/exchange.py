@@ -82,7 +82,7 @@ def choose_reads(
         if reads.answered():
             return reads, notices
         text = "the servos do not reply to fast sync reads, although their firmware supports them"
-        notices.append(Finding("warn", "servos", text, "the daemon uses slower sync reads"))
+        notices.append(Finding("warn", "servos", text, "the daemon uses slower normal sync reads"))
     reads = TickReads(port, handler, ids, GroupRead)
     if not reads.answered():
         listed = ", ".join(map(str, ids))
@@ -164,8 +164,8 @@ def judge_exchanges(
         return Finding(status, "exchange", text, fix)
     if decisive * rate > _REPLY_FRACTION_MAX:
         text += (
-            f"; this takes most of a tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}), so ticks "
-            "will be late"
+            f"; a cycle takes up most of a tick of {_ms(1.0 / rate)} (loop.rate = {rate:g}), so "
+            "ticks will be late"
         )
         return Finding("warn", "exchange", text, _remedy(decisive, settings))
     return Finding("pass", "exchange", text)
@@ -179,7 +179,7 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
         return []
     text = (
         f"the servos take at least {_ms(least)} to reply, which is {least * rate:.0%} of a tick of "
-        f"{_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
+        f"{_ms(1.0 / rate)} (loop.rate = {rate:g}), so ticks will be late"
     )
     fix = (
         f"{_remedy(least, settings)}; run `softfinger doctor` to measure the reply times of "

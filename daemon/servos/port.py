@@ -146,7 +146,7 @@ def _why_not(path: str, error: Exception) -> str:
             "doctor` lists the available ports"
         )
     if code == errno.EACCES:
-        return f"{path}: no permission: {grant(path)}"
+        return f"{path}: no permission to open the port: {grant(path)}"
     if code in (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK) or "lock" in str(error).lower():
         return f"{path}: the port is in use by another program: end that program first"
     return f"{path}: can't be opened: {error}"

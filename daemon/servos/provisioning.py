@@ -75,8 +75,8 @@ class Garbled:
     def __str__(self) -> str:
         factory = " (the factory setting)" if self.id == FACTORY_ID else ""
         return (
-            f"replies of ID {self.id} at {self.baud} baud are corrupted: several servos have this "
-            f"ID{factory}, or the line is faulty"
+            f"replies from ID {self.id} at {self.baud} baud are corrupted: several servos have "
+            f"this ID{factory}, or the line is faulty"
         )
 
 

@@ -103,13 +103,15 @@ class FlexiTacDecoder(Decoder):
             )
         if self._ambiguous:
             return (
-                f"found the marker AA 55 several times in each frame of {expected}, so the frame "
+                f"found the AA 55 marker several times in each frame of {expected}, so the frame "
                 "boundary is ambiguous: load the sensor differently"
             )
         if self._markers:
-            return f"found markers AA 55, but not at intervals of one frame of {expected}"
+            return (
+                f"found AA 55 markers, but not at the intervals expected for frames of {expected}"
+            )
         return (
-            f"found no marker AA 55, expected frames of {expected}: check the board and its baud "
+            f"found no AA 55 marker, expected frames of {expected}: check the board and its baud "
             "rate"
         )
 

@@ -155,7 +155,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
             left -= part.file_size
             if left < 0:
                 raise ValueError(
-                    f"{name}: the unpacked data are suspiciously large for the size of the file"
+                    f"{name}: the unpacked data are suspiciously large for a file of this size"
                 )
             with archive.open(part) as unpacked:
                 held[ours] = _read_array(unpacked, part.file_size)
@@ -220,8 +220,8 @@ def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
         raise ValueError(
-            f"the header states the shape {shape} of {kind}, but the file does not contain that "
-            "much data"
+            f"the header states an array of shape {shape} and type {kind}, but the file contains "
+            "less data"
         )
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
@@ -247,7 +247,7 @@ def _checked(
     if frames.ndim != 3 or frames.size == 0:
         raise ValueError(f"frames: found shape {frames.shape}, expected [n, rows, cols]")
     if frames.dtype.kind not in "uif":
-        raise ValueError(f"frames: found {frames.dtype}, expected numbers")
+        raise ValueError(f"frames: found elements of type {frames.dtype}, expected numbers")
     live = np.ones(frames.shape[1:], np.bool_)
     if "live" in arrays:
         live = arrays["live"].astype(np.bool_)
@@ -312,7 +312,7 @@ def _check_below(
         )
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     if lowest < -_NOISE_SIGMA_MAX * noise:
-        expected = f"at least {-_NOISE_SIGMA_MAX * noise:.3g}, the range of noise around 0"
+        expected = f"at least {-_NOISE_SIGMA_MAX * noise:.3g}, the lower limit for noise around 0"
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     share = np.count_nonzero(frames < 0) / (len(frames) * np.count_nonzero(live))
     notes.append(

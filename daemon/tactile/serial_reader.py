@@ -269,7 +269,7 @@ def open_port(path: str, baud: int) -> serial.Serial:
             if not path.startswith("/dev/"):
                 why = "port not found; check that `softfinger emulate` is running"
         elif number in (errno.EACCES, errno.EPERM):
-            why = f"no permission to open it: {grant(path)}"
+            why = f"no permission to open the port: {grant(path)}"
         elif number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
             why = "the port is in use by another program: end that program first"
         else:

@@ -221,7 +221,7 @@ def _frames(
         raise TekscanError("the file does not contain any frames")
     if len(frames[-1]) < rows:
         raise TekscanError(
-            f"the file ends in frame {numbers[-1]}, which has {len(frames[-1])} of {rows} rows"
+            f"the file ends within frame {numbers[-1]}, which has {len(frames[-1])} of {rows} rows"
         )
     return numbers, frames, places
 

@@ -26,7 +26,8 @@ KINDS: dict[str, EventKind] = {
     "start": EventKind("info", "The daemon is starting, or is ready and accepts commands."),
     "end": EventKind(
         "info, error",
-        "The daemon has exited. If the level is error, the servos did not confirm torque off.",
+        "The daemon has exited. If the level is error, the servos did not confirm that torque is "
+        "off.",
         "If the level is error, switch off the servo supply.",
     ),
     "mode": EventKind("info", "The mode has changed; the message states the old and the new mode."),
@@ -54,8 +55,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "realtime": EventKind(
         "info, warning",
-        "Real-time features were enabled. A warning names a feature that the system denied.",
-        "To permit the feature, run the command in the warning; otherwise, disable the "
+        "Real-time features were enabled. A warning names each feature that the system denied.",
+        "To allow a denied feature, run the command in the warning. Otherwise, disable the "
         "feature in `[realtime]`.",
     ),
     "late": EventKind(
@@ -100,8 +101,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "slip": EventKind(
         "warning",
-        "The object slips or rotates in the grip, or the grip force was increased or a rotation "
-        "was stopped to prevent slip.",
+        "The object slips or rotates in the grip. The event also reports that the daemon increased "
+        "the grip force or stopped a rotation to prevent slip.",
         "Grasp with more force; check `control.tip_friction` and `control.object_load`.",
     ),
     "grip.slip": EventKind(
@@ -141,7 +142,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "servos.frozen": EventKind(
         "error",
-        "A servo repeats outdated readings.",
+        "A servo keeps sending outdated readings.",
         "Switch the servo supply off and on again; check the cable.",
     ),
     "servos.alert": EventKind(
@@ -178,8 +179,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "torque.off": EventKind(
         "error, info",
-        "The servos have not confirmed torque off. When the servos confirm torque off, an "
-        "event of level info follows.",
+        "The servos have not confirmed that torque is off. An info event follows when the servos "
+        "confirm that torque is off.",
         "Switch off the supply, then find out why the servos do not reply.",
     ),
     # Joints
@@ -190,17 +191,17 @@ KINDS: dict[str, EventKind] = {
     ),
     "joint.velocity": EventKind(
         "error",
-        "A joint moves too fast.",
-        "Check whether something pushed the finger. If not, reduce the control gains.",
+        "A joint is moving too fast.",
+        "Check whether something pushed the finger; if not, reduce the control gains.",
     ),
     "joint.jump": EventKind(
         "error",
-        "A joint angle does not follow the measured velocity of the joint.",
+        "A joint angle is inconsistent with the measured joint velocity.",
         "Check the encoder and the cable of the servo.",
     ),
     "joint.dead": EventKind(
         "error",
-        "A joint does not move towards its goal and draws no current.",
+        "A joint neither moves towards its goal nor draws current.",
         "Check the encoder, the current sensor and the motor of the servo.",
     ),
     "joint.current": EventKind(
@@ -210,7 +211,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "joint.stall": EventKind(
         "error",
-        "A joint does not reach its goal at maximum current.",
+        "A joint stalled at maximum current before it reached its goal.",
         f"Remove the obstacle. {_CALIBRATE_JOINTS}",
     ),
     "joint.swapped": EventKind(
@@ -239,17 +240,17 @@ KINDS: dict[str, EventKind] = {
     # Tips and sensors
     "tip.force": EventKind(
         "warning, error",
-        "The force of a tip is close to or above `safety.force_max`.",
+        "A tip force is close to or above `safety.force_max`.",
         "Grasp with less force. If the measured force is wrong, check the calibration.",
     ),
     "tip.displacement": EventKind(
         "warning, error",
-        "The displacement of a tip is close to or above `safety.d_max`.",
+        "A tip displacement is close to or above `safety.d_max`.",
         "Grasp with less force.",
     ),
     "tip.tilt": EventKind(
         "warning, error",
-        "The tip's tilt is close to or beyond the limit of the contact model.",
+        "The tilt of a tip is close to or beyond the limit of the contact model.",
         "Rotate the object back, or grasp with less force.",
     ),
     "tactile": EventKind(
@@ -263,12 +264,11 @@ KINDS: dict[str, EventKind] = {
         "error",
         "No valid frame arrived within `safety.frame_age_fault`.",
         "The message states the reason and, if the cell noise exceeds `tactile.noise`, the "
-        "measured noise. Check the cable, and check the board with `softfinger "
-        "doctor`.",
+        "measured noise. Check the cable, and run `softfinger doctor` to check the board.",
     ),
     "tactile.frozen": EventKind(
         "error",
-        "A board repeats the same frame during contact.",
+        "A board keeps sending the same frame during contact.",
         "Switch the board off and on again. If the board's noise is below one count, set "
         "`safety.frozen_after = 0`.",
     ),
@@ -286,7 +286,7 @@ KINDS: dict[str, EventKind] = {
     "tare": EventKind(
         "info, warning",
         "A tare has ended. The message states the median and the largest change in the zero "
-        "offsets. At the `warning` level, the sensor was not tared because most cells are "
+        "offsets. If the level is warning, the sensor was not tared because most cells are "
         "saturated without contact.",
         "If the level is warning, check the board's gain and `tactile.full_count`. If the "
         "change is large at every start, run `softfinger calibrate tare` again.",

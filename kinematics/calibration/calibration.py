@@ -249,7 +249,7 @@ def _cubic(
     at = np.linspace(0.0, 1.0, 201)
     if (c[0] + 2 * c[1] * at + 3 * c[2] * at**2 <= 0.0).any():
         raise CalibrationError(
-            "curve: the cubic through these loads is not increasing; use a power law"
+            "curve: the cubic through these loads does not increase monotonically; use a power law"
         )
     scaled = (1.0, float(c[0] / full), float(c[1] / full**2), float(c[2] / full**3))
     return scaled, rows @ c - 1.0

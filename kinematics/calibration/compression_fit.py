@@ -115,9 +115,9 @@ def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
         )
     if np.ptp(run.force[run.pressed]) < _LOADED * _noise([run]):
         raise CalibrationError(
-            f"found a force of {np.ptp(run.force[run.pressed]):.3g} N, expected at least "
-            f"{_LOADED * _noise([run]):.2g} N ({_LOADED:g} times the scatter of the force): check "
-            "that the tip was loaded"
+            f"the force changes by {np.ptp(run.force[run.pressed]):.3g} N, expected at least "
+            f"{_LOADED * _noise([run]):.2g} N ({_LOADED:g} times the force noise): check that the "
+            "tip was loaded"
         )
     return run
 
@@ -135,8 +135,8 @@ def rising(d: FloatArray) -> tuple[slice, int]:
     turns = _turning_points(d, _SLACK * span)
     if len(turns) - 2 > max(2, d.size // _TURNS):
         raise CalibrationError(
-            f"found {len(turns) - 2} reversals of d in {d.size} rows, expected rows in the order "
-            "of the test: sort the rows by time"
+            f"d reverses {len(turns) - 2} times in {d.size} rows, expected rows in test order: "
+            "sort the rows by time"
         )
     top = d.max() - (1.0 - _DEEP) * span
     found = [(i, j) for i, j in itertools.pairwise(turns) if d[j] > d[i] and d[j] >= top]

@@ -121,8 +121,9 @@ def duration_error(seconds: float) -> str:
 
 def _too_little(closing: float, opening: float) -> str:
     return (
-        f"found {closing:.1f} s of closing and {opening:.1f} s of opening without contact at more "
-        f"than {_SLIDING_SPEED:g} rad/s, expected at least {_MOTION_TIME_MIN:g} s in each direction"
+        f"found {closing:.1f} s of closing motion and {opening:.1f} s of opening motion, expected "
+        f"at least {_MOTION_TIME_MIN:g} s of each; the joint must move faster than "
+        f"{_SLIDING_SPEED:g} rad/s and without contact"
     )
 
 

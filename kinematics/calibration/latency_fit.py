@@ -146,7 +146,7 @@ def _fit(
 
 def _too_little(widest: float) -> str:
     return (
-        f"found a change of d of {widest * 1e3:.1f} mm (computed from the joints), expected at "
+        f"d (computed from the joints) changed by {widest * 1e3:.1f} mm, expected a change of at "
         f"least {_CLOSING_MIN * 1e3:g} mm while both tips are in contact"
     )
 

@@ -154,7 +154,7 @@ def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """Return the covariance [4, 4] of one frame's sums, from the frames of each press."""
     if min(map(len, frames)) < 5:
         raise CurvesError(
-            "expected at least five frames for each press, which are needed to measure the noise"
+            "expected at least five frames for each press, so that the noise can be measured"
         )
     each = [weights @ every.reshape(len(every), -1).T for every in frames]
     return np.asarray(np.mean([np.cov(sums) for sums in each], axis=0))

@@ -62,7 +62,7 @@ class Material:
         if not np.all(slope > 0.0):
             worst = int(np.argmin(slope))
             raise MaterialError(
-                "stress must increase with strain everywhere, but its slope is "
+                "stress must increase with strain everywhere, but the slope is "
                 f"{slope[worst]:.4g} Pa at strain {worst / 512:.3f}"
             )
 

@@ -98,8 +98,8 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
     misfit, modulus = next(one for one in tried if one[0] <= enough)
     if misfit > _MISFIT_MAX:
         raise MaterialError(
-            "no smooth monotonic law fits the points: the best law deviates from a point by "
-            f"{misfit * top:.4g} Pa, and the maximum stress is {top:.4g} Pa"
+            "no smooth monotonic law fits the points: the best law deviates from the points by up "
+            f"to {misfit * top:.4g} Pa (maximum stress: {top:.4g} Pa)"
         )
     rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])
     misses = np.abs(_integrals(x, len(modulus) - 1) @ modulus - y / top) * top

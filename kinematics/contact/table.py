@@ -149,8 +149,8 @@ class ContactTable:
         if material.worst_force_error > _LAW_ERROR:
             warnings.warn(
                 "the material law deviates from the measured points by up to "
-                f"{material.fit_error:.4g} Pa ({material.worst_force_error:.1%} of the force); "
-                f"expected at most {_LAW_ERROR:.0%}",
+                f"{material.fit_error:.4g} Pa, which changes the force by up to "
+                f"{material.worst_force_error:.1%}; expected at most {_LAW_ERROR:.0%}",
                 RuntimeWarning,
                 stacklevel=2,
             )

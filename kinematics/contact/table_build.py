@@ -75,8 +75,8 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
             break
         splits *= 2
     raise TableError(
-        f"no contact table for this material meets the tolerance {tolerance:.3g}; the lowest error "
-        f"is {table.max_error:.4g}"
+        f"no contact table for this material meets the tolerance {tolerance:.3g}; the smallest "
+        f"error reached is {table.max_error:.4g}"
     )
 
 

@@ -61,7 +61,7 @@ class TipCurves:
 
     def __post_init__(self) -> None:
         if not all(np.isfinite(getattr(self, each.name)).all() for each in fields(self)):
-            raise ValueError("all numbers of a measured law must be finite")
+            raise ValueError("all numbers in a measured law must be finite")
         if not (0.0 < self.deepest <= self.radius and 0.0 < self.tilt < 0.5 * math.pi):
             raise ValueError("the maximum depth and tilt of a measured law must be above 0")
         shapes = dict.fromkeys(("push", "shown", "lever", "extent"), (POWERS, SQUARES))

@@ -293,7 +293,7 @@ class ContactEstimator:
     ) -> None:
         if tip.physics == "measured":
             raise ValueError(
-                "the frames of a measured tip can't be modelled by this class: use "
+                "this class can't estimate the contact of a measured tip: use "
                 "softfinger.kinematics.estimation.measured.MeasuredEstimator"
             )
         if active is not None and np.shape(active) != grid.shape:

@@ -151,7 +151,7 @@ class VirtualTimeHand(Hand):
         """Advance by the smallest step: a tick, or a recorded message."""
         if self._serving:
             raise RuntimeError(
-                "serve() is running and advances the clock itself, so this call must not: use a "
+                "serve() is running and advances the clock itself; instead of this call, use a "
                 "client such as Hand(hand.address)"
             )
         self._step()
@@ -337,8 +337,8 @@ class VirtualHand(VirtualTimeHand):
             event = self._faults.pop(0)
             if not self.plant.apply_fault(event):
                 raise FaultError(
-                    f"{event}: found a fault of servos or boards, expected a measurement fault or "
-                    "a load: use emulated_hand"
+                    f"{event}: found a servo or board fault, expected a measurement fault or a "
+                    "load; emulated_hand supports all faults"
                 )
 
     @contextlib.contextmanager

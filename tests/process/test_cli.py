@@ -53,7 +53,7 @@ def test_duration_and_settings_on_the_command_line(profile, inline):
     done = softfinger("run", "--config", path, "--set", "loop.rate=250", "--duration", "0.3")
     assert done.returncode == 0, done.stderr
     assert "simulated, 250 Hz" in done.stderr
-    assert "ended; torque is off" in done.stderr
+    assert "exited; torque is off" in done.stderr
 
 
 def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
@@ -113,7 +113,7 @@ def test_fatal_signals_turn_torque_off_first(profile, addresses, number):
     process.send_signal(number)
     said = process.communicate(timeout=300)[1]
     assert process.returncode == 0
-    assert "ended; torque is off" in said
+    assert "exited; torque is off" in said
 
 
 @pytest.mark.extended

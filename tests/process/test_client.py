@@ -429,7 +429,7 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
             Hand()
 
 
-UNKNOWN = "found the unknown host 'no..host' (not a host name), expected an IP address or a"
+UNKNOWN = "unknown host 'no..host' (not a host name); expected an IP address or a"
 
 
 @pytest.mark.parametrize("cls", [Hand, AsyncHand])
@@ -490,9 +490,8 @@ def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     ):
         error = in_a_thread(use)
         assert isinstance(error, WrongThread), use
-        assert (
-            "thread other_0: the stream of this Hand is already used by thread MainThread"
-            in str(error)
+        assert "thread other_0: thread MainThread already uses the stream of this Hand" in str(
+            error
         )
     assert next(states).mode == hand.state().mode == "holding"
 

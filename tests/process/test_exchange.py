@@ -79,7 +79,7 @@ def test_assessment_of_exchange_times():
     near = judged(0.0017, 0.0018)  # `run` issues the same warning.
     assert (near.status, near.fix.split(",")[0]) == ("warn", "set loop.rate = 440")
     assert near.text.endswith(
-        "this takes most of a tick of 2 ms (loop.rate = 500), so ticks will be late"
+        "a cycle takes up most of a tick of 2 ms (loop.rate = 500), so ticks will be late"
     )
     # Both times are longer than a tick and shorter than reply_timeout.
     both = judged(0.0028, 0.003)
@@ -108,7 +108,7 @@ def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bu
         bus.servo(i).fast_reads = False  # This setting contradicts the firmware version.
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
-    assert notice.fix == "the daemon uses slower sync reads"
+    assert notice.fix == "the daemon uses slower normal sync reads"
     assert not isinstance(backend._reads.errors, FastGroupRead)
     reading = Reading()
     backend.read(reading)

@@ -238,7 +238,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     assert rig.status()["fault_name"] == "servos.bus"
     assert not rig.send("clear")["ok"]
     assert daemon.end() == 1
-    assert "ended with a fault" in "".join(daemon.lines)
+    assert "exited with a fault" in "".join(daemon.lines)
 
 
 def test_lost_packets_do_not_keep_torque_on(rig):
@@ -250,7 +250,7 @@ def test_lost_packets_do_not_keep_torque_on(rig):
     told = softfinger("send", "stop", "--address", rig.commands)
     assert told.returncode == 3
     assert json.loads(told.stdout)["torque_off"] == "unconfirmed"
-    assert "have not confirmed torque off" in told.stderr
+    assert "have not yet confirmed that torque is off" in told.stderr
     until(rig.stopped)
     assert rig.status()["torque"], "torque off is not confirmed yet"
     send_words(rig.folder, "lose-writes=0")

@@ -147,7 +147,7 @@ def test_keys_command_the_hand(fake):
         assert [r["command"] for r in fake.requests[count:]] == ["stop"]
         fake.replies["stop"] = {"ok": True, "mode": "disarmed", "torque_off": "unconfirmed"}
         page.type(b" ")
-        page.shows("✗ stop: the servos have not confirmed torque off yet")
+        page.shows("✗ stop: the servos have not yet confirmed that torque is off")
 
 
 SETTINGS = {"control": {"force_default": 10.0}, "safety": {"force_max": 14.0}}
@@ -254,7 +254,7 @@ def test_resize_suspend_and_continue(fake):
         page.shows("HOLDING", "▀" * 42)
         page.resize(60, 20)
         page.process.send_signal(signal.SIGWINCH)
-        page.shows("needs 80 × 24", "this is 60 × 20")
+        page.shows("requires 80 × 24", "this terminal: 60 × 20")
         page.type(b" ")
         page.wait(lambda: fake.requests == [{"command": "stop"}])
         page.resize(80, 24)

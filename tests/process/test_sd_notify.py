@@ -128,7 +128,7 @@ def test_the_daemon_reports_ready_alive_and_stopping_but_not_while_suspended(
     assert all({"timestamp", "level", "kind", "text"} <= set(record) for record in records)
     texts = [record["text"] for record in records]
     assert "running, disarmed" in texts
-    assert "ended; torque is off" in texts
+    assert "exited; torque is off" in texts
     times = [record["timestamp"] for record in records]
     assert times == sorted(times)
     running = next(record for record in records if record["text"] == "running, disarmed")
@@ -250,10 +250,10 @@ def test_journal_lines_have_priorities(capfd, monkeypatch):
     for form in ("plain", "json"):
         log = EventLog(form)
         log.line("warning", "bus", "slow\nand late", late_s=0.25)
-        log.plain("softfinger: ended with a fault", "error")
+        log.plain("softfinger: exited with a fault", "error")
         log.close()
     *plain, line, last = capfd.readouterr().err.splitlines()
-    ended = "<3>softfinger: ended with a fault"
+    ended = "<3>softfinger: exited with a fault"
     assert plain == ["<4>warning bus      slow", "<4>and late", ended]
     assert (json.loads(line.removeprefix("<4>"))["late_s"], last[:3]) == (0.25, "<3>")
 

@@ -250,7 +250,7 @@ def test_user_tests_pass(tmp_path, text, count):
 
 def test_unusable_hands_and_faults_are_refused(capfd):
     with pytest.raises(
-        NoEmulator, match=r"--model=AX-12: the program ended; see its message above"
+        NoEmulator, match=r"--model=AX-12: the program exited; see its message above"
     ):
         EmulatedHand(model="AX-12")
     assert "XM430-W350" in capfd.readouterr().err

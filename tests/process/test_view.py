@@ -69,8 +69,10 @@ class Kept:
         self.pictures = Pictures(self._take, lambda: True, self.said.append, live=live)
 
     def _take(self, scene: str, picture: str, rows: list[Row]) -> None:
-        self.scene, self.newest = orjson.loads(scene), orjson.loads(picture)
         self.rows = [orjson.loads(row.text) for row in rows]
+        # Tests in another thread wait for the picture, so the picture is stored last.
+        self.scene = orjson.loads(scene)
+        self.newest = orjson.loads(picture)
 
 
 def view(fake: FakeDaemon, *words: str) -> Viewed:

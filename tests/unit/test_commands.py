@@ -221,7 +221,7 @@ def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered
             assert msgpack.unpackb(reply) == {"ok": True, "heard": "arm"}
         else:
             assert msgpack.unpackb(reply)["reason"] == "request"
-            assert "expected a single frame with the command" in msgpack.unpackb(reply)["error"]
+            assert "expected one frame that contains the command" in msgpack.unpackb(reply)["error"]
 
 
 class Aged:

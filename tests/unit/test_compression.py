@@ -187,7 +187,7 @@ def shuffled(d, force):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (shuffled, "reversals of d in 210 rows"),
+        (shuffled, "times in 210 rows, expected rows in test order"),
         (lambda d, force: (d[140:], force[140:]), "d only decreases"),
         (lambda d, force: (0 * d, force), "the same displacement"),
         (lambda d, force: (d, 0.003 * force + 0.2), "tip was loaded"),
@@ -283,7 +283,7 @@ def test_contradictory_arguments_are_rejected(tmp_path, capsys, words, told):
     assert main(["calibrate", "law", str(out), *words]) == 1
     assert told in capsys.readouterr().err
     assert main(["calibrate", "modulus", str(out), *words]) == 1
-    assert "--compression: found the step modulus, but only the step law" in capsys.readouterr().err
+    assert "--compression: found the `modulus` step, but only the" in capsys.readouterr().err
 
 
 def test_a_depth_dependent_modulus_is_stored_as_points(tmp_path, capsys):

@@ -91,7 +91,7 @@ def test_torque_independent_of_direction_is_not_friction():
     assert found.viscous == pytest.approx(0.03, abs=2 * found.viscous_std)
     assert found.coulomb_std < COUNT
     closing = np.maximum.accumulate(q[t < 4.0])
-    with pytest.raises(CalibrationError, match=r"found 0\.\d s of closing and 0\.0 s of opening"):
+    with pytest.raises(CalibrationError, match=r"0\.\d s of closing motion and 0\.0 s of opening"):
         fit_friction(t[t < 4.0], closing, closing, shown[t < 4.0], 0.010, COUNT)
     with pytest.raises(CalibrationError, match=r"found 0\.0 s of closing"):
         fit_friction([], [], [], [], 0.010, COUNT)
@@ -105,7 +105,7 @@ def test_only_motion_without_contact_is_used(tmp_path, capsys):
     }
     record_hand(tmp_path / "run.mcap", due, 3.0)
     assert calibrate("friction", tmp_path) == 1
-    assert "friction: left: found 0.1 s of closing and " in capsys.readouterr().err
+    assert "friction: left: found 0.1 s of closing motion and " in capsys.readouterr().err
     assert load(tmp_path / "my.toml").control.joint_friction == 0.05
 
 
@@ -176,7 +176,7 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
 @pytest.mark.parametrize(
     ("profile", "due", "hand", "why"),
     [
-        (None, ARM, (), "found a change of d of 0.0 mm (computed from the joints)"),
+        (None, ARM, (), "d (computed from the joints) changed by 0.0 mm"),
         (None, FORCES, ("simulation.object_angle=0.3",), "neither slides nor tilts"),
         (VELOSTAT, GRASP, (), "found a latency uncertainty of 1"),
     ],
@@ -208,5 +208,5 @@ def test_a_delay_is_recovered_from_synthetic_data(delay):
     assert found.ramps == 2
     assert found.scale == pytest.approx(1.1, abs=0.02)
     still = np.zeros_like(read)
-    with pytest.raises(CalibrationError, match=r"expected at least 0\.8 mm"):
+    with pytest.raises(CalibrationError, match=r"at least 0\.8 mm"):
         fit_latency((t, d, std), (read, still), (2e-5, 0.2), 0.02)

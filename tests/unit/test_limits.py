@@ -67,10 +67,14 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
     "rim": (
         {"contacts.0.theta": -math.asin(0.8) + 0.04},
         "tip.tilt",
-        "the left tip tilt is -50.8°, above 5",
+        "the left tip tilt is -50.8°, expected at most 5",
     ),
     "late": ({"timing.late_in_row": 100}, "loop.overruns", "loop: 100 consecutive ticks were late"),
-    "outside": ({"contacts.0.inside": False}, "tip.tilt", "the left tip tilt is 5.7°, above"),
+    "outside": (
+        {"contacts.0.inside": False},
+        "tip.tilt",
+        "the left tip tilt is 5.7°, expected at most",
+    ),
 }
 THINNER: Changes = {"object.width": 0.0355}
 

@@ -237,14 +237,14 @@ def test_a_tare_reports_the_change_of_the_zero(make):
     pascal = daemon.settings.tactile.pascal_per_count
     found = tared(0, 0)
     assert found.startswith(
-        f"the left sensor's zero offsets changed by +100.0 counts ({100 * pascal:+.0f} Pa)"
+        f"the left sensor's zero offsets changed: median +100.0 counts ({100 * pascal:+.0f} Pa)"
     )
     assert tared(30, 50) == (
-        f"the left sensor's zero offsets changed by +30.0 counts ({30 * pascal:+.0f} Pa); "
-        "the largest change was +80.0 counts"
+        f"the left sensor's zero offsets changed: median +30.0 counts ({30 * pascal:+.0f} Pa), "
+        "largest change +80.0 counts"
     )
     # The reference of the warning is the last zero offset, not the first zero offset.
-    assert tared(-10, -60).endswith("the largest change was -150.0 counts")
+    assert tared(-10, -60).endswith("largest change -150.0 counts")
 
 
 def test_a_tare_of_saturated_sensors_keeps_the_zero_offset_and_is_reported(make):

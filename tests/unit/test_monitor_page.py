@@ -61,7 +61,7 @@ def test_the_page_fills_the_terminal_exactly(size):
 @pytest.mark.parametrize("size", [(79, 24), (80, 23), (30, 8), (1, 1), (12, 3)])
 def test_a_terminal_that_is_too_small_is_reported(size):
     text = shown(fed(), width=size[0], height=size[1])
-    assert size[0] < 30 or f"this is {size[0]} × {size[1]}" in text
+    assert size[0] < 30 or f"this terminal: {size[0]} × {size[1]}" in text
 
 
 def test_unknown_values_are_shown_as_dashes():

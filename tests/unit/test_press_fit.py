@@ -119,7 +119,7 @@ def test_calibrate_law_names_the_tip_model(tmp_path, capsys):
     assert "springs: E = " in told
     assert "E fitted separately at 1.2, 3.2, 4.2 mm: 0.2" in told
     assert "drifts" not in told
-    assert "first presses read +10" in told
+    assert "readings of the first presses differ by +10" in told
     assert "the rubber softens" in told
     profile = (
         'tip.physics = "solid", tip.base = "bonded", tip.face = "frictionless", tip.poisson = 0.4'

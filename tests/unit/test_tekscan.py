@@ -105,7 +105,7 @@ def test_a_single_frame_needs_no_frame_line():
         ("7,255,1", "7,-255,1", "row 2, cell 2 is -255"),
         ("7,255,1", "7,inf,1", "row 2, cell 2 is inf"),
         ("7,255,1\n", "", "frame 4 has 1 of 2 rows"),
-        ("3,4,5\n", "", "the file ends in frame 6, which has 1 of 2 rows"),
+        ("3,4,5\n", "", "the file ends within frame 6, which has 1 of 2 rows"),
         ("3,4,5\n", "3,4,5\n6,7,8\n", "line 22"),
     ],
 )

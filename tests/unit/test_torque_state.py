@@ -54,7 +54,7 @@ def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
     )
     assert daemon.loop.state.fault_name == "torque.off"
     assert daemon.loop.state.torque, "torque off is not confirmed yet"
-    assert "clear: the servos have not confirmed torque off yet" in refusal(daemon, "clear")
+    assert "clear: the servos have not yet confirmed that torque is off" in refusal(daemon, "clear")
     daemon.loop.advance(1.0)
     lost.mend()
     daemon.loop.advance(0.2)
@@ -62,7 +62,7 @@ def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
     told = [text for _, kind, text in events if kind == "torque.off"]
     assert len(told) == 2, "must be reported once at the beginning and once at the end"
     assert "keeps the bus silent" in told[0]
-    assert "confirmed torque off" in told[1]
+    assert "that torque is off" in told[1]
     command(daemon, "clear")
     assert command(daemon, "stop")["torque_off"] == "confirmed"
 
@@ -191,6 +191,6 @@ def test_arm_waits_until_torque_off_is_confirmed(make):
     daemon.loop.advance(0.1)
     Deaf(daemon, tries=3)
     command(daemon, "stop")
-    assert "arm: the servos have not confirmed torque off yet" in refusal(daemon, "arm")
+    assert "arm: the servos have not yet confirmed that torque is off" in refusal(daemon, "arm")
     daemon.loop.advance(3 * daemon.loop.period)
     command(daemon, "arm")

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
 _EPILOG = """\
-FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames, a folder of these,
-or a Tekscan-style ASCII export. A recording contains its settings. For the other files, select a
-profile with --config, or set the missing values, for example
+FILE is a recording (.mcap), an .npz file with frames [n, rows, cols] and t, an .npy file with
+frames, a folder of .npy files, or a Tekscan-style ASCII export. A recording contains its settings.
+For the other files, select a profile with --config, or set the missing values, for example
   --set tip.radius=0.02 --set tactile.pitch=0.0013 --set tactile.pascal_per_count=4
   --set tactile.noise=500 --set material.law=constant --set material.modulus=3e5
-The results are written to FILE.contacts.csv in the same folder, which PlotJuggler can plot. Several
-files are analysed in parallel, one per processor."""
+The results are written to FILE.contacts.csv in the same folder; PlotJuggler can plot this file.
+Several files are analysed in parallel, one per processor."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
 MEASUREMENTS = {
     "estimator": (
-        "run time and error of the force and energy lookups, and of estimating d and tilt from "
-        "frames"
+        "run time and error of force and energy lookups, and of d and tilt estimates from frames"
     ),
     "tick": "run time of ticks, in one process and over ptys",
     "control": "remaining object angle error for each grip law",
@@ -71,8 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json",
         type=Path,
         metavar="FILE",
-        help="write the results as JSON; after Ctrl-C, the same command continues "
-        f"({', '.join(SWEPT)})",
+        help="write the results as JSON; after an interruption by Ctrl-C, the same command resumes "
+        f"the run ({', '.join(SWEPT)})",
     )
     add_sweep(parser)
 
@@ -185,4 +184,4 @@ def _check(names: list[str], arguments: argparse.Namespace) -> None:
         if name not in MEASUREMENTS:
             raise ValueError(f"found {name!r}, expected one of {', '.join(MEASUREMENTS)}")
     if arguments.only and not any(arguments.only in case for case in _module(names[0]).NAMES):
-        raise ValueError(f"--only {arguments.only}: no case of {names[0]} contains this text")
+        raise ValueError(f"--only {arguments.only}: no case name of {names[0]} contains this text")

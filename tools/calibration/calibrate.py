@@ -39,41 +39,44 @@ _LEARNT = 0.8
 # Minimum relative standard deviation of each factor. Rubber and joints change from day to day.
 _LEAST = 0.02
 _EPILOG = """\
-steps of a hand; FILE is a profile, copied from that of --config if it does not exist:
-  joints       you close, open and straighten each finger by hand, with torque off; determines the
-               servo, direction, zero and range of each finger
-  heat         temperature rise and time constants of the servo of --finger, from a recording of a
-               grip that lasts some minutes and starts with a cold servo
+steps for a hand; FILE is a profile; if it does not exist, the --config profile is copied to FILE:
+  joints       servo, direction, zero and range of each finger; you close, open and straighten each
+               finger by hand while torque is off
+  heat         temperature rise and time constant of one servo (--finger); requires a recording of a
+               grip that starts with a cold servo and lasts several minutes
   friction     friction of each joint without contact; the running daemon sweeps the joint back and
-               forth, or use a recording of such a motion
-  latency      latency of the frames; the running daemon grasps an object with several forces
-               (--force is the first), or use a recording of such a grip
+               forth, or you give a recording of such a motion
+  latency      frame latency; the running daemon grasps an object with several forces (--force sets
+               the first force), or you give a recording of such a grip
 
-steps of a tip, in this order; each step adds its result to FILE:
-  tare         zero offset of each cell, noise and its correlation, drift; without load
-  equilibrate  gain of each cell, dead cells; several uniform pressures
-  curve        pressure versus count; known weights placed upright on the tip (--force), or a run
-               with known displacement (--d)
-  centre       position and rotation of the tip; upright presses, or presses at known tilt (--theta)
-  modulus      E; a run with known displacement (--d), whose zero offset is fitted
+steps for a tip, in this order; each step adds its result to FILE:
+  tare         zero offset of each cell, noise, noise correlation, drift; the tip must be unloaded
+  equilibrate  gain of each cell, and dead cells; requires several uniform pressures
+  curve        pressure versus count; requires known weights placed upright on the tip (--force), or
+               a run with known displacement (--d)
+  centre       position and rotation of the tip; requires upright presses, or presses at known tilts
+               (--theta)
+  modulus      E; requires a run with known displacement (--d); the zero offset of d is fitted
   law          comparison of springs and solid rubber: E, ν, goodness of fit and remaining error;
-               presses at known depths and tilts (--d, --theta), or CSV files of a testing machine
-               (--compression), which give E, or E versus d, from the force alone
-  relaxation   initial stiffness of the rubber relative to its final stiffness, for the profile; a
-               press held for a few seconds at a known d (--d, --frames 500)
-  scales       correction factors for the tip's modulus, the sensor's gain and the joint's torque,
-               estimated during grips of a running daemon or in a recording; the daemon starts with
-               these factors
+               requires presses at known depths and tilts (--d, --theta), or CSV files from a
+               testing machine (--compression), which give E, or E versus d, from the force alone
+  relaxation   initial stiffness of the rubber relative to its final stiffness, for the profile;
+               requires a press held for a few seconds at a known d (--d, --frames 500)
+  scales       correction factors for the tip's modulus, the sensor's gain and the joint's torque;
+               requires grips of a running daemon, or a recording of such grips; the daemon then
+               starts with these factors
 
 Frames are read from the profile's sensor, one load after the other, or from recordings: one file
-per load, or one .npz file of the whole run with d [m], theta [rad] and force [N] of each frame.
+per load, or one .npz file of the whole run that contains d [m], theta [rad] and force [N] for each
+frame.
 If you have no test stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
 If matplotlib is installed, each step plots its result and residuals in FILE.STEP.png (law: only
 with --compression).
 Steps depend on earlier steps: repeating equilibrate removes the results of curve, modulus and
-scales; repeating curve removes those of modulus and scales; repeating modulus removes scales.
+scales; repeating curve removes the results of modulus and scales; repeating modulus removes the
+result of scales.
 """
 
 
@@ -99,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="CSV",
-        help="law: files with d and F, or with strain and stress, and units in the header; for "
+        help="law: files with d and F, or with strain and stress; the header states the units; for "
         "files without a tilt column, --theta gives the tilt",
     )
     parser.add_argument(
@@ -126,9 +129,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--move",
         metavar="COMMAND",
-        help="live: run a program that applies each load and exits when done, instead of waiting "
-        "for Enter; {force}, {d} and {theta} are replaced by the load's values; for joints, "
-        "{finger} and {pose} are replaced (pose: closed, open or zero)",
+        help="live: instead of waiting for Enter, run a program that applies one load and then "
+        "exits; {force}, {d} and {theta} are replaced by the load's values; for joints, {finger} "
+        "and {pose} are replaced (pose: closed, open or zero)",
     )
     parser.add_argument("--no-plot", action="store_true", help="do not plot the result")
     add_daemon(parser, addresses)  # The `friction`, `latency` and `scales` steps use this option.
@@ -147,7 +150,7 @@ def run(arguments: argparse.Namespace) -> int:
         from softfinger.kinematics.calibration.calibration import CalibrationError
 
         raise CalibrationError(
-            f"--compression: found the step {step}, but only the step law uses this file"
+            f"--compression: found the `{step}` step, but only the `law` step uses this option"
         )
     if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file

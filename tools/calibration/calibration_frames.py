@@ -106,8 +106,8 @@ def _spread(given: dict[str, Any], count: int) -> dict[str, Any]:
     for name, values in given.items():
         if len(values) not in (1, count):
             raise CalibrationError(
-                f"--{name}: found {len(values)} values for {count} loads, expected one value or "
-                "one per load"
+                f"--{name}: found {len(values)} values for {count} loads, expected one value, or "
+                "one value for each load"
             )
     return {name: np.broadcast_to(given[name], count).copy() for name in TRUTHS if name in given}
 

@@ -191,7 +191,7 @@ def fit_files(
     if any("strain" in file for file in files):
         if len(files) > 1 or settings.tip.physics != "springs":
             raise CalibrationError(
-                'law: files with strain and stress: expected one file and tip.physics = "springs"'
+                'law: strain and stress require a single file and tip.physics = "springs"'
             )
         return _stress_strain(calibration, paths[0], files[0])
     tilts = np.radians(theta or np.zeros(len(files))).tolist()
@@ -349,9 +349,10 @@ def _stress_strain(
     wants: dict[str, Any] = {"physics": "springs"}
     line = (
         f"springs, law of {len(x)} points to a strain of {x[-1]:.2f}: E = "
-        f"{material.reference_modulus / 1e6:.4f} MPa at zero strain; F within "
-        f"{material.worst_force_error:.2%}; {len(strain) - (rows.stop - rows.start)} unloading "
-        f"rows were excluded\n  for the profile: {_profile_line(wants, step)}"
+        f"{material.reference_modulus / 1e6:.4f} MPa at zero strain; force "
+        f"error up to {material.worst_force_error:.2%}; "
+        f"{len(strain) - (rows.stop - rows.start)} unloading rows were excluded\n"
+        f"  for the profile: {_profile_line(wants, step)}"
     )
     changed = {"modulus": step, "wants": wants, "scales": None, "date": now()}
     shown = Points("law", "strain", "stress [kPa]", x, y * 1e-3, material.stress(x) * 1e-3)
@@ -384,7 +385,7 @@ def _check_beginning(strain: FloatArray, stress: FloatArray) -> None:
     if secant < slope / _TOE or secant > slope * _TOE:
         raise CalibrationError(
             f"found a modulus of {secant / 1e3:.3g} kPa up to a strain of {strain[first[0]]:.3g} "
-            f"and {slope / 1e3:.3g} kPa above it, which indicates a toe region or a zero offset; "
-            f"expected a curve through 0: subtract {-start / slope:.3g} from the strain, and "
-            "remove the points with negative strain"
+            f"and {slope / 1e3:.3g} kPa above this strain, which indicates a toe region or a zero "
+            f"offset; expected a curve through 0: subtract {-start / slope:.3g} from the strain, "
+            "and remove the points with negative strain"
         )

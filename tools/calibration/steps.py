@@ -211,7 +211,9 @@ def _curve(step: Step) -> Done:
     if force is None:
         d = truths.get("d")
         if d is None:
-            raise CalibrationError("curve: expected --force or --d, or a run that contains them")
+            raise CalibrationError(
+                "curve: expected --force or --d, or a run that contains force or d"
+            )
         # Compute the force on the whole footprint from the material in the profile.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
         pressures = [
@@ -329,7 +331,9 @@ def _law(step: Step) -> Done:
     softer = first_cycle(d, theta, signed.sum(axis=(1, 2)))
     if softer is not None:
         lines.insert(
-            1, f"the first presses read {softer:+.1%} compared with later presses of equal depth"
+            1,
+            f"the readings of the first presses differ by {softer:+.1%} from the readings of later "
+            "presses of equal depth",
         )
         if softer > _SOFTENS:
             lines[1] += (

@@ -369,10 +369,10 @@ PAGES = {
         rows=2,
         notes=(
             "Angles have the paper's sign. Rotation: the servo turns the finger about a root "
-            "20.1 mm from the tip's centre, so d goes from 0 to 4 mm; between frames the joint "
-            "carries the daemon's estimates on. Rolling: d is constant, and each estimate uses "
-            "one frame. Grey: model. Minimum: of a parabola through the estimates, ± standard "
-            "error.",
+            "20.1 mm from the tip's centre, so d increases from 0 to 4 mm; between frames, the "
+            "daemon extrapolates its estimates from the joint motion. Rolling: d is constant, and "
+            "each estimate uses one frame. Grey: model. The minimum is that of a parabola fitted "
+            "to the estimates, ± standard error.",
         ),
     ),
 }  # fmt: skip

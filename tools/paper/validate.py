@@ -138,7 +138,8 @@ def _energy() -> Iterator[PublishedValue]:
         why = (
             ""
             if minimum == 0.0
-            else f"at a fixed d, the energy decreases up to {minimum:.0f}° (tested: 0 to 20°)"
+            else f"at a fixed d, the energy decreases with the tilt until {minimum:.0f}° (tested: "
+            "0 to 20°)"
         )
         yield between(f"tilt of minimum U at d = 4 mm: {law}", 0.0, 0.0, source, minimum, ".1f",
                       "°", why)  # fmt: skip

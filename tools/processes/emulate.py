@@ -20,66 +20,67 @@ if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
 _FAULTS = """\
-faults; any number can be given, each in the form KIND[=VALUE][@START]:
+Faults. Give any number of faults, each in the form KIND[=VALUE][@START]:
   tactile boards   torn, noisy (=PROBABILITY per frame), silent, frozen, wrong-size, saturated,
-                   zero; on both boards, or on one board: left:silent, right:torn=0.2
-  to the servos    lose, lose-writes =PROBABILITY that an instruction does not reach any servo
+                   zero; for both boards, or for one board: left:silent, right:torn=0.2
+  instructions     lose, lose-writes =PROBABILITY that an instruction does not reach any servo
   servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY; delay=S for every reply
   servos           silent, answer, reboot, overheat, overload, undervoltage =ID; readings: stuck
                    (constant angle, velocity and current 0), jump (by 0.2 rad), frozen (all
                    registers constant, including time), refuse (errors only); recover =ID
   ports            unplug, plug: the servo port; left:unplug, right:plug …: the port of a board
-  measurements     wrong values, while the hand itself is unchanged; on both fingers, or on one:
-                   left:gain=0.5. gain=FACTOR for all pressures, shift-x, shift-y=CELLS for the
-                   image, mirror=1 (columns reversed), drift=FRACTION of the maximum count (may be
-                   negative), replay=S (repeats the last S seconds of frames, at most 3 s, with new
-                   numbers), current=FACTOR for the reported current. To end a fault, set its
-                   factor to 1 or its other value to 0
-  the object       push=N along its faces, away from the palm, twist=N·m; 0 ends the load
+  measurements     wrong values, while the hand itself is unchanged; for both fingers, or for one
+                   finger: left:gain=0.5. gain=FACTOR for all pressures, shift-x, shift-y=CELLS for
+                   the image, mirror=1 (columns reversed), drift=FRACTION of the maximum count (may
+                   be negative), replay=S (repeats the last S seconds of frames, at most 3 s, with
+                   new numbers), current=FACTOR for the reported current. To end a fault, set a
+                   FACTOR to 1, and any other value to 0
+  the object       push=N along the object's faces, away from the palm, twist=N·m; 0 ends the load
   recovery         well ends all faults; left:well ends those of one board and its measurements.
-                   Loads on the object are not removed. Hardware errors remain until a reboot
+                   Loads on the object stay. Hardware errors of servos remain until a reboot
   @START           start time [s]; without it, the fault starts immediately. With gain=0.5@3..5, a
                    measurement changes linearly from 3 to 5 s
 
-softfinger emulate --send "drop=0.01 left:frozen@2" changes a running emulator, through DIR/control.
+To change the faults of a running emulator through DIR/control:
+  softfinger emulate --send "drop=0.01 left:frozen@2"
 
-a plate on a test stage, which takes the place of the object and presses on a tip, to try out
-`calibrate`:
-  --send "press PRESSES" returns when the plate has reached its position
+To try out `calibrate`, press on the tips with an emulated plate, which replaces the object:
+  --send "press PRESSES"   returns when the plate has reached its position
   PRESSES is a comma-separated list; each press consists of some of these words:
     depth=4mm      or force=5N, or pressure=10kPa on all cells, as from a bladder; 0mm lifts off
-    tilt=10deg     tilt of the plate (0)
-    speed=2mm/s    approach speed (5)
-    hold=1s        hold for this time, then lift off; by default, the last press stays and others
-                   are held for 1 s
-    tip=left       or right (both)
+    tilt=10deg     tilt of the plate (default: 0)
+    speed=2mm/s    approach speed (default: 5)
+    hold=1s        hold for this time, then lift off; by default, the plate stays after the last
+                   press and holds each earlier press for 1 s
+    tip=left       or right (default: both)
   When a plate has reached its position, the log shows the force on the tip. Plates do not move the
   joints.
 
-a person's hand, which turns joints while torque is off, to try out `calibrate joints`:
-  --send "turn left=closed right=open"   turns each joint to its stop, or to its
-                                         zero position with zero; returns on arrival
+To try out `calibrate joints`, turn the joints as if by hand, while torque is off:
+  --send "turn left=closed right=open"   turns each joint to its stop, or with `zero` to its zero
+                                         position; returns on arrival
 
-the object: --send place puts it back after it has slipped away; the object is then at rest and
-without a load.
+To put the object back after it has slipped away, at rest and without a load:
+  --send place
 
-the record of the servo bus, for testing a daemon: --send report prints it as JSON, --send forget
-starts a new record, and --send "report forget" does both without a gap:
+To test a daemon, use the record of the servo bus: --send report prints the record as JSON, --send
+forget starts a new record, and --send "report forget" does both without a gap. The record contains:
   t, monotonic     current time of the hand [s], and time.monotonic() at that time
   servos           left first, for each:
     id, torque, mode, q, hardware_error, watchdog (time-out [s], 0 if it is not armed, null after it
                    stopped the motor), stopped_by_watchdog: current state
     goal_q, goal_current
-                   minimum and maximum goal received [rad, A; positive closes], including refused
-                   ones; null if there were no goals; goals near the position of a joint without
+                   minimum and maximum received goal [rad, A; positive closes], including refused
+                   goals; null if there were no goals; goals near the position of a joint without
                    torque are omitted
     goals_refused  number of writes with a goal that the servo refused
-    torque_on      count, t of the last time; far: number of times the goal was more than 0.05 rad
-                   away, and the maximum distance [rad]
+    torque_on      count: number of times that torque was switched on; t: last time; far:
+                   number of times that the goal was then more than 0.05 rad from the joint angle;
+                   farthest: maximum of this distance [rad]
     quiet, longest_quiet
-                   time since the last instruction with torque on (null while it is off), and the
-                   longest such time [s]
-    watchdog_fired count, t of the last time
+                   time since the last instruction while torque is on (null while torque is off),
+                   and the longest such time [s]
+    watchdog_fired count: number of motor stops by the watchdog; t: time of the last stop
   object           current pose (x, y [m], angle [rad])
   force            current force on each tip [N], left first
 """
@@ -211,7 +212,7 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
             assert process.stdout is not None
             if process.stdout.readline() != "ready\n":
                 raise NoEmulator(
-                    f"{' '.join(command[3:])}: the program ended; see its message above"
+                    f"{' '.join(command[3:])}: the program exited; see its message above"
                 )
             yield process
         finally:

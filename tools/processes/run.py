@@ -158,7 +158,7 @@ def _serve(
         if arguments.log == "plain":
             log.plain("\n".join(statistics.table()))
     if state.fault:
-        log.plain(f"softfinger: ended with a fault: {state.fault}", "error")
+        log.plain(f"softfinger: exited with a fault: {state.fault}", "error")
     if state.torque:
         log.plain("softfinger: torque could not be switched off and may still be on", "error")
     unrecorded = recording is not None and recording.failed

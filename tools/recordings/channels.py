@@ -139,7 +139,7 @@ def _restored(
         message["data"] = base64.b64decode(message.get("data") or "")
         frame = read(schema.TactileFrame, message)
         if frame.finger not in FINGERS or not math.isfinite(frame.timestamp):
-            raise ValueError("a tactile frame that has no finger or no time")
+            raise ValueError("a tactile frame without a finger or a time")
     for path in floats:
         place: Any = message
         for part in path[:-1]:

@@ -218,7 +218,7 @@ class Recording:
                 self._damaged(error)
                 continue
             except (TypeError, AttributeError):
-                self._damaged(ValueError(f"an invalid message of {topic.decode()}"))
+                self._damaged(ValueError(f"an invalid {topic.decode()} message"))
                 continue
             yield topic, message
 
@@ -284,7 +284,7 @@ class Recording:
     def _count(self, unpacked: int) -> None:
         self._left -= unpacked
         if self._left < 0:
-            raise ValueError("the unpacked data are suspiciously large for the size of the file")
+            raise ValueError("the unpacked data are suspiciously large for a file of this size")
 
     def _learn(self, content: bytes) -> None:
         from mcap.data_stream import ReadDataStream
@@ -451,7 +451,7 @@ def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
     elif method == "":
         unpacked = bytes(data)
     else:
-        raise ValueError(f"a chunk compressed by {method[:20]!r}, expected zstd, lz4 or none")
+        raise ValueError(f"a chunk compressed with {method[:20]!r}, expected zstd, lz4 or none")
     if len(unpacked) != size or crc not in (0, zlib.crc32(unpacked)):
         raise ValueError("a chunk that does not match its header")
     return unpacked

@@ -44,11 +44,11 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
 
 _EPILOG = """\
-Recording ends with Ctrl-C or after --duration, and the numbers of written and lost messages are
+Recording ends on Ctrl-C or after --duration; the numbers of written and lost messages are then
 printed.
 With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mcap and so on.
 `replay --recompute` requires --topics all; `run --record` records all topics from the first tick.
-Exit status: 0 everything was written, 1 something was not written, with the reason."""
+Exit status: 0 all messages were written; 1 messages were not written (the reason is printed)."""
 
 _SILENCE_TIME = 2.0  # time without messages after which a notice is printed [s]
 # Time between socket reads [s]. Waking up for each message would take longer than processing the

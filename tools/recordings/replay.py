@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 Without --recompute, the messages are published unchanged on the stream's socket, at their original
-pace or --speed times as fast. To subscribers this looks like a daemon.
+pace or --speed times as fast. To subscribers, the replay looks like a daemon.
 
 With --recompute, the recorded readings, frames and commands are processed by this version's
-estimator, tables, control and limits, and every state is compared with the recorded state. This
-requires a recording of all topics: `record --topics all`, or `run --record`, which starts at the
-first tick. If the recording starts there, the same code and settings give bit-identical results.
+estimator, tables, control and limits, and every state is compared with the recorded state. The
+recording must contain all topics: use `record --topics all`, or `run --record`, which starts at the
+first tick. If the recording starts at the first tick, the same code and settings give bit-identical
+results.
 Exit status: 0 published, or all states identical; 1 the file can't be read; 3 states differ."""
 
 _SUBSCRIBER_WAIT = 10.0  # timeout for the first subscriber [s]
@@ -129,8 +130,8 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     with Progress("recompute", recording.size) as progress:
         result = recompute(recording, settings, progress)
     print(
-        f"{arguments.file}: {result.ticks} ticks, {result.states} states of {result.fields} fields "
-        "compared"
+        f"{arguments.file}: {result.ticks} ticks, compared {result.states} states with "
+        f"{result.fields} fields each"
     )
     if not result.from_start:
         print(

@@ -14,12 +14,12 @@ from softfinger.tools.arguments import add_changes, add_directory, own_runtime_f
 _EPILOG = """\
   softfinger config check my.toml           print all errors and warnings; exit status 1 for errors
   softfinger config show hil > my.toml      create your own profile from a packaged profile
-  softfinger config schema > schema.json    in the same folder: completion and checks in editors
+  softfinger config schema > schema.json    for completion and checks in editors (same folder)
   softfinger config reference tactile       print one section, or one key, e.g. pitch"""
 
 
 _CHECK = """\
-Print all errors and warnings of a profile, without touching hardware. Errors prevent the start of
+Print all errors and warnings for a profile, without accessing hardware. Errors prevent the start of
 `softfinger run`: invalid keys or values, contradictions, and calibration files or contact tables
 that do not match. Warnings concern settings that are valid but probably wrong, for example
 a sensor that is smaller than the footprint, or forces that the servos can't reach.
@@ -32,14 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     check = actions.add_parser(
         "check",
-        help="print all errors and warnings of a profile",
+        help="print all errors and warnings for a profile",
         description=_CHECK,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     check.add_argument("config", type=Path, metavar="FILE", help="a TOML file, or a profile name")
     add_changes(check)
     add_directory(check)
-    actions.add_parser("list", help="list the names of the profiles")
+    actions.add_parser("list", help="list the profile names")
     show = actions.add_parser("show", help="print a profile")
     show.add_argument("profile", type=Path, metavar="PROFILE", help=f"one of {', '.join(names())}")
     every = actions.add_parser(

@@ -40,9 +40,9 @@ _EPILOG = """\
 exit status: 0 no check failed (there may be warnings), 1 a check failed, 2 the settings can't be
 used. Without --fix, nothing is changed. With --fix, doctor sets the latency timers of adapters to
 1 ms, sets the ID and baud rate of each servo that can be identified with certainty, sets all
-registers that the hand requires, and compiles the kernels. It reboots servos that report a hardware
-error or whose position is wrong by a turn; the hand drops its object during a reboot. --fix never
-switches torque on or moves the hand.
+registers that the hand requires, and compiles the kernels. doctor --fix also reboots servos that
+report a hardware error or whose position is wrong by a turn; the hand drops its object during a
+reboot. --fix never switches torque on or moves the hand.
 
 All factory-new servos have ID 1 at 57600 baud: connect only one servo and run doctor --fix; then
 connect the next servo as well, and run doctor --fix again."""
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
     change = parser.add_mutually_exclusive_group()
     change.add_argument(
-        "--fix", action="store_true", help="fix the findings that softfinger can fix"
+        "--fix", action="store_true", help="fix the problems that softfinger can fix"
     )
     change.add_argument(
         "--restore",

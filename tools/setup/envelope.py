@@ -69,7 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep",
         type=Path,
         metavar="FILE",
-        help="write the map to a file for use by grasp; after Ctrl-C, the same command continues",
+        help="write the map to a file that `grasp` can use; after an interruption by Ctrl-C, the "
+        "same command resumes the run",
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="plot the map (extra 'plot')")
     add_sweep(parser)

@@ -10,9 +10,9 @@ from softfinger.daemon.wire.keys import make_keys
 _EPILOG = """\
 The first call creates the daemon's keys and the keys of the client `local`, for tools on the
 daemon's machine. Each CLIENT adds the keys of one client. Set access.keys in the profile to FOLDER,
-copy FOLDER/CLIENT to the client's machine, and pass it to the tools with --keys. Files are never
-overwritten. If you remove FOLDER/server/clients/CLIENT.key, the client is disconnected within a
-second. If keys are used, the lease is bound to the client's key name.
+copy FOLDER/CLIENT to the client's machine, and pass this copy to the tools with --keys. Files are
+never overwritten. If you remove FOLDER/server/clients/CLIENT.key, the client is disconnected within
+a second. If keys are used, the lease is bound to the client's key name.
 Exit status: 0 keys created, 1 an error occurred."""
 
 

@@ -339,8 +339,8 @@ def _heights(width: int, height: int) -> tuple[int, int]:
 def _too_small(width: int, height: int) -> list[Text]:
     text = [
         "softfinger monitor",
-        f"needs {WIDTH} × {HEIGHT},",
-        f"this is {width} × {height}",
+        f"requires {WIDTH} × {HEIGHT},",
+        f"this terminal: {width} × {height}",
         "q quits, space stops",
     ]
     lines = [Text() for _ in range(max(0, (height - len(text)) // 2))]

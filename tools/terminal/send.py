@@ -27,7 +27,7 @@ commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle
 setpoint), move left=RAD right=RAD, release, set compliance=RAD/NM, demo (restart the profile's
 task), stop, clear, status. Numbers are in SI units or carry a unit: force=10N, angle=8deg or 8°.
 Exit status: 0 done, 1 rejected, 2 no reply or invalid arguments, 3 stop or disarm was received, but
-the servos have not confirmed torque off yet."""
+the servos have not yet confirmed that torque is off."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

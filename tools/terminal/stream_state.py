@@ -48,7 +48,7 @@ GLOSSARY = (  # meanings of the terms on the pages
     ("±", "one standard deviation"),
     ("map age", "age of the newest pressure map"),
     ("joint, goal", "current and goal angle; positive when closing"),
-    ("current, bound", "motor current and its limit in the current goal"),
+    ("current, bound", "motor current and its limit in the latest goal"),
     ("object", "angle and width of the object between the tips"),
 )
 # Relative force increase above which the page reports an increased grip force.

@@ -12,13 +12,14 @@ from softfinger.tools.stop_condition import StopCondition
 
 _EPILOG = """\
 Serves a web page for browsers on this machine. The printed address with the token opens a page with
-buttons and sliders, where the space key stops the hand. Without the token, the page only displays.
+buttons and sliders, where the space key stops the hand. Without the token, the page only shows the
+hand.
 With --foxglove, the stream is also served to Foxglove, by default at ws://127.0.0.1:8765; the
-printed line gives the layout file. Recordings can be opened directly in Foxglove.
+printed line names the layout file. Recordings can be opened directly in Foxglove.
 The server stops on Ctrl-C, or after --duration.
 From another machine, use ssh -L 9090:127.0.0.1:9090 with the printed port, or --host ADDRESS on a
-trusted network. Each address that is then printed opens the page in one browser.
-Exit status: 0 success; 1 nothing could be shown, with the reason."""
+trusted network. Each address printed with --host opens the page in one browser.
+Exit status: 0 success; 1 nothing could be shown (the reason is printed)."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,8 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--save",
         type=_saved,
         metavar="OUT",
-        help="save the recording and end: OUT.html is a page that plays without softfinger, "
-        "OUT.svg is an animated picture of the hand",
+        help="save the recording and exit; OUT.html is a page that plays the recording without "
+        "softfinger, OUT.svg is an animated picture of the hand",
     )
     add_stream(parser, addresses)
     parser.add_argument(
@@ -50,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--host",
         default="127.0.0.1",
         metavar="ADDRESS",
-        help="address of this machine on which to serve, 0.0.0.0 for all addresses (default: "
+        help="address on which to serve; 0.0.0.0 for all addresses of this machine (default: "
         "127.0.0.1, for browsers on this machine only)",
     )
     parser.add_argument(
@@ -69,8 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         default=3.0,
         metavar="S",
-        help="discard a command if the displayed picture is older than this, and wait this long "
-        "for the daemon's reply (default 3)",
+        help="maximum age of the displayed picture when a command is sent, and maximum time to "
+        "wait for the daemon's reply, in seconds (default 3)",
     )
     parser.add_argument(
         "--rate",

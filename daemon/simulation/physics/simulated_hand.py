@@ -392,8 +392,8 @@ class SimulatedHand:
         row = self._rows[number % len(self._rows)]
         if row.number != number:
             raise LookupError(
-                f"sample {number} is no longer stored; only the latest of {self.sample_count} "
-                "samples are kept"
+                f"sample {number} is not stored; {self.sample_count} samples have been taken, and "
+                f"the latest {len(self._rows)} are stored"
             )
         return row
 

@@ -182,7 +182,7 @@ function showAges() {
   }
   put(one(".mode"), old ? "No stream" : picture.mode || "—");
   give(one(".mode"), "data-mode", picture.mode);
-  const past = age === Infinity ? "no state yet" : `last state ${seconds(age)} s ago, then ${picture.mode}`;
+  const past = age === Infinity ? "no state yet" : `last state ${seconds(age)} s ago, in mode ${picture.mode}`;
   const why = connected ? "" : "; the page's server does not respond";
   put(one(".stream"), old ? past + why : scene.live ? "live" : "recording");
   if (old && settings.force) showControls();
@@ -212,7 +212,7 @@ function setTheme(next) {
   theme = next;
   document.documentElement.dataset.theme = next === "auto" ? dark.matches ? "dark" : "light" : next;
   put(one("#theme"), { auto: "◐ Auto", light: "☀ Light", dark: "☾ Dark" }[next]);
-  one("#theme").setAttribute("aria-label", `Colours: ${{ auto: "as the system", light: "light", dark: "dark" }[next]}`);
+  one("#theme").setAttribute("aria-label", `Colours: ${{ auto: "same as the system", light: "light", dark: "dark" }[next]}`);
   inks.clear();
   if (picture) {
     panels.forEach(paint);
