@@ -225,10 +225,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
     try:
         sensor.open()
     except TactileError as error:
-        what, _, fix = str(error).rpartition(": ")
-        if fix.startswith(("set ", "move ")):
-            return Finding("FAIL", name, what, fix)
-        return Finding("FAIL", name, str(error), "check tactile.port, tactile.baud and the cable")
+        return Finding("FAIL", name, str(error))
     try:
         before, start = sensor.counters(), time.monotonic()
         time.sleep(_LISTEN_TIME)

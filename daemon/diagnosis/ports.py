@@ -40,9 +40,8 @@ def note_ports() -> Finding:
 
 def check_runtime_folder() -> Finding:
     """Check that only this user may write to the folder for emulated ports and local stops."""
-    what, _, fix = runtime_fault().partition(": chmod ")
-    if what:
-        return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
+    if fault := runtime_fault():
+        return Finding("warn", "runtime folder", fault)
     return Finding("pass", "runtime folder", str(runtime_folder()))
 
 

@@ -264,12 +264,18 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
 
 
 def check_angle(
-    name: str, scale: JointScale, counts: int, hand: GeometrySettings, finger: int
+    name: str,
+    scale: JointScale,
+    counts: int,
+    hand: GeometrySettings,
+    finger: int,
+    is_reversed: bool = False,
 ) -> Finding | None:
     """Return a finding if a joint is far outside the hand's limits, otherwise None.
 
     Switching torque on would immediately move an out-of-range joint back. A reboot resets the
-    servo's turn count, which corrects a lost turn.
+    servo's turn count, which corrects a lost turn, unless the servo ``is_reversed``: it then counts
+    down from 0, even after a reboot.
     """
     low, high = hand.q_min[finger], hand.q_max[finger]
 
@@ -284,6 +290,9 @@ def check_angle(
     problem = f"the joint is at {found}, expected {lowest} to {highest}"
     turns = counts // reg.COUNTS_PER_TURN
     if turns and is_inside(counts - turns * reg.COUNTS_PER_TURN):
+        if is_reversed:
+            fix = "run `softfinger calibrate joints`, because the drive mode is reversed"
+            return Finding("FAIL", name, problem, fix)
         problem += f": the servo has counted {turns} turn{'' if turns in (1, -1) else 's'} too many"
         return Finding("FAIL", name, problem, LOST_TURN_FIX)
     cure = (
@@ -296,17 +305,11 @@ def check_angle(
 def check_position(
     name: str, scale: JointScale, table: Registers, hand: GeometrySettings, finger: int
 ) -> Finding | None:
-    """Check the angle of a servo from its registers.
-
-    A servo in reverse drive mode counts down from 0, even after a reboot.
-    """
+    """Check the angle of a servo from its registers."""
     counts = table.long(reg.PRESENT_POSITION)
-    found = check_angle(name, scale, counts, hand, finger)
-    reversed_ = table[reg.DRIVE_MODE] & DRIVE_REVERSE and -reg.COUNTS_PER_TURN < counts <= 0
-    if found is not None and found.fix == LOST_TURN_FIX and reversed_:
-        fix = "run `softfinger calibrate joints`, because the drive mode is reversed"
-        return Finding(found.status, name, found.text.partition(": ")[0], fix)
-    return found
+    counts_down = bool(table[reg.DRIVE_MODE] & DRIVE_REVERSE)
+    is_reversed = counts_down and -reg.COUNTS_PER_TURN < counts <= 0
+    return check_angle(name, scale, counts, hand, finger, is_reversed)
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:

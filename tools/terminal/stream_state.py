@@ -252,13 +252,17 @@ class StreamState:
         client, until = self._lease_holder
         return client if now < until else ""
 
+    @property
+    def is_raised(self) -> bool:
+        """True if the daemon has increased the grip force above the commanded force."""
+        return self.state.goal_force > _INCREASED_RATIO * self.commanded
+
     def grip(self) -> str:
         """Describe the grip's goal; return an empty string if there is no grip."""
         force, angle = self.state.goal_force, math.degrees(self.state.goal_angle)
         if not math.isfinite(force):
             return ""
-        is_raised = force > _INCREASED_RATIO * self.commanded
-        raised = f", raised from {self.commanded:.1f} N" if is_raised else ""
+        raised = f", raised from {self.commanded:.1f} N" if self.is_raised else ""
         turned = f", object angle {angle:z.1f}°" if math.isfinite(angle) else ""
         return f"grip: goal {force:.1f} N{raised}{turned}"
 

@@ -371,7 +371,10 @@ class Pictures:
         state, safety, feed = self.feed.state, self._settings.safety, self.feed
         last = [each for each in feed.events[-1:] if each.level == "warning"]
         notes = [each.text for each in last if self.time - each.timestamp < _WARNING_TIME]
-        notes += filter(None, [why_invalid(state), self._force_increase()])
+        if invalid := why_invalid(state):
+            notes.append(invalid)
+        if self.feed.is_raised:
+            notes.append(self.feed.grip())
         used = [
             (value / getattr(safety, f"{key}_max"), name, key)
             for name in self._fingers
@@ -389,11 +392,6 @@ class Pictures:
                 f"{schema.SCHEMA}"
             )
         return notes
-
-    def _force_increase(self) -> str:
-        """Describe the grip's goal if the daemon has increased the force."""
-        grip = self.feed.grip()
-        return grip if "raised" in grip else ""
 
     def _facts(self, now: float) -> list[tuple[str, str]]:
         """Return names and values for the details panel: loop times, frames, servos and losses."""
