@@ -10,9 +10,9 @@ parts:
    object angle error is added to the joint goals with opposite signs, and a PD controller follows
    these goals. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
 
-With ``control.law = "energy"``, the moment arms follow from the derivatives of the contact-table
-energy with respect to the joint angles while the tips roll. The moment arms therefore account for
-the moments and shear forces of the tips.
+With ``control.law = "energy"``, the moment arms are derivatives of the contact table's energy with
+respect to the joint angles of rolling tips. The moment arms therefore account for the moments and
+shear forces of the tips.
 
 With ``"upright"``, the control law ignores the object angle until a command steers the object. The
 upright law gives both joints the same torque plus damping, as in the literature on blind grasping.

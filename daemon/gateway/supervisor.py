@@ -48,7 +48,7 @@ class Gateway:
         ours, theirs = loop_link.pair()
         paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
-            # The option -P keeps Python from importing a folder named daemon in the working
+            # The -P option keeps Python from importing a folder named daemon in the working
             # directory.
             words = [sys.executable, "-P", "-m", f"{__package__}.server", str(theirs.fileno())]
             self.process = subprocess.Popen(

@@ -49,7 +49,7 @@ class GraspState(Record):
     # A load L along the object faces changes the mean torque residual by load_arm L +
     # load_curvature L².
     torque_residual: Pair  # joint torque attributed to a load along the object faces [N·m]
-    load_arm: float  # moment arm of the load [m], or 0 if a load has no effect on the torques
+    load_arm: float  # moment arm of the load [m], or 0 if the load has no effect on the torques
     load_curvature: float  # [m/N]
     pull_shear: float  # shear due to a pulling load, measured by solid tips [N]
     twist_shear: float  # shear due to a twisting load, measured by solid tips [N]

@@ -18,7 +18,8 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
 _VALUE_LENGTH_MAX = 60  # maximum length of a value in a message [characters]
 _DITHER_TICKS_MIN = 8  # minimum number of ticks per dither period
-_SENSOR_WIDTH_MAX = 2.0  # limit in tip diameters; a larger sensor probably belongs to another tip
+# Maximum sensor width in tip diameters. A larger sensor probably belongs to a different tip.
+_SENSOR_WIDTH_MAX = 2.0
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 

@@ -32,7 +32,7 @@ from softfinger.kinematics.hand.geometry import tip_position
 
 _NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention the noise
 _WARNING_FRACTION = 0.9  # fraction of a fault limit above which a warning is issued
-# Expected current per position error [A/rad], lower than in the position loop of any servo model.
+# Minimum ratio of current to position error [A/rad]; every servo's position loop exceeds it.
 _CURRENT_PER_ERROR = 2.0
 _STANDSTILL_SPEED = 0.05  # maximum speed of a joint at standstill [rad/s]
 # Minimum relative increase in commanded force, and the fraction of the increase that the tips must

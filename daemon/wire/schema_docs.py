@@ -76,8 +76,8 @@ bytes. The reason in the reply is then `request`.
 **Late commands.** If the daemon stalls, commands wait longer than their clients expect. The daemon
 therefore rejects outdated commands as `late`. `arm` and all commands that move the hand or change
 its grip are rejected if they are older than 0.2 s or `servos.watchdog`, whichever is shorter.
-`disarm`, `tare`, `clear`, and `hold` during a grip are accepted up to an age of 1 s. `status` and
-`stop` are always accepted.
+`disarm`, `tare`, `clear`, and `hold` during a grip are accepted if they are at most 1 s old.
+`status` and `stop` are always accepted.
 
 **Repeated commands.** To make a late command safe to repeat, add a `key` to the command: a
 unique string of 1 to 64 characters, for example a random number. To repeat the command, send the

@@ -354,8 +354,8 @@ def fit_centre(
     if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT_ERROR):
         raise CalibrationError(
             f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so tilt and "
-            "position can't be separated; use only upright presses, or both upright presses and "
-            "presses with a larger tilt"
+            "position can't be separated; use only upright presses, or add presses with a larger "
+            "tilt"
         )
     for k, frame in enumerate(stack):
         if not frame.max() > _PRESSED_SIGMA * noise:

@@ -145,7 +145,7 @@ def mark(folder: OwnFolder, part: str) -> None:
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove other cache folders, except the newest few and recently used folders."""
+    """Remove other cache folders, except for the few newest and all recently used folders."""
     oldest = time.time() - _RECENT
     others = [
         each

@@ -61,7 +61,7 @@ class SolidData:
 
 @lru_cache(maxsize=8)
 def solid_data(tip: Fingertip) -> SolidData:
-    """Return the data for the Poisson's ratio, base and face of a solid ``tip``."""
+    """Return the data of a solid ``tip``, selected by its Poisson's ratio, base and face."""
     block = tip.base if tip.face == "frictionless" else f"{tip.base}-{tip.face}"
     with np.load(_FILE) as file:
         stored: dict[str, Any] = {

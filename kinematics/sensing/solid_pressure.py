@@ -281,7 +281,7 @@ def render_solid(
 
 
 def pixels_of(images: FloatArray) -> FloatArray:
-    """Return ``images`` [·, cells] as [cells, ·] with zeros up to a multiple of `_LANES`."""
+    """Transpose ``images`` to [cells, ·], padded with zeros to a multiple of `_LANES` columns."""
     return np.ascontiguousarray(np.pad(images, ((0, -len(images) % _LANES), (0, 0))).T)
 
 

@@ -49,7 +49,7 @@ class SpringPoints(NamedTuple):
     outside the grid that are within the range of the blur.
     """
 
-    line: FloatArray  # [5, row]: distance from the tip centre in x [m], and scratch
+    line: FloatArray  # [5, row]: distance from the tip centre in x [m], then scratch values
     inverse: FloatArray  # means of 1/ℓ, x/ℓ and y/ℓ [3, all rows]
     y: FloatArray  # one value per row
     across: FloatArray  # weights along x [position, cell offset], see `blur.axis_points`

@@ -80,7 +80,7 @@ class Watch(event.Listener):
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Run the script; report the compilations during startup, in no warm-up part, and later."""
+    """Run the script; report compilations at startup, outside all warm-up parts, and later."""
     watch = Watch()
     modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch):

@@ -94,7 +94,7 @@ def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
     assert "left finger: found a range of 0.0° between closed and open" in capsys.readouterr().err
     monkeypatch.setattr(emulator._servos.bus.servos[0]._joint, "shift", 4000)
     assert calibrate(folder, *words) == 1
-    assert "(one turn), because a servo loses its turn count" in capsys.readouterr().err
+    assert "(one turn): switch the supply off and on again" in capsys.readouterr().err
 
 
 def test_only_calibrated_values_change_in_a_profile():

@@ -39,7 +39,7 @@ FRACTION = """((selector, colour) => {
     count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
   return 4 * count / data.length;
 })"""
-# Visible texts with a contrast below the WCAG AA limit of 4.5, or 3 for large text.
+# Visible text with a contrast below the WCAG AA minimum of 4.5 (3 for large text).
 PALE = """(() => {
   const linear = part => part <= 10.31 ? part / 3294.6 : ((part / 255 + 0.055) / 1.055) ** 2.4;
   const parts = colour => colour.match(/[\\d.]+/g).map(Number);

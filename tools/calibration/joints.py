@@ -114,9 +114,9 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
         if not 0 <= encoder < reg.COUNTS_PER_TURN:
             raise ServoError(
                 f"servo {servo}: found a position of {encoder} counts, expected 0 to "
-                f"{reg.COUNTS_PER_TURN - 1} (one turn), because a servo loses its turn count when "
-                "its supply is switched off: switch the supply off and on again; if the position "
-                "is still outside this range, mount the horn half a turn further"
+                f"{reg.COUNTS_PER_TURN - 1} (one turn): switch the supply off and on again to "
+                "reset the turn count; if the position is still outside this range, mount the horn "
+                "half a turn further"
             )
     return counts
 

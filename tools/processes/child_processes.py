@@ -34,7 +34,7 @@ class _Lifeline:
     def start(self, words: list[str], keys: str, **options: Any) -> subprocess.Popen[Any]:
         """Start ``softfinger`` with the arguments ``words`` and, if keys are set, ``--keys``."""
         reads, self._ours = os.pipe()
-        # The option -P keeps Python from importing a folder named tools in the working directory.
+        # The -P option keeps Python from importing a folder named tools in the working directory.
         command = [sys.executable, "-P", "-m", "softfinger", *words, "--lifeline", str(reads)]
         try:
             return subprocess.Popen(

@@ -210,7 +210,7 @@ class _Build:
 
 def _start() -> subprocess.Popen[str]:
     """Start a process that runs `main`."""
-    # The option -P keeps Python from importing a folder named tools in the working directory.
+    # The -P option keeps Python from importing a folder named tools in the working directory.
     command = [sys.executable, "-P", "-m", "softfinger.tools.processes.compile"]
     path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(

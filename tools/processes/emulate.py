@@ -205,7 +205,7 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
     """
     from softfinger.daemon.simulation.emulator.folder import NoEmulator
 
-    # The option -P keeps Python from importing a folder named softfinger in the working directory.
+    # The -P option keeps Python from importing a folder named softfinger in the working directory.
     command = [sys.executable, "-P", "-m", "softfinger", "emulate", *map(str, words)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:

@@ -1,4 +1,4 @@
-"""Emulate a tactile board that sends the frames of the simulated sensor on a pty.
+"""Emulate a tactile board that sends the simulated sensor's frames over a pty.
 
 The encoders (`ENCODERS`) are pure functions that convert counts to a board's framing. This module
 also applies board faults.
