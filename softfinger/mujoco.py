@@ -6,10 +6,10 @@ pressure under each tip. :class:`MujocoHand` simulates the hand of a profile. Th
 class if ``servos.backend = "mujoco"``.
 
 The contact law is the kernel that the simulated hand uses (`simulation.physics.tip`). In 3D, the
-shear is a vector in the face. The component along the tilt is d_t. The component across the tilt is
-treated as a variance, because U contains ρ(ζ² + v). The forces f are computed for the end of the
-step (docs/mujoco.md). The forces are linearly implicit in d, θ and both shears, whose Jacobian rows
-are R:
+shear is a vector in the plane of the face. The component along the tilt is d_t. The component
+across the tilt is treated as a variance, because U contains ρ(ζ² + v). The forces f are computed
+for the end of the step (docs/mujoco.md). The forces are linearly implicit in d, θ and both shears,
+whose Jacobian rows are R:
 
     (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
 

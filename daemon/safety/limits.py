@@ -447,8 +447,8 @@ _OVERLAP_RATIO = 0.5
 
 
 @Limit("joint.opens",
-    "tip overlap during the approach, computed from the joint angles, although one tip has no "
-    "contact", "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
+    "approach in which the joint angles imply that the tips overlap, but one tip has no contact",
+    "warn", ("servos.direction",), "servos", in_turn=True)  # fmt: skip
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 
@@ -508,7 +508,7 @@ def _goal_lost(view: View, state: State, _: float) -> str:
 
 @Limit(
     "goal.number",
-    "computed goal that is not a finite number; such a goal is never sent",
+    "goal that is not a finite number and is therefore not sent",
     "fault",
     needs="servos",
 )

@@ -128,7 +128,7 @@ class FaultEvent(NamedTuple):
     """Start of a device fault or object load."""
 
     after: float  # s
-    part: str  # ``servos``, ``object``, ``all``, or a finger (board or measurements)
+    part: str  # ``servos``, ``object``, ``all``, or the finger whose board or measurements fail
     kind: str
     value: float = 1.0  # probability, servo ID, load, or value of a measurement fault
     over: float = 0.0  # time over which the fault grows to its full value [s]

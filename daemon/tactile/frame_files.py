@@ -220,7 +220,7 @@ def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
         raise ValueError(
-            f"the header states an array of shape {shape} and type {kind}, but the file contains "
+            f"the header declares an array of shape {shape} and type {kind}, but the file contains "
             "less data"
         )
     file.seek(0)

@@ -26,9 +26,9 @@ KINDS: dict[str, EventKind] = {
     "start": EventKind("info", "The daemon is starting, or is ready and accepts commands."),
     "end": EventKind(
         "info, error",
-        "The daemon has exited. If the level is error, the servos did not confirm that torque is "
+        "The daemon has exited. If the level is `error`, the servos did not confirm that torque is "
         "off.",
-        "If the level is error, switch off the servo supply.",
+        "If the level is `error`, switch off the servos' power supply.",
     ),
     "mode": EventKind("info", "The mode has changed; the message states the old and the new mode."),
     "compile": EventKind(

@@ -130,7 +130,7 @@ def _name(address: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Yield candidate folders, first those of a login session and of the system service."""
+    """Yield candidate folders, starting with those of the login session and the service."""
     session = f"/run/user/{os.geteuid()}"
     for place in (os.environ.get("XDG_RUNTIME_DIR"), "/run/softfinger", session):
         if place:

@@ -33,7 +33,7 @@ class Invalid(IntEnum):
     MODEL_MISMATCH = 8, "the frame does not match the tip's contact model"
     OUT_OF_RANGE = 9, "depth or tilt is outside the range of the contact model"
     UNCERTAIN = 10, "the estimate is too uncertain: use more force, or calibrate the sensor"
-    # The daemon tracks estimates over time and therefore sets the following reasons.
+    # Only the daemon sets the following reasons, because only the daemon tracks sensors over time.
     NO_FRAME = 11, "no frame has arrived yet"
     BAD_FRAME = 12, "the board is disconnected, or its frames repeat"
     STALE = 13, "no valid frame has arrived for too long"

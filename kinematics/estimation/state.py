@@ -170,7 +170,7 @@ class Cells(NamedTuple):
     reach: FloatArray  # √(a² − x² − y²), negative for unused cells [m]
     x: FloatArray  # cell centre [m]
     y: FloatArray
-    height: FloatArray  # like ``reach``, but also negative for outliers in the frame
+    height: FloatArray  # like ``reach``, but negative for outliers in the frame
     pattern: FloatArray  # pattern for detecting the contact of a solid tip
     model: FloatArray  # modelled pressure including gain and shear [Pa]
     residual: FloatArray  # reading − model, or 0 for cells excluded from the fit [Pa]

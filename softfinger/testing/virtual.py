@@ -207,8 +207,8 @@ class VirtualTimeHand(Hand):
     def serve(self, speed: float = 1.0) -> Iterator[str]:
         """Serve clients over ZeroMQ; the context manager returns `address`.
 
-        During the context, a thread advances the virtual time ``speed`` times as fast as real time,
-        if the machine is fast enough. Clients in this process are created with
+        During the context, a thread advances virtual time ``speed`` times as fast as real time, if
+        the machine is fast enough. Clients in this process are created with
         ``Hand(hand.address)``.
         """
         config = Config(self.stream_address, self.command_address, GATEWAY_TOPICS, _QUEUE)

@@ -29,7 +29,7 @@ def test_a_daemon_starts_with_factors_from_earlier_grips(
     with Hand(*addresses, timeout=60.0) as hand:
         hand.state()
         assert calibrate(0) == 1
-        assert "first grasp an object with a high force" in capsys.readouterr().err
+        assert "first grasp an object firmly" in capsys.readouterr().err
         assert not Path(files[0]).exists()
         hand.arm()
         hand.grasp(force=10.0)

@@ -302,8 +302,8 @@ def test_simulated_servos_heat_up_with_their_current_and_shut_down():
     while not read(servos, reading).alert:
         clock.sleep_until(clock.now() + 0.05)
         assert clock.now() < 400.0
-    # The heat is 55 K times 73 J/K. The power is 22.5 W at first and 32 W with hot copper, minus
-    # the losses to the air.
+    # The heat is 55 K times 73 J/K. The power is 22.5 W initially and 32 W once the copper is
+    # hot. The air removes part of this heat.
     assert 55.0 * 73.0 / 32.0 < clock.now() < 1.2 * 55.0 * 73.0 / 22.5
     assert (reading.alert, reading.hardware) == (0b01, [1 << 2, 0])
     assert reading.temperature == [80.0, 25.0]

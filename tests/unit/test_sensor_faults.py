@@ -56,7 +56,7 @@ def test_a_measurement_fault_is_named_and_has_no_effect(lie: str) -> None:
         assert hand.mode == mode
         if mode == "holding":
             assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.1)
-        if mode == "fault":  # As with missing frames, no sensor is valid.
+        if mode == "fault":  # The sensor is invalid, as if its frames were missing.
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 

@@ -167,7 +167,7 @@ def frames_to_contacts(rounds: int) -> Report:
 
 
 def centroid_and_extent(frames: FloatArray) -> FloatArray:
-    """Use NumPy to compute d and tilts [n, 3] from each footprint's centroid and extent.
+    """Use NumPy to compute [d, tilts] [n, 3] from each footprint's centroid and extent.
 
     For a constant modulus, the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance is
     d (4a − d)/6 − sin² θ d (12a − 5d)/36. The initial footprint contains all cells above a

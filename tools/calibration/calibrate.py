@@ -234,8 +234,7 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     if not contact.sensor_gain_std < _LEARNT * settings.tactile.gain_error * contact.sensor_gain:
         raise CalibrationError(
             f"scales: found a gain uncertainty of {contact.sensor_gain_std:.2f}, expected less "
-            f"than {_LEARNT * settings.tactile.gain_error:.2f}: first grasp an object with a high "
-            "force"
+            f"than {_LEARNT * settings.tactile.gain_error:.2f}: first grasp an object firmly"
         )
     step = ScalesStep(
         date=now(),

@@ -88,8 +88,8 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
             )
     if len({new["servos"]["ids"][finger] for finger in scene}) < len(scene):
         raise CalibrationError(
-            f"servo {new['servos']['ids'][0]} rotated with both fingers, expected one servo per "
-            "finger: move one finger at a time"
+            f"servo {new['servos']['ids'][0]} rotated when either finger was moved, expected one "
+            "servo per finger: move one finger at a time"
         )
     return "\n  ".join([*told, *write_keys(arguments, new)])
 
@@ -171,9 +171,9 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write the settings ``new`` to ``arguments.file``, or to a copy of the profile at this path.
+    """Write ``new`` settings to ``arguments.file``, and keep all other text.
 
-    All other text is preserved.
+    If the file does not exist, it is created as a copy of the profile.
     """
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config

@@ -61,6 +61,6 @@ def run(arguments: argparse.Namespace) -> int:
         for old in found.old_protocol():
             print(f"{path}: {old}", flush=True)
         if not found.servos and not found.garbled and not found.old:
-            print(f"{path}: no servo replies at any of these baud rates", flush=True)
+            print(f"{path}: no servo replied at any of these baud rates", flush=True)
         count += len(rates)
     return 0 if count else 1

@@ -28,8 +28,8 @@ _WHOLE = _whole()
 def document(kind: str, stored: bytes = b"") -> str:
     """Return the page for the ``kind`` of visitor: ``command``, ``watch`` or ``play``.
 
-    Without ``stored``, the page receives pictures from its server. ``stored`` contains the pictures
-    of a recording, compressed by `saved.save`.
+    Without ``stored``, the page receives pictures from its server. ``stored`` contains a
+    recording's pictures, compressed by `saved.save`.
     """
     others = rf'<section class="(?!{kind}).*?</section>'
     page = re.sub(others, "", _WHOLE, flags=re.S)

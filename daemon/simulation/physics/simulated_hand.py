@@ -364,7 +364,7 @@ class SimulatedHand:
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
 
     def apply_fault(self, event: FaultEvent) -> bool:
-        """Begin or end an object load or a measurement fault; return False for other faults."""
+        """Apply a change of an object load or measurement fault; return False for other faults."""
         kind, part = event.kind, event.part
         if part == OBJECT:
             self.load(**{kind: event.value})

@@ -190,7 +190,7 @@ class SensorModel:
         """Return the pressure [Pa] on each cell due to a cylinder of radius R = ``roundness`` [m].
 
         The normal (n_x, n_y, …) points from the tip centre to the cylinder axis, whose distance is
-        a − d + R. With the coordinate p across the axis,
+        a − d + R. Let p be the coordinate across the axis. Then
 
             z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
 
