@@ -92,8 +92,8 @@ def tare(frames: ArrayLike) -> Tare:
     restless = np.count_nonzero(noise > _UNREST_SIGMA * max(float(np.median(noise)), 0.5))
     if restless >= _UNREST_CELL_COUNT:
         raise CalibrationError(
-            f"tare: the readings of {restless} cells change, expected constant readings; check "
-            "that the tip is not in contact"
+            f"tare: the readings of {restless} cells are changing, expected constant readings; "
+            "check that the tip is not in contact"
         )
     zero = stack.mean(axis=0)
     excess = float(np.maximum(stack - zero, 0.0).mean())
@@ -395,7 +395,7 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
-        raise CalibrationError("modulus: expected values of d and force for each frame")
+        raise CalibrationError("modulus: expected one value of d and one force for each frame")
     used = (depth > 0.0) & (load > 0.0)
     if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
         raise CalibrationError("modulus: expected at least three frames in contact at different d")

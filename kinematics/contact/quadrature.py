@@ -34,7 +34,7 @@ from softfinger.kinematics.contact.material import Material
 # Number of Gauss points per piece. With 14 points, ∂F/∂θ has an error of 1e-10. With 18 points,
 # only rounding errors remain.
 _NODES = 18
-# Number of points for laws above degree 8. With 18 points, the error for these laws may be 1e-11.
+# Number of points for laws above degree 8. With 18 points, their error can reach 1e-11.
 _NODES_HIGH_DEGREE = 26
 _PIECE_MIN = 2.0**-14  # minimum size of a graded piece, relative to the scale of the singular point
 

@@ -236,7 +236,7 @@ class MeasuredEstimator:
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         moment, moment_q = shown * lever, shown_q * lever + shown * lever_q
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        partials = np.zeros((3, 3))  # of the sum and both moments with respect to (d, n_x, n_y)
+        partials = np.zeros((3, 3))  # ∂(sum, both moments)/∂(d, n_x, n_y)
         partials[0] = shown_t * per_d, *(2.0 * shown_q * n)
         partials[1:, 0] = (shown_t * lever + shown * lever_t) * per_d * n
         partials[1:, 1:] = moment * np.eye(2) + 2.0 * moment_q * np.outer(n, n)

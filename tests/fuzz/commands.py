@@ -164,7 +164,7 @@ class FileTarget:
         self._path = Path(self._folder.name) / f"fuzz{end}"
 
     def give(self, rng: random.Random) -> tuple[str, bytes]:
-        """Read one file; return the kind of result and the file."""
+        """Read one file; return the kind of result and the file's content."""
         kind = rng.random()
         text = rng.choice(self._seeds)
         if kind < 0.05:

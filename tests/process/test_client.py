@@ -255,7 +255,7 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     for seq in (5, 10, 16, 30, 36):  # The publisher sends every fifth state, starting at any state.
         gaps.take({"seq": seq, "seq_step": 5})
     assert gaps.lost == 2
-    gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, which is not a loss.
+    gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, and nothing was lost.
     gaps.take({"seq": 10, "seq_step": 5})
     assert gaps.lost == 2
     for finger in ("left", "right"):  # Losses are counted separately per finger.

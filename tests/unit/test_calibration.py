@@ -50,7 +50,7 @@ def test_a_tare_under_load_is_refused():
     frames[:, 2:4, 3] *= 20.0  # The tare ignores two faulty cells.
     tare(frames)
     frames[10:, 4:6, 4:7] += 100.0
-    with pytest.raises(CalibrationError, match="the readings of 8 cells change"):
+    with pytest.raises(CalibrationError, match="the readings of 8 cells are changing"):
         tare(frames)
 
 

@@ -5,10 +5,11 @@ model is frictionless. For a tip with shear ζ
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
-The shear rate is the rolling speed minus two other terms: the speed along the face, and the
-component along a tilted face due to increasing d. The quantities s, d and θ are defined in
-`kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium if Σ δU = 0
-for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, the condition becomes
+The shear rate is the rolling speed minus two other terms: the sliding speed along the face, and the
+component, along a tilted face, of the velocity at which d increases. The quantities s, d and θ are
+defined in `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium
+if Σ δU = 0 for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, the
+condition becomes
 
     Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0
 

@@ -72,11 +72,11 @@ class Site:
     """Serve the page and its pictures, carry out its commands, and stream to Foxglove clients.
 
     Requests must name this server as their host. Requests from a browser must also come from this
-    server's pages. The host rule blocks DNS rebinding, in which the host has another name. The page
-    rule blocks requests from pages of other sites, which have a different origin. Pages with the
-    ``token`` may send commands through ``send``. All pages may control a recording's playback
-    through ``wish``. If other machines can reach the server, the token is required even for
-    watching. A browser then obtains the token with a one-time code.
+    server's pages. The host rule blocks DNS rebinding, because such requests name a different host.
+    The page rule blocks requests from pages of other sites, which have a different origin. Pages
+    with the ``token`` may send commands through ``send``. All pages may control a recording's
+    playback through ``wish``. If other machines can reach the server, the token is required even
+    for watching. A browser then obtains the token with a one-time code.
     """
 
     def __init__(

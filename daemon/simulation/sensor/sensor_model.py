@@ -189,8 +189,8 @@ class SensorModel:
     def _curved(self, d: float, n_x: float, n_y: float, roundness: float) -> FloatArray:
         """Return the pressure [Pa] on each cell due to a cylinder of radius R = ``roundness`` [m].
 
-        The normal (n_x, n_y, …) points from the tip centre to the cylinder axis, whose distance is
-        a − d + R. Let p be the coordinate across the axis. Then
+        The normal (n_x, n_y, …) points from the tip centre to the cylinder axis, which is
+        a − d + R away. Let p be the coordinate across the axis. Then
 
             z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
 

@@ -53,8 +53,8 @@ class SimulatedTactile:
     only on request. The frames that are never computed are also counted in ``seq``. The hand's
     ``measurement_faults`` are applied to the frames.
 
-    If ``stage`` is set, it replaces the contact with the object. ``stage`` is a function of the
-    time since the hand's start [s].
+    If ``stage`` is set, it defines the contact instead of the object. ``stage`` is a function of
+    the time since the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:

@@ -221,9 +221,9 @@ _ARRIVAL_TOLERANCE = 1e-6
 
 
 class Profile:
-    """Velocity-based or time-based trajectory to a goal, with its current position and velocity.
+    """Velocity-based or time-based trajectory to a goal.
 
-    A limit of 0 means no limit.
+    The object stores the trajectory's present position and velocity. A limit of 0 means no limit.
     """
 
     def __init__(self) -> None:
