@@ -18,7 +18,7 @@ stays within ±`friction` of its initial value. Because rubber relaxes, the offs
 range by up to _RELAXATION_SHARE of the tip moment.
 
 **Load.** Friction hides a load of up to friction/load_arm, which is 2 N per tip for the default
-hand. Loads below half of the hidden load are ignored. Larger loads are increased by the load that
+hand. Loads below half of this value are ignored. Larger loads are increased by the load that
 friction may hide. Increasing the grip force by more than _UNCONFIRMED_SHARE requires confirmation:
 the object has rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
 

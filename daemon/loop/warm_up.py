@@ -70,7 +70,8 @@ def parts(settings: Settings) -> list[Part]:
 
     One process compiles the estimator and the simulated sensor, because they share kernels. The
     second process compiles the contact table before the simulated hand and the filter, because both
-    use the table. The shorter parts are distributed so that both processes take about equally long.
+    use the table. The shorter parts are distributed so that both processes take about the same
+    time.
     """
     simulated = needs_hand(settings.servos.backend, settings.tactile.backend)
     servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"

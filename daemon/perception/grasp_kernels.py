@@ -5,7 +5,7 @@ torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05
           while the joints close                                           held by the gears
 balance   ln N1 − ln N2 = 0, where N are the normal forces                 5 % and 0.4 N
 
-The force of a tip is ρ e^MODULUS F(D, θ), where F is the tip's contact table and ρ is the tip's
+The force on a tip is ρ e^MODULUS F(D, θ), where F is the tip's contact table and ρ is the tip's
 relaxation factor.
 """
 

@@ -27,7 +27,7 @@ class UnloadedCells:
     """Estimator for one sensor's zero shift and noise."""
 
     def __init__(self, grid: SensorGrid, radius: float, live: NDArray[np.bool_]) -> None:
-        """Create an estimator for a tip of ``radius`` [m]; ``live`` masks the working cells."""
+        """Create an estimator for a tip of ``radius`` [m]; ``live`` is True for working cells."""
         (pitch_x, pitch_y), (centre_x, centre_y) = grid.pitches, grid.centre
         x = (np.arange(grid.cols) - 0.5 * (grid.cols - 1)) * pitch_x - centre_x
         y = (np.arange(grid.rows) - 0.5 * (grid.rows - 1)) * pitch_y - centre_y

@@ -416,8 +416,8 @@ def _joint_stall(view: View, state: State, _: float, i: int) -> str:
     return f"the {FINGERS[i]} joint has stalled {off} at {current:.2f} A"
 
 
-@Limit("joint.swapped", "joint that moves the tip of the other finger, or an object that rotates "
-    "in the direction opposite to the command", "fault", ("servos.ids",), "sensors")  # fmt: skip
+@Limit("joint.swapped", "joint that moves the other finger's tip, or object that rotates in the "
+    "opposite direction to the command", "fault", ("servos.ids",), "sensors")  # fmt: skip
 def _joint_swapped(view: View, _: State, __: float) -> str:
     return view.wiring.swapped
 

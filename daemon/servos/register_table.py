@@ -54,7 +54,7 @@ class Register(NamedTuple):
 
 
 # Registers that `doctor --save` stores so that they can be restored later. ID, baud rate and
-# protocol are excluded, because a change makes the servo unreachable with the old settings.
+# protocol are excluded, because changing them would make the servo unreachable.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),

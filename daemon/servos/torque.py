@@ -27,7 +27,8 @@ _GOAL_BYTES = (
     *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
 _PACKET_COUNT = 2  # number of copies of each torque-off packet, which has no reply
-_ON_TIMEOUTS = 50  # time limit for switching on, in reply timeouts; switching on blocks the loop
+# Time limit for switching on, as a multiple of the reply timeout. Switching on blocks the loop.
+_ON_TIMEOUTS = 50
 _MOTION_MAX = 8  # allowed motion of a limp joint before torque is on, in counts (0.7°)
 
 

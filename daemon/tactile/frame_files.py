@@ -208,7 +208,7 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
     header = {(1, 0): lib.read_array_header_1_0, (2, 0): lib.read_array_header_2_0}
     version = lib.read_magic(file)
     if version not in header:
-        raise ValueError(f"found version {version} of .npy, expected 1.0 or 2.0")
+        raise ValueError(f"found .npy format version {version}, expected 1.0 or 2.0")
     return header[version](file)
 
 
@@ -369,7 +369,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
         )
     elif not 1.0 / _INTERVAL_RATIO_NOTED < step * rate < _INTERVAL_RATIO_NOTED:
         notes.append(
-            f"t: interpreted as s, which gives {step:.4g} s between frames, but tactile.rate "
+            f"t: interpreted as seconds, which gives {step:.4g} s between frames, but tactile.rate "
             f"corresponds to {1.0 / rate:.4g} s"
         )
     return np.multiply(since, factor)

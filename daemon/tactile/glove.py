@@ -22,7 +22,7 @@ _BITS = 5  # bits per half of a count
 
 
 class GloveDecoder(DelimitedDecoder):
-    """Decoder for a glove-style board with counts of 2 × ``bits`` bits."""
+    """Decoder for a glove-style board, which sends each count in two halves of ``bits`` bits."""
 
     def __init__(self, rows: int = 32, cols: int = 32, bits: int = _BITS) -> None:
         super().__init__(rows, cols, b"\n", 2 + 2 * rows * cols)

@@ -54,7 +54,7 @@ _FORCES = {
     **dict.fromkeys(("oz", "ozf"), 0.27801385095),
 }
 _AREAS = {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6, "in2": 0.0254**2, "ft2": 0.3048**2}
-# Square symbols as encoded by Latin-1, UTF-8 and DOS code pages.
+# The superscript ² as encoded in Latin-1, UTF-8 and DOS code pages.
 _SQUARES = str.maketrans({"²": "2", "ý": "2", "^": "", ".": "", "*": ""})
 
 

@@ -155,7 +155,7 @@ def refusal(error: str, reason: str) -> bytes:
 def decode(payload: bytes) -> dict[str, Any]:
     """Unpack a command: a flat map of numbers and strings; the value of ``command`` is a string.
 
-    Raises Refused for other data. Additional fields of a stop are ignored.
+    Raises Refused for other data. Additional fields in a `stop` command are ignored.
     """
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)

@@ -169,7 +169,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "goal.lost": EventKind(
         "error",
-        "A servo does not receive its goals.",
+        "A servo is not receiving its goals.",
         "Check the cable; lower `servos.baud`.",
     ),
     "goal.number": EventKind(
@@ -286,9 +286,9 @@ KINDS: dict[str, EventKind] = {
     "tare": EventKind(
         "info, warning",
         "A tare has ended. The message states the median and the largest change in the zero "
-        "offsets. If the level is warning, the sensor was not tared because most cells are "
-        "saturated without contact.",
-        "If the level is warning, check the board's gain and `tactile.full_count`. If the "
+        "offsets. If the level is `warning`, most cells are saturated without contact, and "
+        "the sensor was not tared.",
+        "If the level is `warning`, check the board's gain and `tactile.full_count`. If the "
         "change is large at every start, run `softfinger calibrate tare` again.",
     ),
     # consistency checks between components of the hand

@@ -34,7 +34,7 @@ _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
 # Number of other cache folders to keep, for example those of other checkouts or the previous
 # release.
 _FOLDERS_MAX = 4
-_RECENT = 600.0  # minimum age of a pruned folder [s], because newer folders may still be in use
+_RECENT = 600.0  # age below which a folder may still be in use and is not removed [s]
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",

@@ -17,8 +17,8 @@ point first touched it. The plane moves straight along its normal. N = ∂U/∂d
 is the tilt derivative of the energy for straight presses. A shear force T = −N sin θ cos θ q_0
 pulls the tip up the slope. Therefore, F = N cos θ (1 − sin² θ q_0).
 
-A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). The shear force is
-assumed to act at height a, so its moment about the base centre is T a.
+A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). The shear force T is
+assumed to act at the height a above the base, so its moment about the base centre is T·a.
 """
 
 from __future__ import annotations

@@ -165,7 +165,7 @@ class EstimatorState(Record):
 class Cells(NamedTuple):
     """Arrays over the cells of `EstimatorState.grid`, float64 [cells] or [·, cells]."""
 
-    sensitivity: FloatArray  # pressure at a gain of 1, its partials, shear images [PARAMETERS, ·]
+    sensitivity: FloatArray  # pressure at a gain of 1, ∂/∂parameters, shear images [PARAMETERS, ·]
     planes: FloatArray  # the first four rows of ``sensitivity``, [4, rows, cols]
     reach: FloatArray  # √(a² − x² − y²), negative for unused cells [m]
     x: FloatArray  # cell centre [m]

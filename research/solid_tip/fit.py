@@ -27,7 +27,7 @@ S_MAX = np.sqrt(D_MAX)
 ORDERS = (11, 6)  # number of coefficients in s, and in sin²θ
 HARMONICS = 9
 # Cells beyond this radius are down-weighted, because a bonded tip has a stress singularity at the
-# rim, and the base of a lying tip ends at the rim.
+# rim, and the base of a tip that is not bonded ends at the rim.
 RIM = 0.95
 
 

@@ -124,7 +124,7 @@ class Grasp:
         """Move the joints to ``q`` (2,) in one step and let the object roll to equilibrium.
 
         Use small steps, because the shears are integrated along a straight path. Raise GraspError
-        if a contact opens or leaves the table, or if no equilibrium is found.
+        if a contact opens or leaves the table's range, or if no equilibrium is found.
         """
         x = state.coordinates
         if q is not None:

@@ -93,9 +93,9 @@ class BusClient:
 class DirectPort(SerialPort):
     """Port connected to a bus in this thread: a reply is available immediately or never.
 
-    The bus uses the time of ``clock``. Without a clock, the bus uses ``t``, which the test sets. If
-    a reply is missing, the wait advances ``t`` to the deadline. With ``baud`` 0, the port receives
-    at any rate.
+    The bus takes its time from ``clock``. Without a clock, the bus uses ``t``, which the test sets.
+    If a reply is missing, the wait advances ``t`` to the deadline. With ``baud`` 0, the port
+    receives at any rate.
     """
 
     def __init__(

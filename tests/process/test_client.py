@@ -252,7 +252,7 @@ def test_state_returns_a_current_state(fake, hand):
 
 def test_gaps_are_counted_with_the_step_of_the_topic():
     gaps = Gaps()
-    for seq in (5, 10, 16, 30, 36):  # The publisher sends every fifth state, starting at any state.
+    for seq in (5, 10, 16, 30, 36):  # The publisher sends every fifth state.
         gaps.take({"seq": seq, "seq_step": 5})
     assert gaps.lost == 2
     gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, and nothing was lost.

@@ -75,7 +75,7 @@ def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the doctor's measurements of this machine and skip its address check."""
+    """Shorten the machine measurements of `doctor`, and skip the address check."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UP_COUNT", 5)
 

@@ -103,7 +103,10 @@ def test_a_missed_aim_is_not_a_success(monkeypatch, capsys):
     ("words", "text"),
     [
         (["tik"], "found 'tik', expected one of estimator"),
-        (["faults", "--only", "no such fault"], "no case name of faults contains this text"),
+        (
+            ["faults", "--only", "no such fault"],
+            "no case in faults has a name that contains this text",
+        ),
         (["tick", "--full"], "--full: valid only for reflex"),
         (["--trials", "3"], "--trials: valid only for faults or robustness"),
     ],

@@ -330,7 +330,7 @@ def test_a_slow_recording_is_read_unchanged_and_reported(press, tmp_path):
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t.tolist() == (np.arange(8) * 0.5).tolist()
     assert read.notes == (
-        "t: interpreted as s, which gives 0.5 s between frames, but tactile.rate "
+        "t: interpreted as seconds, which gives 0.5 s between frames, but tactile.rate "
         "corresponds to 0.01 s",
     )
 

@@ -186,8 +186,8 @@ def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]
     tip = Fingertip(0.020, physics)
     # With 32 frames of three values per depth, the scatter is ± 0.14. For a solid tip, the
-    # covariance includes an error of the tip data. The simulated frames come from the same data, so
-    # the lower limit is smaller.
+    # covariance includes the error in the tip data. The simulated frames come from the same data,
+    # so the lower limit is smaller.
     least, most = (0.6, 1.5) if physics == "springs" else (0.2, 1.5)
     # With spring tips, an offset of 0.5 mm causes an error in d that exceeds the estimated
     # uncertainty of d.

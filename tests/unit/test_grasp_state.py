@@ -163,7 +163,7 @@ def test_total_tilt_is_the_angle_between_normal_and_axis():
     assert math.cos(total_tilt(0.2, -0.1)) == pytest.approx(math.sqrt(1.0 - x * x - y * y))
 
 
-# Load along the faces from joint torques
+# Load along the faces, computed from joint torques
 
 
 def found_load(

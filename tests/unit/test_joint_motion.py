@@ -194,6 +194,6 @@ def test_position_mode_moves_without_current_checks(make):
     command(daemon, "move", left=0.05, right=-0.1)
     daemon.loop.advance(1.0)
     assert daemon.loop.state.reading.q == pytest.approx([0.05, -0.1], abs=0.01)
-    command(daemon, "move", left=0.3, right=0.3)  # The joints move onto the object.
+    command(daemon, "move", left=0.3, right=0.3)  # The fingers close on the object.
     daemon.loop.advance(2.0)
     assert daemon.loop.state.fault_name == ""

@@ -329,7 +329,7 @@ def test_stopping_the_opening_hand_leaves_no_later_fault(make):
 def test_a_blocked_joint_is_a_fault_that_can_be_cleared(make):
     daemon = make(tactile={"backend": "none"})
     command(daemon, "arm")
-    command(daemon, "move", left=0.9, right=0.9)  # The joints move onto the object.
+    command(daemon, "move", left=0.9, right=0.9)  # The fingers close on the object.
     advance_to(daemon, "fault", 8.0)
     assert daemon.loop.state.fault_name == "joint.stall"
     assert "joint has stalled" in daemon.loop.state.fault

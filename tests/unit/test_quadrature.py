@@ -1,4 +1,4 @@
-"""Test a tip's closed forms and reference integrals against NumPy in other coordinates."""
+"""Compare a tip's closed forms and reference integrals with NumPy integrals."""
 
 import math
 from fractions import Fraction

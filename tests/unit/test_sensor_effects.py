@@ -46,7 +46,7 @@ def test_noise_has_the_configured_deviation_and_is_clipped_at_zero():
     assert abs(rest.mean()) < 4.0 * 600.0 / np.sqrt(rest.size)
     free = counts(model, (0.0, 0.0, 0.0))
     assert (free == 0.0).mean() == pytest.approx(0.5, abs=0.05)
-    # A clipped normal distribution has the mean σ/√2π. With 1936 cells, the ratio is 1 ± 0.033.
+    # A clipped normal distribution has a mean of σ/√2π. With 1936 cells, the ratio is 1 ± 0.033.
     assert free.mean() == pytest.approx(600.0 / np.sqrt(2 * np.pi), rel=0.15)
 
 

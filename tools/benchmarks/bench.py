@@ -184,4 +184,6 @@ def _check(names: list[str], arguments: argparse.Namespace) -> None:
         if name not in MEASUREMENTS:
             raise ValueError(f"found {name!r}, expected one of {', '.join(MEASUREMENTS)}")
     if arguments.only and not any(arguments.only in case for case in _module(names[0]).NAMES):
-        raise ValueError(f"--only {arguments.only}: no case name of {names[0]} contains this text")
+        raise ValueError(
+            f"--only {arguments.only}: no case in {names[0]} has a name that contains this text"
+        )

@@ -291,7 +291,7 @@ def _law(step: Step) -> Done:
     if d is None:
         raise CalibrationError("law: expected --d, or a run that contains d")
     if len(d) < 3 or np.ptp(d) <= 0.0:
-        raise CalibrationError("law: expected at least three presses at different d")
+        raise CalibrationError("law: expected at least three presses at different values of d")
     sensor = step.calibration.sensor
     grid = calibrated_grid(settings, FINGERS.index(sensor.finger), step.calibration)
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])

@@ -37,7 +37,7 @@ _CHUNK_SIZE_MAX = 64 << 20  # unpacked chunk size limit [bytes]; chunks usually 
 # time.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
-_OTHERS_NAMED_MAX = 3  # maximum number of other programs' channels in a warning
+_OTHERS_NAMED_MAX = 3  # maximum number of foreign channels that a warning lists
 _FIELD_COUNT_MAX = 500  # maximum number of fields per message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # record header with kind and content size

@@ -90,8 +90,8 @@ def format_value(value: float, decimals: int) -> str:
 def format_microseconds(seconds: float) -> str:
     """Format a duration in up to 4 columns.
 
-    Durations of 10 ms or more are in ms and have a unit; shorter durations are in µs without a
-    unit.
+    Durations of 10 ms or more are printed in ms with the unit. Shorter durations are printed in µs
+    without the unit.
     """
     if not math.isfinite(seconds):
         return "—"

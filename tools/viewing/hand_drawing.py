@@ -106,8 +106,8 @@ def held_outline(
 ) -> FloatArray:
     """Return the held object's closed outline [m], shape [5, 2], with the left finger first.
 
-    The position across the faces is computed from the joint angles and contacts. Along the faces,
-    the object is assumed to be centred on the contacts.
+    The position perpendicular to the faces follows from the joint angles and contacts. Along the
+    faces, the object is assumed to be centred on the contacts.
     """
     a, tips = hand.tip_radius, hand.tips(q)
     angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])

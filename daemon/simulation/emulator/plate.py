@@ -70,7 +70,7 @@ class PlatePress:
 
 
 def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, list[PlatePress]]:
-    """Parse ``[tip=left] depth=4mm [tilt=10deg] …, …`` and return the presses by finger.
+    """Parse ``[tip=left] depth=4mm [tilt=10deg] …, …`` and return each finger's presses.
 
     Each press has either a depth (0 lifts off), a force or a pressure (uniform, like a bladder).
     The optional words are tilt, speed, hold and tip. The tip is left, right or both (default). If

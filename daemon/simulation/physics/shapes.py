@@ -113,8 +113,8 @@ def wedge(simulation: SimulationSettings) -> Shape:
     if 2.0 * abs(leaning) >= width:
         raise ValueError(
             f"simulation.object_width: found {width:g} m, expected more than "
-            f"{2.0 * abs(leaning):.3g} m; otherwise the faces of a wedge with this object_taper "
-            "and object_height meet"
+            f"{2.0 * abs(leaning):.3g} m: with this object_taper and object_height, the faces "
+            "of a narrower wedge would meet"
         )
     return polygon(_trapezoid(simulation, leaning))
 

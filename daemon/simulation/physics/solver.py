@@ -151,7 +151,7 @@ def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def add_extra_shears(plant: Plant, k: Motion, g: float) -> None:
-    """Add g row·k, the effect of the solved velocities, to the extra shears in ``k``."""
+    """Add the effect of the solved velocities to the extra shears in ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.shear > 0 and extra.stiffness != 0.0:

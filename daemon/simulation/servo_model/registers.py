@@ -137,7 +137,7 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
 
 
 class ControlTable:
-    """Register memory that can be accessed by single register or by address range.
+    """Memory of registers that can be accessed one by one or by address range.
 
     Addresses between registers read as 0. The servo may write directly to ``memory``.
     """

@@ -31,7 +31,7 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
 )
 
 REBOOT_TIME = 0.34  # time without a reply during a reboot [s]
-JUMP_COUNTS = 130  # jump of the encoder zero, in counts (0.2 rad at the shaft)
+JUMP_COUNTS = 130  # jump in the encoder zero, in counts (0.2 rad at the shaft)
 FAR_GOAL = 0.05  # distance from the torque-on angle above which a goal counts as far [rad]
 _WATCHED_REGISTERS = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 _TUNING_REGISTERS = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
