@@ -77,8 +77,16 @@ class Browser:
         self.ask("Emulation.setDeviceMetricsOverride", **size)
 
     def evaluate(self, script: str) -> Any:
-        """Return the value of a JavaScript expression in the page."""
-        answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True)
+        """Return the value of a JavaScript expression in the page.
+
+        Returns None if the page is reloaded before the browser has evaluated the expression.
+        """
+        try:
+            answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True)
+        except RuntimeError as error:
+            if "Inspected target navigated" in str(error):
+                return None
+            raise
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{script}: {answer['result'].get('description')}")
         return answer["result"].get("value")

@@ -207,7 +207,7 @@ def test_servos_at_another_rate_are_found(hands, capsys):
     ]
     path = str(hand.folder / "servos")
     assert main(["scan", path, "--baud", "57600", "--wait", "0.5"]) == 1
-    assert "no servo replies" in capsys.readouterr().out
+    assert "no servo replied at any of these baud rates" in capsys.readouterr().out
     assert main(["scan", "/dev/does-not-exist"]) == 1
     assert "port not found" in capsys.readouterr().err
 
