@@ -33,7 +33,8 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-_SOURCES = tuple(Path(__file__).parents[1] / name for name in ("daemon", "kinematics", "tools"))
+# In a checkout, the last three folders are links, which a search of the first one does not follow.
+_SOURCES = tuple(Path(__file__).parents[1] / n for n in ("", "daemon", "kinematics", "tools"))
 _CONNECT_TIMEOUT = 10.0  # time limit for connecting to the scheduler [s]
 _REDRAW_INTERVAL = 0.1  # time between two updates of a progress bar [s]
 _BAR_WIDTH = 20  # columns

@@ -137,9 +137,9 @@ class View:
 
     def update(self, state: State) -> None:
         """Store the parts of this tick's state that later checks need for comparison."""
-        # Readings taken while torque is off are not compared. The clock of an emulated hand does
-        # not wait for the daemon while torque is off. The joints may therefore move further than
-        # expected in the time between two readings.
+        # A jump is a fault only while torque is on. Readings without torque are not compared,
+        # because the clock of an emulated hand does not wait for the daemon then, and its joints
+        # may move further than the time between two readings allows.
         if self._torque:
             self.motion.update(state.t, state.reading)
         else:

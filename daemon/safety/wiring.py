@@ -1,4 +1,4 @@
-"""Detect swapped servo IDs, with which each finger receives the other finger's commands.
+"""Detect swapped servo IDs, which send each finger's commands to the other finger.
 
 Joint angles and currents remain consistent, because each servo reports its own values. Only the
 tactile sensors show the error. A tip tilts by about the angle through which its finger rotates, so

@@ -64,10 +64,12 @@ def test_the_workers_exit_if_the_sweep_is_killed(tmp_path):
     context = multiprocessing.get_context("spawn")
     process = context.Process(target=_hang, args=(tmp_path,))
     process.start()
-    until(lambda: len(list(tmp_path.iterdir())) == 2)
-    workers = [psutil.Process(int(each.name)) for each in tmp_path.iterdir()]
-    process.kill()
-    process.join()
+    try:
+        until(lambda: len(list(tmp_path.iterdir())) == 2)
+        workers = [psutil.Process(int(each.name)) for each in tmp_path.iterdir()]
+    finally:
+        process.kill()
+        process.join()
     _, alive = psutil.wait_procs(workers, timeout=150.0)
     assert not alive
 
