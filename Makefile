@@ -2,10 +2,10 @@
 # make test: run the first test tier on all processors.  make test-extended: run the second tier (tests marked
 # `extended`).  make test-all: run both tiers.  ARGS selects tests (ARGS=tests/unit) or adds pytest options (ARGS=-n0
 # uses one process). Test files named in ARGS run with their extended tests.
-# make test-arithmetic: run the numerical tests again with different floating-point arithmetic.
 # make lowest: run the tests of servos, settings and messages with the oldest packages that pyproject.toml allows.
 # make docs: build the documentation site in build/site.
-# make newest: run a fast subset of the tests with the newest Python on this machine.
+# make newest: run the numerical tests and a fast subset of the others with the newest Python on this machine and with
+# different floating-point arithmetic.
 # make release VERSION=1.2.3: set version and changelog, run all checks, build the packages, and print the publishing
 # commands.
 # Each target installs only its own requirements into .venv. PYTHON=python3.13 selects an interpreter (3.11 or later) with
@@ -31,6 +31,7 @@ PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
 COMPILE = $(BIN)/softfinger compile --all && $(BIN)/softfinger compile --all --config solid
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 NEWEST_PIP := build/newest/bin/python $(PIP_INSTALL) --quiet $(CONSTRAINTS)
+NEWEST := build/newest/bin/python -m tests.harness.arithmetic # different floating-point arithmetic
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
 NEWEST_TESTS := tests/unit/test_stream.py tests/process/test_client.py
@@ -50,7 +51,7 @@ TO_RELEASE := $(VENV)/.ready-release
 # Always write bytecode files, because a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test test-extended test-all test-arithmetic warm docs lowest newest lint format release clean
+.PHONY: run test test-extended test-all warm docs lowest newest lint format release clean
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
@@ -66,12 +67,6 @@ test-extended: $(TO_TEST)
 
 test-all:
 	@$(MAKE) test ARGS='-m "extended or not extended" $(ARGS)'
-
-test-arithmetic: $(TO_TEST)
-	@$(BIN)/python -m tests.harness.arithmetic softfinger compile --all
-	@$(BIN)/python -m tests.harness.arithmetic softfinger compile --all --config solid
-	$(BIN)/python -m tests.harness.arithmetic pytest --numprocesses $$(nproc) --dist worksteal \
-		-m 'not extended' $(NUMERICAL_TESTS) $(ARGS)
 
 # Compile the bytecode in advance, so that the test processes do not all compile the same modules.
 warm: $(TO_TEST)
@@ -92,9 +87,11 @@ lowest:
 
 newest:
 	"$$($(PYTHON) -m tests.harness.newest_python)" -m venv --clear build/newest
-	$(NEWEST_PIP) --editable . pytest pytest-timeout hypothesis
-	build/newest/bin/softfinger compile
-	build/newest/bin/python -m pytest $(SERVO_TESTS) $(LOWEST_TESTS) $(NEWEST_TESTS)
+	$(NEWEST_PIP) --editable '.[plot,record]' scipy pytest pytest-timeout pytest-xdist hypothesis
+	@$(NEWEST) softfinger compile --all
+	@$(NEWEST) softfinger compile --all --config solid
+	$(NEWEST) pytest --numprocesses $$(nproc) --dist worksteal -m 'not extended' \
+		$(SERVO_TESTS) $(LOWEST_TESTS) $(NEWEST_TESTS) $(NUMERICAL_TESTS) $(ARGS)
 
 lint: $(TO_TEST)
 	$(BIN)/ruff check .

@@ -26,17 +26,16 @@ REFUSED = "left:shift-x=3"  # fault after which the hand releases the object
 
 
 @contextlib.contextmanager
-def running(hand: Sequence[str] = (), daemon: Sequence[str] = ()) -> Iterator[Rig]:
+def running(hand: Sequence[str] = ()) -> Iterator[Rig]:
     """Yield an emulated hand and its daemon on a shared clock that tolerates a busy machine.
 
-    ``hand`` and ``daemon`` are additional settings.
+    ``hand`` contains additional settings of the hand.
     """
     with Rig() as made:
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")
         made.config.write_text(text, encoding="utf-8")
         made.hand_words = tuple(word for each in hand for word in ("--set", each))
-        told = ("servos.fault_after=1.0", *daemon)  # Times are measured on the hand's clock.
-        made.start(*(word for each in told for word in ("--set", each)))
+        made.start("--set", "servos.fault_after=1.0")  # Times are measured on the hand's clock.
         yield made
 
 
@@ -123,35 +122,18 @@ def test_a_sensor_fault_has_a_bounded_effect_and_is_the_only_one_reported(rig, l
     assert last == pytest.approx(FORCE, rel=0.2)
 
 
-@pytest.mark.parametrize(
-    ("hand", "daemon", "words", "seconds", "least", "says"),
-    [
-        (["simulation.joint_friction=0.12"], [], "", 4.0, 0.8, False),
-        (["simulation.tactile_delay=0.025"], ["tactile.latency=0.02"], "", 4.0, 0.8, False),
-        ([], [], "left:drift=-0.05@0..20 right:drift=-0.05@0..20", 22.0, 0.7, True),
-        (
-            [],
-            [],
-            "gain=0.5@0..5 left:current=0.5@0..5 right:current=0.5@0..5",
-            7.0,
-            0.8,
-            True,
-        ),
-    ],
-    ids=["friction", "latency", "zeros sink", "gains and currents"],
-)
-def test_a_hand_that_differs_from_its_settings_does_not_grip_too_hard(
-    hand, daemon, words, seconds, least, says
-):
-    with running(hand, daemon) as rig:
+def test_an_unexpectedly_high_joint_friction_does_not_change_the_force():
+    """The hand has more than twice the joint friction that the daemon is configured with.
+
+    Other differences are tested in virtual time (`tests.unit.test_robustness`).
+    """
+    with running(hand=["simulation.joint_friction=0.12"]) as rig:
         gripped(rig)
-        if words:
-            rig.send(words)
-        reports = list(watched(rig, seconds))
+        reports = list(watched(rig))
         means = [fmean(report["force"]) / FORCE for report in reports]
         assert max(means) < 1.3
         assert mode(rig) == "holding", rig.log()[-5:]
         end = reports[-1]["t"] - SETTLED
         last = [m for m, report in zip(means, reports, strict=True) if report["t"] > end]
-        assert least < fmean(last) < 1.2
-        assert any("consistency." in line for line in rig.log()) == says
+        assert fmean(last) == pytest.approx(1.0, abs=0.2)
+        assert not any("consistency." in line for line in rig.log())

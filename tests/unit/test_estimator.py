@@ -32,7 +32,7 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
     # a noise of 0.2 % of the modulus.
     rng = np.random.default_rng(7)
     noise = 0.002 * material.reference_modulus
-    for _ in range(60):
+    for _ in range(30):
         grid = SensorGrid(44, 44, PITCH, centre=tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
         d = 10 ** rng.uniform(math.log10(5e-4), math.log10(8e-3))
         truth = (d, *tilts(rng.uniform(0.0, math.radians(30)), rng.uniform(0, 7)), 1.0)
@@ -56,7 +56,7 @@ def test_the_bias_is_small_where_the_footprint_nearly_reaches_the_rim(d, degrees
     # rim.
     rng = np.random.default_rng(1)
     noise = 0.002 * E
-    for _ in range(25):
+    for _ in range(12):
         grid = SensorGrid(44, 44, PITCH, centre=tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
         truth = (d, *tilts(math.radians(degrees), rng.uniform(0, 7)), 1.0)
         sigma = np.sqrt(np.diag(fisher(grid, LINEAR, truth, noise, free_gain)))
@@ -274,7 +274,7 @@ def test_counts_clipped_at_zero_cause_no_bias(free_gain):
 def test_a_light_touch_is_detected_and_noise_is_not():
     rng = np.random.default_rng(8)
     missed = 0
-    for k in range(3000):
+    for k in range(1500):
         if k % 30 == 0:
             grid = SensorGrid(44, 44, PITCH, centre=tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
             estimator = ContactEstimator(TIP, LINEAR, grid, NOISE)
@@ -285,7 +285,7 @@ def test_a_light_touch_is_detected_and_noise_is_not():
     estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
     alarms = 0
     buffer = np.empty(GRID.shape)
-    for _ in range(20_000):
+    for _ in range(8_000):
         rng.standard_normal(out=buffer)
         buffer *= NOISE
         e = estimator.update(buffer)

@@ -28,7 +28,7 @@ def holding(soak: Soak) -> Soak:
 
 @pytest.mark.parametrize(
     ("sequences", "unjudged"),
-    [(2, 10), pytest.param(12, 5, marks=pytest.mark.extended)],
+    [(2, 10), pytest.param(6, 7, marks=pytest.mark.extended)],
 )
 def test_sequences_hold_without_violations(sequences, unjudged):
     account = Account()
