@@ -19,7 +19,10 @@ _STANDING_MAX = 0.02  # maximum motion of the stationary joint [rad]
 _CLOSING_MIN = 0.05  # minimum difference between the two joints' closing motions [rad]
 _TILT_SIGMA = 2.0  # number of tilt standard deviations added to the tilt threshold
 _FORCE_RISE_MIN = 1.0  # minimum tip force increase [N]
-_SETTLING_TIME = 0.07  # settling time after a touch [s], including frame latency and stopping time
+# Settling time after a touch [s]. While late frames show the closing motion before the touch, the
+# joint has already stopped. Frames may be 0.1 s old (`safety.frame_age_fault`), and the joint stops
+# within 0.05 s.
+_SETTLING_TIME = 0.15
 _WRONG_ROTATION = math.radians(4.0)  # minimum rotation opposite to the command [rad]
 _TILT_SIGNS = (1.0, -1.0)  # sign of the tip tilt while the finger closes
 

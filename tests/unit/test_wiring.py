@@ -154,6 +154,15 @@ def test_correctly_wired_servos_grasp_and_turn(make, off, object_):
     assert not [kind for _, kind, _ in events if kind.startswith("joint.")]
 
 
+@pytest.mark.parametrize("off", OFF)
+def test_late_frames_are_not_mistaken_for_swapped_servos(make, off):
+    """Frames are 90 ms old, so the force still rises after the joint has stopped."""
+    daemon = make("right", object_position=(off, 0.08), tactile_delay=0.09, **HEAVY)
+    command(daemon, "grasp", force=6.0)
+    greatest_force(daemon, 3.0)
+    assert daemon.loop.state.fault == ""
+
+
 def texts(events: list[tuple[str, str, str]], kind: str) -> list[str]:
     return [text for _, found, text in events if found == kind]
 
