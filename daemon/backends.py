@@ -1,14 +1,14 @@
 """Look up servo, tactile and shape backends by name, and import them on demand.
 
-Built-in backends are listed in `BUILT_IN`. Plugins are entry points of installed packages, in the
-groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. Servo and tactile
+Built-in backends are listed in `BUILT_IN`. A plugin is an entry point of an installed package in
+the ``softfinger.servos``, ``softfinger.tactile`` or ``softfinger.shapes`` group. Servo and tactile
 plugins are classes, and shape plugins are functions. Plugins take the same arguments as the
 built-in backends. A plugin may define these attributes:
 
 - ``metal``: True (default) if the backend drives real hardware.
 - ``hand``: True if the plugin needs the simulated hand. The daemon then passes the simulated hand
-  to the plugin in the same way as to a built-in backend. Instead of True, a servo plugin may
-  specify a class that replaces `SimulatedHand` and takes the same arguments.
+  to the plugin, as it does to a built-in backend. Instead of True, a servo plugin may specify a
+  class that replaces `SimulatedHand` and takes the same arguments.
 - ``Settings``: a pydantic model for the profile table ``[plugins.NAME]``, preferably derived from
   `profile.fields.Section`. The daemon passes the validated settings as the last argument.
 """
@@ -35,7 +35,7 @@ class Backend(NamedTuple):
 
     load: Callable[[], Any]
     metal: bool = True  # True for real hardware
-    hand: Any = False  # True if a simulated hand is needed; a servo backend may set its class
+    hand: Any = False  # True if a simulated hand is needed; may also be the hand's class
     name: str = ""  # plugin name, or empty for a built-in backend
     source: str = ""  # plugin name, package and version for messages
     section: type[BaseModel] | None = None  # plugin's settings model
@@ -104,7 +104,7 @@ def plugins(kind: Kind) -> list[EntryPoint]:
 
 
 def source(entry: EntryPoint) -> str:
-    """Return a plugin's name and the name and version of its package."""
+    """Return the plugin's name, followed by the name and the version of its package."""
     package = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "no package"
     return f"plugin {entry.name} from {package}"
 

@@ -1,4 +1,4 @@
-"""Provide the pipeline's clocks: real, simulated and virtual time.
+"""Provide the pipeline's clocks for real, simulated and virtual time.
 
 The pipeline reads the time only from its clock, never directly from the system.
 """
@@ -17,7 +17,7 @@ from softfinger.daemon.types import FINGERS
 
 
 class Clock(Protocol):
-    """The pipeline's time source, in seconds."""
+    """Time source of the pipeline; all times are in seconds."""
 
     pauses_when_late: bool  # True if the hand's clock pauses while this machine is late
 
@@ -40,7 +40,7 @@ class LoopClock(Clock, Protocol):
     behind: float  # total time by which `now` lags behind the machine's clock [s]
 
     def host(self) -> float:
-        """Return the machine's monotonic time [s], used to measure computing time and delay."""
+        """Return the machine's monotonic time [s] for measuring computing times and delays."""
 
 
 def make_clock(settings: Settings) -> LoopClock:
@@ -70,8 +70,8 @@ def emulated(settings: Settings) -> bool:
 class Deadline:
     """Start time [s] of the daemon's next tick; an emulated hand must not advance past this time.
 
-    The time is measured by the daemon's clock. The deadline is stored in a file in the emulator's
-    port folder. The daemon and the emulator map this file into memory.
+    The time is measured by the daemon's clock. The time is stored in a file in the emulator's port
+    folder, and both processes map the file into memory.
     """
 
     NAME = ".deadline"
@@ -106,8 +106,9 @@ class Deadline:
 class RealClock:
     """The machine's monotonic clock.
 
-    Each sleep ends with a busy wait of ``spin`` s, which hides the system's wake-up latency of tens
-    of microseconds. During the busy wait, the processor is not available to other threads.
+    Each sleep ends with a busy wait of ``spin`` [s]. The busy wait hides the wake-up latency of the
+    system, which is tens of microseconds. During the busy wait, the processor is not available to
+    other threads.
     """
 
     now = staticmethod(time.monotonic)
@@ -134,9 +135,9 @@ class HandClock:
     """Clock of a simulated or emulated hand; the clock pauses while the machine is late.
 
     The clock's time changes only during a sleep. After a sleep, the time equals the sleep's
-    deadline, even if the machine woke up late. The clock makes up for any delay that is shorter
-    than the time to the next deadline. If the delay is longer, the excess is added to ``behind``
-    and does not affect the hand's time. An emulated hand must not advance past ``due``.
+    deadline, even if the machine woke up late. If a delay is shorter than the time to the next
+    deadline, the clock catches up. If the delay is longer, the excess is added to ``behind`` and
+    does not affect the hand's time. An emulated hand must not advance past ``due``.
     """
 
     pauses_when_late = True
@@ -160,7 +161,7 @@ class HandClock:
         return self._machine.host()
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until the hand's time is ``t``; if late, add the delay to ``behind``."""
+        """Sleep until the hand's time is ``t``; add any delay of the machine to ``behind``."""
         self._now = max(t, self._now)
         if self._due is not None:
             self._due.t = self._now

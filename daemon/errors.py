@@ -1,7 +1,7 @@
-"""Define the exceptions that several packages use. All are derived from `SoftfingerError`.
+"""Define the exceptions that several packages use.
 
-An exception used by a single package is defined in that package and has the same base class. This
-module does not import Numba or ZeroMQ.
+All exceptions are derived from `SoftfingerError`. An exception used by a single package is defined
+in that package and has the same base class. This module does not import Numba or ZeroMQ.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class RecordingError(SoftfingerError):
 
 
 class Reason(StrEnum):
-    """Machine-readable reason for rejecting a command; the ``reason`` field of the reply."""
+    """Machine-readable reason for a refusal, sent in the ``reason`` field of the reply."""
 
     LATE = "late"
     STOPPED = "stopped"
@@ -105,7 +105,7 @@ class Reason(StrEnum):
 
     @property
     def meaning(self) -> str:
-        """Explanation of the reason, which is shown in the documentation."""
+        """Explanation of the reason, shown in the documentation."""
         return _MEANINGS[self]
 
 
@@ -150,7 +150,7 @@ class NoStream(SoftfingerError):
 
 
 class NotInTime(SoftfingerError, TimeoutError):
-    """The condition was not met before the timeout. The error text contains the last state."""
+    """No state met the condition before the timeout. The error text contains the last state."""
 
 
 class HandClosed(SoftfingerError):

@@ -2,7 +2,7 @@
 
 A path given by a user or in another file may refer to a device, a pipe without a writer, or a file
 that does not fit in memory. In a shared folder such as /tmp, another user may have placed a file or
-a link at the output path. Writing through the link would overwrite its target.
+a link at the output path. Writing through such a link would overwrite its target.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from softfinger.kinematics.compiled.own_folder import (
     user_cache,
 )
 
-SIZE_MAX = 16 << 20  # maximum size of a file read at once, or of an unpacked part [bytes]
+SIZE_MAX = 16 << 20  # maximum size of a file that is read at once or of an unpacked part [bytes]
 
 _WORLD_WRITABLE = stat.S_IWOTH
 
@@ -31,7 +31,7 @@ def open_regular(path: Path) -> BinaryIO:
 
     Raises OSError on failure or if the path is a device or a pipe.
     """
-    mode = path.stat().st_mode  # Check the type first, because opening a device can affect it.
+    mode = path.stat().st_mode  # Check the type first; opening a device may have side effects.
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, "found a device or a pipe, expected a regular file", str(path))
     no_wait = getattr(os, "O_NONBLOCK", 0)
@@ -48,7 +48,7 @@ def read_file(path: Path, most: int = SIZE_MAX) -> bytes:
 
 
 def unpacked_size_max(file: BinaryIO) -> int:
-    """Return the maximum unpacked size of a file: 32 times its size on disk, but at least 8 MiB.
+    """Return the maximum unpacked size: 32 times the file's size on disk, but at least 8 MiB.
 
     Compression reduces recordings to between a third and a tenth of their size. Holes in a sparse
     file do not count towards its size.

@@ -14,7 +14,7 @@ def port_group_remedy(path: str) -> str:
 
 
 def serial_group() -> str:
-    """Return the owning group of serial ports: ``dialout`` or, if it does not exist, ``uucp``."""
+    """Return the group of serial ports: ``dialout``, or ``uucp`` if only ``uucp`` exists."""
     import grp  # Some client systems lack this module.
 
     groups = {each.gr_name for each in grp.getgrall()}
@@ -22,7 +22,7 @@ def serial_group() -> str:
 
 
 def grant(path: str) -> str:
-    """Return the command that gives this user access, usually by group membership."""
+    """Return the command that gives this user access to the port."""
     import grp  # Some client systems lack this module.
 
     try:

@@ -1,9 +1,9 @@
 """Define the plain records that the pipeline stages exchange.
 
 Per-finger lists have length 2, left finger first. For a finger that is not in the scene, the values
-stay 0 and ``valid`` is False. Values are plain floats because each tick accesses single values. All
-quantities are in SI units. A positive joint angle closes the finger. ``t`` is the clock time in
-seconds.
+stay 0 and ``valid`` is False. Values are plain floats because each tick accesses the values one at
+a time. All quantities are in SI units. A positive joint angle closes the finger. ``t`` is the clock
+time in seconds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _pair() -> list[float]:
 
 @dataclass(slots=True)
 class Reading:
-    """Latest joint measurements. ``Servos.read`` updates them in place."""
+    """Latest joint measurements, which ``Servos.read`` updates in place."""
 
     seq: int = 0
     t: float = -math.inf  # time of the last valid reading [s]
@@ -54,7 +54,7 @@ class Frame:
     """One tactile frame. The sensor does not modify ``data`` after delivery."""
 
     seq: int
-    t_sample: float  # estimated mid-scan time of the board [s]
+    t_sample: float  # estimated time at the middle of the board's scan [s]
     t_arrival: float  # time when the complete frame was received [s]
     valid: bool
     data: NDArray[np.uint16]  # counts [rows, cols]
@@ -62,7 +62,7 @@ class Frame:
 
 @dataclass(slots=True)
 class Contact:
-    """Contact of one fingertip: the newest frame estimate, extrapolated with later joint angles."""
+    """Contact of one fingertip in the newest frame, extrapolated with later joint angles."""
 
     seq: int = 0  # sequence number of the frame
     t: float = 0.0  # sample time of the frame [s]
@@ -80,7 +80,7 @@ class Contact:
     modulus_scale_std: float = 0.0
     sensor_gain: float = 1.0  # `gain` equals modulus_scale · sensor_gain
     sensor_gain_std: float = 0.0
-    torque_scale: float = 1.0  # ratio of the torque constant setting to the true value
+    torque_scale: float = 1.0  # torque constant in the settings divided by the true torque constant
     torque_scale_std: float = 0.0
     # Average normalised innovation squared of each sensor channel. A consistent channel has a value
     # of about 1.
@@ -120,28 +120,28 @@ class Goal:
     t: float = 0.0
     valid: bool = False
     q: list[float] = field(default_factory=_pair)  # goal angle [rad]
-    current: list[float] = field(default_factory=_pair)  # limit for the current magnitude [A]
+    current: list[float] = field(default_factory=_pair)  # limit of the absolute motor current [A]
     force: float = math.nan  # target mean tip force [N], NaN without a grip
     angle: float = math.nan  # target object angle [rad], NaN if not set
 
 
 @dataclass(slots=True)
 class ServoHeatEstimate:
-    """Servo temperatures computed by `safety.heat`'s thermal model; 0 while unknown."""
+    """Servo temperatures, computed by the thermal model in `safety.heat`; 0 while unknown."""
 
     winding: float = 0.0  # [°C]
     winding_std: float = 0.0  # standard deviation [°C]
-    case: float = 0.0  # case temperature without the thermometer's quantisation [°C]
+    case: float = 0.0  # case temperature, not quantised like the thermometer reading [°C]
     case_std: float = 0.0
     ambient: float = 0.0  # ambient temperature [°C]
-    time_to_limit: float = 3600.0  # time to `safety.temperature_max` at this current, capped [s]
+    time_to_limit: float = 3600.0  # time until `safety.temperature_max` is reached, at most 1 h [s]
 
 
 @dataclass(slots=True)
 class Timing:
-    """Loop timing [s] on this machine's clock."""
+    """Loop timing [s], measured by this machine's clock."""
 
-    tick_s: float = 0.0  # interval between the starts of the previous tick and this one
+    tick_s: float = 0.0  # interval between the starts of the previous tick and this tick
     compute_s: float = 0.0  # computing time of the previous tick
     wake_late_s: float = 0.0  # delay of this tick's start relative to its deadline
     overruns: int = 0  # number of ticks that took longer than the period
@@ -160,9 +160,9 @@ class State:
     mode: str = "disarmed"
     fault: str = ""
     fault_name: str = ""  # limit name in `safety.limits`
-    torque: bool = False  # True if torque is on, or if the servos have not confirmed torque off
-    torque_off: bool = False  # True if the servos confirmed torque off on this tick
-    read_error: str = ""  # error of this tick's servo bus read
+    torque: bool = False  # True if torque is on, or if the servos have not confirmed that it is off
+    torque_off: bool = False  # True if the servos confirmed on this tick that torque is off
+    read_error: str = ""  # error in reading the servo bus on this tick
     write_error: str = ""
     reading: Reading = field(default_factory=Reading)
     contacts: list[Contact] = field(default_factory=lambda: [Contact(), Contact()])

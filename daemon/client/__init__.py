@@ -12,5 +12,5 @@
         for state in hand.stream():
             ...
 
-`AsyncHand` is the asyncio version. A client needs only the two addresses of the daemon.
+`AsyncHand` is the asyncio version. A client needs only the daemon's two addresses.
 """

@@ -27,7 +27,7 @@ _Record = TypeVar("_Record")
 
 
 class AsyncSubscription(Subscriber[_Record]):
-    """`Subscription` for asyncio: ``async for record in hand.stream(): …``."""
+    """Asyncio version of `Subscription`; use it with ``async for record in hand.stream()``."""
 
     def __aiter__(self) -> AsyncIterator[_Record]:
         return self
@@ -45,7 +45,7 @@ class AsyncSubscription(Subscriber[_Record]):
         raise no_stream(self._address, self._topic, timeout or 0.0)
 
     async def skip(self) -> None:
-        """Drop queued messages, so that `next` returns a new record."""
+        """Drop queued messages so that `next` returns a new record."""
         self._require_open()
         while await self._socket.poll(0):
             self._take(await self._socket.recv_multipart())
@@ -58,7 +58,7 @@ class AsyncSubscription(Subscriber[_Record]):
 
 
 class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
-    """Asyncio version of `client.hand.Hand`: ``async with AsyncHand() as hand: …``.
+    """Asyncio version of `client.hand.Hand`; use it with ``async with AsyncHand() as hand``.
 
     The parameters, methods and exceptions are the same as those of `Hand`.
     """
@@ -85,7 +85,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> AsyncSubscription[TactileFrame]:
-        """Subscribe to both fingers' tactile frames; `TactileFrame.finger` names the finger."""
+        """Subscribe to both fingers' tactile frames; `TactileFrame.finger` is the finger's name."""
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> AsyncSubscription[Event]:
@@ -97,7 +97,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return AsyncSubscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     async def collect(self, seconds: float) -> list[HandState]:
-        """Collect all states for ``seconds`` of the daemon's clock time. Raises NoStream."""
+        """Collect all states for ``seconds``, measured by the daemon's clock. Raises NoStream."""
         async with self.stream(self.timeout) as states:
             collected = [await anext(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)
@@ -125,7 +125,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
                     return state
 
     async def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
-        """Send one command and return the reply. Arguments that are None are omitted.
+        """Send one command and return the reply. Arguments with the value None are not sent.
 
         Raises
         ------
@@ -139,7 +139,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         reply = await asyncio.to_thread(send_once, where, attempts, keys)
         while attempts.again(reply):
             await asyncio.sleep(RETRY_DELAY)
-            if not attempts.remaining():  # The computer was suspended in the meantime.
+            if not attempts.remaining():  # The computer was suspended.
                 break
             reply = await asyncio.to_thread(send_once, where, attempts, keys)
         return accepted(reply)
@@ -152,5 +152,5 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
                 raise
 
     async def status(self) -> dict[str, Any]:
-        """Return the daemon's mode, fault, torque state, and servo and sensor counters."""
+        """Return the mode, the fault, the torque state, and the servo and sensor counters."""
         return await self.command("status")

@@ -1,4 +1,4 @@
-"""Send commands to a daemon through one general function, or through one method per command."""
+"""Send commands to a daemon with the general `send` function or the methods of `HandClient`."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class NoAnswer(SoftfingerError):
 
 
 class Attempts:
-    """Retry policy for one command, within the caller's timeout.
+    """Retry policy for one command.
 
     After a stall, the daemon refuses outdated commands with the reason ``late``. A refused command
     has no effect. All attempts use the same key, so the daemon executes the command at most once.
-    The daemon refuses a repeated attempt if it has received a stop or another command in the
-    meantime.
+    If a stop or another command arrives between two attempts, the daemon refuses the second
+    attempt.
     """
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
@@ -67,14 +67,14 @@ class Attempts:
         return max(self._end - _now(), 0.0)
 
     def again(self, reply: dict[str, Any]) -> bool:
-        """Return True if the command must be sent again `RETRY_DELAY` s later."""
+        """Return True if the command must be sent again after `RETRY_DELAY` [s]."""
         return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * RETRY_DELAY
 
 
 def _now() -> float:
     """Return the monotonic time [s].
 
-    On systems that support it, this time includes time spent in suspend.
+    On Linux, the clock also counts the time during which the computer is suspended.
     """
     return time.clock_gettime(_CLOCK) if _CLOCK is not None else time.monotonic()
 
@@ -85,18 +85,19 @@ def send(
     timeout: float = REPLY_TIMEOUT,
     keys: ClientKeys | None = None,
 ) -> dict[str, Any]:
-    """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
+    """Send one command and return the reply. Raises NoAnswer if no reply arrives in time.
 
-    If the daemon refuses the command as late, the client sends the command again until ``timeout``
-    expires. If the reply takes longer than 1 s, a warning is logged. If no logging handler exists,
-    the warning is printed to standard error. If the daemon runs on this machine as the same user,
-    the client sends ``stop`` over a local socket and thus bypasses other clients' queues.
+    If the daemon refuses the command because it is late, the client sends the command again until
+    ``timeout`` expires. If the reply takes longer than 1 s, a warning is logged. If no logging
+    handler exists, the warning is printed to standard error. If the daemon runs on this machine
+    under the same user account, ``stop`` is sent over a local socket. The local socket bypasses the
+    queues of other clients.
     """
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
     while attempts.again(reply):
         time.sleep(RETRY_DELAY)
-        if not attempts.remaining():  # The computer was suspended in the meantime.
+        if not attempts.remaining():  # The computer was suspended.
             break
         reply = send_once(address, attempts, keys)
     return reply
@@ -141,9 +142,9 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
 
 
 def _number(what: str, value: Any) -> float:
-    """Convert a number, including a NumPy scalar or 0-d array, to a float for msgpack.
+    """Convert a number, a NumPy scalar or a 0-d array to a float that msgpack can encode.
 
-    Raises Refused for values of other types.
+    Raises Refused if the value has any other type.
     """
     if getattr(value, "shape", None) == ():
         value = value.item()
@@ -151,13 +152,13 @@ def _number(what: str, value: Any) -> float:
         if isinstance(value, Real) and not isinstance(value, bool):
             return float(value)
     except OverflowError:
-        pass  # The integer exceeds the float range.
+        pass  # The integer is too large for a float.
     text = f"{what}: expected a number, found {type(value).__name__} {str(value)[:40]!r}"
     raise Refused(text, Reason.REQUEST)
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """Return the reply without ``ok``. Raises Refused with the reason if the reply is a refusal.
+    """Return the reply without ``ok``. Raises Refused if the daemon refused the command.
 
     A warning is logged if the servos have not confirmed that torque is off.
     """
@@ -170,7 +171,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_done(command: str, status: dict[str, Any]) -> bool:
-    """Return True if the status shows that the goal of a refused command is already reached."""
+    """Return True if the hand is already in the state that a refused command would produce."""
     mode = status.get("mode", "fault")
     if command == "arm":
         return mode not in ("disarmed", "fault")
@@ -180,12 +181,12 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 
 
 class HandClient(Generic[_Done]):
-    """Base class that stores the addresses and defines the commands of `Hand` and `AsyncHand`.
+    """Base class of `Hand` and `AsyncHand`; stores the addresses and defines the commands.
 
-    If the daemon refuses a command, the command's method raises Refused with the reason. If the
-    daemon does not reply, the method raises NoAnswer. If the daemon refuses a command as late, the
-    client sends the command again until ``timeout`` expires. ``arm``, ``disarm``, ``clear`` and
-    ``release`` may be repeated: arming an armed hand is not an error.
+    A command method raises Refused if the daemon refuses the command, and NoAnswer if the daemon
+    does not reply. If the daemon refuses a command because it is late, the client sends the command
+    again until ``timeout`` expires. ``arm``, ``disarm``, ``clear`` and ``release`` may be repeated.
+    For example, arming an armed hand is not an error.
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context
@@ -219,7 +220,7 @@ class HandClient(Generic[_Done]):
         return f"{type(self).__name__}: {self.stream_address}, {self.command_address}{ended}"
 
     def close(self) -> None:
-        """Close all sockets, including the sockets of subscriptions. The hand keeps its state."""
+        """Close all sockets and subscriptions. The state of the hand does not change."""
         self._thread.claim()
         self._context.destroy(linger=0)
 
@@ -253,7 +254,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("tare")
 
     def move(self, left: float | None = None, right: float | None = None) -> _Done:
-        """Move one or both joints to angles [rad]."""
+        """Move one or both joints to the given angles [rad]."""
         return self._carry_out("move", left=left, right=right)
 
     def grasp(self, force: float | None = None) -> _Done:
@@ -271,8 +272,8 @@ class HandClient(Generic[_Done]):
         """Send one setpoint; call this method repeatedly, for example at 50 to 100 Hz.
 
         Pass the ``force`` [N] per tip, the object ``angle`` [rad], or both. If the hand is not
-        gripping yet, it grasps first. The angle is limited to the grip's range, and the angular
-        rate to ``control.rotate_speed``.
+        gripping yet, the first setpoint starts a grasp. The angle is limited to the range of this
+        grip. The angular rate is limited to ``control.rotate_speed``.
         """
         return self._carry_out("hold", force=force, angle=angle)
 
@@ -289,5 +290,5 @@ class HandClient(Generic[_Done]):
         return self._carry_out("stop")
 
     def clear(self) -> _Done:
-        """Clear a latched fault whose cause is gone."""
+        """Clear a latched fault after its cause has been removed."""
         return self._carry_out("clear")

@@ -14,16 +14,16 @@ import zmq
 from softfinger.daemon.errors import SettingsError, WrongThread
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
-REPLY_TIMEOUT = 5.0  # default timeout for a reply or a first message [s]
+REPLY_TIMEOUT = 5.0  # default timeout for a reply or the first message [s]
 SILENCE_TIME = 1.0  # waiting time before a warning is logged [s]
 
 _QUEUE_LENGTH = 100_000  # maximum number of messages queued for a slow program
-# Maximum message size [bytes]. A frame from the largest grid takes 131 kB.
+# Maximum message size [bytes]. A frame of the largest grid has 131 kB.
 _MESSAGE_SIZE_MAX = 4_000_000
 
 
 def default_addresses() -> tuple[str, str]:
-    """Return the addresses in SOFTFINGER_ADDRESS, by default those of a daemon on this machine.
+    """Return the addresses in SOFTFINGER_ADDRESS, or the default addresses on this machine.
 
     Raises SettingsError like :func:`both_addresses`.
     """
@@ -37,7 +37,8 @@ def both_addresses(named: str, where: str) -> tuple[str, str]:
     """Parse a string into the stream and command addresses.
 
     The string is either ``tcp://HOST``, which implies the default ports, or both addresses
-    separated by a comma. Raises SettingsError for other strings; the message begins with ``where``.
+    separated by a comma. Raises SettingsError if the string has any other form. The message begins
+    with ``where``.
     """
     addresses = [part.strip() for part in named.split(",")]
     if is_host(named):
@@ -62,11 +63,11 @@ def is_host(named: str) -> bool:
 def require_host(address: str) -> None:
     """Raise SettingsError if this machine cannot resolve the host name of a TCP address.
 
-    ZeroMQ does not report an unknown host; instead, ZeroMQ retries forever.
+    If the host is unknown, ZeroMQ does not report an error but retries forever.
     """
     if not address.startswith("tcp://"):
         return
-    # A source address may precede the host, separated by a semicolon.
+    # The host may be preceded by a source address and a semicolon.
     host = address[6:].rpartition(";")[2].rpartition(":")[0].strip("[]")
     try:
         getaddrinfo(host, None)
@@ -79,11 +80,10 @@ def require_host(address: str) -> None:
 
 
 class OneThread:
-    """Owner of a hand's sockets: the first thread that uses the sockets.
+    """Guard that allows only one thread to use the sockets of a `Hand`.
 
-    The ownership lasts until the thread ends.
-
-    If two threads use one ZeroMQ socket, messages are lost or the process aborts.
+    The first thread that uses the sockets owns them until the thread ends. If two threads use
+    one ZeroMQ socket, messages may be lost or the process may abort.
     """
 
     def __init__(self) -> None:
@@ -91,7 +91,7 @@ class OneThread:
         self._owner: threading.Thread | None = None
 
     def claim(self) -> None:
-        """Make this thread the owner. Raises WrongThread if another thread is the owner."""
+        """Make the current thread the owner. Raises WrongThread if another thread is the owner."""
         thread = threading.current_thread()
         with self._lock:
             if self._owner is None or not self._owner.is_alive():
@@ -137,7 +137,7 @@ def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
 
 
 def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
-    """Return the topic and map of a stream message. Raises ValueError for invalid bytes."""
+    """Unpack a stream message into its topic and map. Raises ValueError for an invalid message."""
     try:
         topic, packed = frames
         message = msgpack.unpackb(packed)
@@ -149,5 +149,5 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
 
 
 def still_waiting(what: str, timeout: float) -> str:
-    """Return the warning text to log while a client waits for data."""
+    """Return the text of the warning to log while a client waits for data."""
     return f"no {what} yet; waiting up to {round(timeout, 2):g} s"

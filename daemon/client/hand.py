@@ -32,7 +32,7 @@ class Subscription(Subscriber[_Record]):
     def next(self, timeout: float | None) -> _Record:
         """Return the next record; raise NoStream if no record arrives within ``timeout`` s.
 
-        If there is a timeout, a warning is logged after 1 s of waiting.
+        If ``timeout`` is a number, a warning is logged after 1 s without a record.
         """
         for milliseconds in self._waits(timeout):
             if self._socket.poll(milliseconds):
@@ -42,7 +42,7 @@ class Subscription(Subscriber[_Record]):
         raise no_stream(self._address, self._topic, timeout or 0.0)
 
     def skip(self) -> None:
-        """Drop queued messages, so that `next` returns a new record."""
+        """Drop queued messages so that `next` returns a new record."""
         self._require_open()
         while self._socket.poll(0):
             self._take(self._socket.recv_multipart())
@@ -57,17 +57,17 @@ class Subscription(Subscriber[_Record]):
 class Hand(HandClient[None]):
     """Client of one hand. Create one `Hand` in each thread.
 
-    Commands may be sent from any thread. The first thread that reads the stream (`state`, `stream`,
-    `frames`, `events`, `collect`, `wait_for`) owns the stream until the thread ends. In other
-    threads, these methods and `close` raise WrongThread. All methods raise HandClosed after
-    `close`.
+    Commands may be sent from any thread. The methods `state`, `stream`, `frames`, `events`,
+    `collect` and `wait_for` read the stream. The first thread that calls one of these methods owns
+    the stream until the thread ends. In other threads, these methods and `close` raise WrongThread.
+    All methods raise HandClosed after `close`.
 
     Parameters
     ----------
     stream, commands
         Addresses of the daemon. ``stream`` may also specify both addresses, as ``tcp://HOST`` or
         ``STREAM,COMMANDS``. By default, the addresses are read from the SOFTFINGER_ADDRESS
-        environment variable or, if the variable is not set, refer to this machine.
+        environment variable. If the variable is not set, the addresses refer to this machine.
     client
         Client name for the command lease.
     timeout
@@ -105,7 +105,7 @@ class Hand(HandClient[None]):
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> Subscription[TactileFrame]:
-        """Subscribe to both fingers' tactile frames; `TactileFrame.finger` names the finger."""
+        """Subscribe to both fingers' tactile frames; `TactileFrame.finger` is the finger's name."""
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> Subscription[Event]:
@@ -117,7 +117,7 @@ class Hand(HandClient[None]):
         return Subscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     def collect(self, seconds: float) -> list[HandState]:
-        """Collect all states for ``seconds`` of the daemon's clock time. Raises NoStream."""
+        """Collect all states for ``seconds``, measured by the daemon's clock. Raises NoStream."""
         with self.stream(self.timeout) as states:
             collected = [next(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)
@@ -137,7 +137,7 @@ class Hand(HandClient[None]):
         NotInTime
             If no state satisfies the condition within ``timeout`` [s].
         HandFault
-            If the hand is in a fault and its state does not satisfy the condition.
+            If the hand has a latched fault and its state does not satisfy the condition.
         NoStream
             If no state arrives.
         """
@@ -152,7 +152,7 @@ class Hand(HandClient[None]):
                     return state
 
     def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
-        """Send one command and return the reply. Arguments that are None are omitted.
+        """Send one command and return the reply. Arguments with the value None are not sent.
 
         Raises
         ------
@@ -174,5 +174,5 @@ class Hand(HandClient[None]):
                 raise
 
     def status(self) -> dict[str, Any]:
-        """Return the daemon's mode, fault, torque state, and servo and sensor counters."""
+        """Return the mode, the fault, the torque state, and the servo and sensor counters."""
         return self.command("status")

@@ -1,7 +1,7 @@
 """Read the stream: decode messages into records, count lost messages, and wait for a state.
 
 Messages are untrusted input. Fields that are missing or have the wrong type become NaN, 0, False or
-empty. Unknown fields are ignored, so a program also works with a daemon that uses a newer schema.
+empty. Unknown fields are ignored, so a program still works if the daemon uses a newer schema.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ __all__ = ["read", "to_columns"]
 
 _Record = TypeVar("_Record")
 
-_STORED_MESSAGE_COUNT = 1000  # number of message numbers stored to detect repeated messages
+_STORED_MESSAGE_COUNT = 1000  # number of stored message numbers, used to detect repetitions
 
 _log = logging.getLogger(__name__)
 
 
 def read(record: type[_Record], message: object) -> _Record:
-    """Convert a message map to the `wire.schema` record of its topic.
+    """Convert a message, given as a map, to a `wire.schema` record.
 
     Raises ValueError if the data size of a tactile frame does not match its grid.
     """
@@ -73,7 +73,8 @@ _CONVERTERS: dict[Any, Callable[[object], Any]] = {
 def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
     """Convert states to one array per field; nested fields have names such as ``left.force``.
 
-    The result can be passed to ``pandas.DataFrame``. Records of other topics are also accepted.
+    The result can be passed to ``pandas.DataFrame``. Records of other topics can be converted in
+    the same way.
     """
     rows = list(states)
     names = [field.name for field in fields_of(type(rows[0]) if rows else HandState)]
@@ -81,12 +82,12 @@ def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
 
 
 class Gaps:
-    """Counter for lost messages of one topic.
+    """Counter of the lost messages of one topic.
 
     A message is identified by its ``number``. A message without ``number`` is identified by ``seq``
-    divided by ``seq_step``. A decreasing number does not count as a loss: it means that the daemon
-    has restarted or that a second daemon is running. A repeated message (``again``) fills a gap if
-    its first copy was lost.
+    divided by ``seq_step``. If the number decreases, no loss is counted, because the daemon has
+    restarted or a second daemon is running. If the first copy of a message was lost, a repeated
+    copy (``again``) fills the gap.
     """
 
     def __init__(self) -> None:
@@ -131,7 +132,7 @@ def no_stream(address: str, topic: bytes, timeout: float) -> NoStream:
 class Subscriber(Generic[_Record]):
     """Socket and decoder for one topic; base class of `Subscription` and `AsyncSubscription`.
 
-    ``unreadable`` is the number of messages that were skipped because they could not be decoded.
+    ``unreadable`` counts the messages that were skipped because they could not be decoded.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class Subscriber(Generic[_Record]):
             raise HandClosed("this subscription is closed: create a new one")
 
     def _take(self, frames: list[bytes]) -> _Record | None:
-        """Decode a message; return None if it is unreadable or a repetition."""
+        """Decode a message; return None if the message is unreadable or repeated."""
         try:
             _, message = unpack(frames)
             record = read(self._record, message)
@@ -193,9 +194,9 @@ class Subscriber(Generic[_Record]):
         return record
 
     def _waits(self, timeout: float | None) -> Iterator[int | None]:
-        """Yield the durations [ms] of successive waits until ``timeout`` [s] has expired.
+        """Yield the duration [ms] of each wait until ``timeout`` [s] has expired.
 
-        If there is a timeout, log a warning after 1 s of waiting.
+        If ``timeout`` is a number, log a warning after 1 s.
         """
         if timeout is None:
             while True:
@@ -215,7 +216,7 @@ class Subscriber(Generic[_Record]):
 
 
 class Wait:
-    """Wait for a state that satisfies ``condition``, for at most ``timeout`` s."""
+    """Wait up to ``timeout`` [s] for a state that satisfies ``condition``."""
 
     def __init__(
         self,
@@ -242,7 +243,7 @@ class Wait:
     def ends_with(self, state: HandState) -> bool:
         """Return True if the condition is met.
 
-        Raises HandFault if the condition is not met and the hand is in a fault.
+        Raises HandFault if the condition is not met and the hand has a latched fault.
         """
         self._last = state
         if self._condition(state):

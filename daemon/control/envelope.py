@@ -1,8 +1,8 @@
-"""Look up which objects the hand can hold in simulation, by shape, size, friction and mass.
+"""Look up whether the simulated hand can hold an object of given size, friction and mass.
 
-`softfinger envelope --keep` creates a map of the objects that the hand can hold, and `grasp` uses
-the map for warnings. A map is valid only for the hand that was simulated; the packaged map is valid
-for the built-in hand.
+`softfinger envelope --keep` creates a map of the objects that the hand can hold. The `grasp`
+command uses the map for warnings. A map is valid only for the hand that was simulated; the packaged
+map is valid for the built-in hand.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def identity(settings: Settings) -> dict[str, Any]:
 
 
 def increased_force_limit(settings: Settings, force: float) -> float:
-    """Return the maximum grip force [N] after slip for a commanded ``force`` [N]."""
+    """Return the maximum grip force [N] after slip, given the commanded ``force`` [N]."""
     control, force_max = settings.control, GRIP_FRACTION * settings.safety.force_max
     increase = min(control.grip_raise_max, control.grip_raise_share * force)
     return max(min(force + increase, force_max), force)
@@ -45,7 +45,7 @@ def increased_force_limit(settings: Settings, force: float) -> float:
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
     """Describe the first setting that differs between map and hand; return "" if none differs.
 
-    If an older map does not contain a setting, the setting's default is used.
+    If an old map lacks a setting, the default of the setting is used.
     """
     defaults = identity(Settings())
     for name, section in expected.items():
@@ -56,12 +56,13 @@ def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
 
 
 class Envelope:
-    """Map of graspable objects for one hand, evaluated for the object in the settings."""
+    """Map of simulated grasps, reduced to the object in the settings."""
 
     def __init__(self, settings: Settings) -> None:
         """Read the map named in the settings.
 
-        By default, use the packaged map if it fits this hand.
+        If the settings do not name a map, read the packaged map. The packaged map is used only if
+        it is valid for this hand.
 
         Raises
         ------
@@ -95,9 +96,10 @@ class Envelope:
     def warning(self, force: float) -> str:
         """Return a warning if a grasp with ``force`` [N] may fail; otherwise, return "".
 
-        The lookup uses the nearest object size, the highest friction not above
-        `control.tip_friction`, and the mass whose weight is `control.object_load`. The mass is
-        scaled by the ratio of the map's force limit to this grip's force limit.
+        The lookup uses the object size that is nearest to `object.width`. The friction coefficient
+        is the highest one that does not exceed `control.tip_friction`. The mass is calculated from
+        `control.object_load` and then multiplied by the ratio of the map's force limit to the force
+        limit of this grip.
         """
         if not self._is_valid:
             return ""

@@ -1,4 +1,4 @@
-"""Access the fingers' contacts and set their joint goals for the control state machine."""
+"""Give the control state machine access to the fingers' contacts and joint goals."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from softfinger.daemon.types import FINGERS, Goal, State
 
 # Distance from the current angle to the goal angle of a torque-controlled joint [rad]. The distance
 # must be at least 0.25 rad, so that the current limit determines the torque (see `hand_estimator`).
-# The distance is smaller than `safety.goal_reach` so that the goal may jump from one side of the
-# joint to the other.
+# The distance is smaller than `safety.goal_reach`, so the goal may jump from one side of the joint
+# angle to the other.
 _GOAL_OFFSET = 0.35
 # Margin between the maximum tilt during a rotation and the tilt that triggers a fault [rad].
 _TILT_RESERVE = 0.1
@@ -27,7 +27,7 @@ def range_text(angle: float, low: float, high: float) -> str:
 
 
 class Fingers:
-    """The fingers in the scene, with their contacts and joint setpoints."""
+    """Fingers in the scene, with their contacts and joint setpoints."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
         """Create the fingers; ``state`` and ``grasp`` are read on each tick but never written."""
@@ -52,9 +52,9 @@ class Fingers:
     def turning_range(self) -> tuple[float, float]:
         """Return the minimum and maximum angle [rad] to which this grip can rotate the object.
 
-        When the object rotates by φ, each joint moves by ψ, which is φ divided by the sum of both
-        rotation Jacobians. The tilt of each tip then changes by φ + ψ. The joint and tilt limits
-        determine the range.
+        When the object rotates by φ, each joint moves by ψ. The angle ψ is φ divided by the sum of
+        the two rotation Jacobians. The tilt of each tip then changes by φ + ψ. The joint and tilt
+        limits determine the range.
         """
         settings, present_angle = self._settings, self.pose.angle
         rotation = self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1]
@@ -81,19 +81,19 @@ class Fingers:
     # Setpoints
 
     def hold_here(self) -> None:
-        """Set all setpoints to the current joint angles with zero speed."""
+        """Set all setpoints to the current joint angles and their speeds to zero."""
         for index, q in enumerate(self.reading.q):
             self._setpoints[index].reset(q)
 
     def set_target(self, index: int, q: float) -> None:
-        """Set the setpoint target of one joint to ``q`` [rad]."""
+        """Set the target of one joint's setpoint to ``q`` [rad]."""
         self._setpoints[index].target = q
 
     def close_fingers(self, touching: set[int]) -> set[int]:
         """Close the fingers that are not in contact; return the fingers in contact.
 
-        ``touching`` is the set that this function returned on the previous tick. A finger that is
-        in contact but not in ``touching`` stops at its current angle.
+        ``touching`` is the set that this function returned on the previous tick. A finger that has
+        just come into contact stops at its current angle.
         """
         law, now_touching = self._settings.control, set[int]()
         for index in self.indices:
@@ -113,19 +113,19 @@ class Fingers:
 
     @property
     def distance_max(self) -> float:
-        """Maximum distance between a joint and its setpoint target [rad]."""
+        """Largest difference between a joint angle and the target of its setpoint [rad]."""
         return max(abs(self.reading.q[i] - self._setpoints[i].target) for i in self.indices)
 
     # Goals
 
     def follow_setpoints(self, goal: Goal, current: float) -> None:
-        """Set goals so that the joints follow their setpoints with at most ``current`` [A]."""
+        """Set goals so that the joints follow their setpoints; ``current`` [A] is the limit."""
         for index in self.indices:
             goal.q[index] = self._setpoints[index].value
             goal.current[index] = current
 
     def apply_torques(self, goal: Goal, torques: tuple[float, float]) -> None:
-        """Set goals so that the joints apply ``torques`` [N·m], positive when closing."""
+        """Set goals for joint ``torques`` [N·m]; positive torques close the fingers."""
         for index in self.indices:
             current = torques[index] / self._settings.control.torque_constant
             goal.q[index] = self.reading.q[index] + math.copysign(_GOAL_OFFSET, current)

@@ -1,26 +1,28 @@
-"""Compute joint torques from tip forces and object angle, once both tips are in contact.
+"""Compute the joint torques of a grip from the tip forces and the object angle.
 
-`control.grip_kernels` contains the computations. Two fingers have one motion that changes the grip
-(both close) and another that moves the object (q1 + δ, q2 − δ). Every control law therefore has two
-parts:
+`control.grip_kernels` contains the computations. Two fingers can make two motions. If both fingers
+close, the grip force changes. If one finger closes and the other opens (q1 + δ, q2 − δ), the object
+moves. Every control law therefore has two parts:
 
-1. *grip*: a feed-forward torque (moment arm × target force + joint friction), proportional and
-   integral feedback of the force error, and damping matched to the tip stiffness;
-2. *steering*, the serial two-phased controller from the soft-fingertip literature: the integrated
-   object angle error is added to the joint goals with opposite signs, and a PD controller follows
-   these goals. The object rotates at φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
+1. The *grip* part controls the force. It adds a feed-forward torque (moment arm × target force +
+   joint friction), feedback of the force error (proportional and integral), and damping that is
+   matched to the tip stiffness.
+2. The *steering* part controls the object angle. It is the serial two-phased controller from the
+   soft-fingertip literature. The integral of the angle error is added to the goal of one joint and
+   subtracted from the goal of the other joint. A PD controller makes the joints follow their goals.
+   The object rotates at φ̇ = r1 q̇1 − r2 q̇2 (`GraspState.jacobian_rotation`).
 
-With ``control.law = "energy"``, the moment arms are derivatives of the contact table's energy with
-respect to the joint angles of rolling tips. The moment arms therefore account for the moments and
-shear forces of the tips.
+If ``control.law`` is ``"energy"``, each moment arm is the derivative of the contact table's energy
+with respect to a joint angle. The tips are assumed to roll. The moment arms therefore account for
+the moments and shear forces of the tips.
 
-With ``"upright"``, the control law ignores the object angle until a command steers the object. The
-upright law gives both joints the same torque plus damping, as in the literature on blind grasping.
-A virtual spring between the fingers places the minimum of the tips' elastic energy at the upright
-object pose, regardless of residual shear in the tips (`hand.upright`). Antisymmetric dither of the
-fingers overcomes joint friction until the object has settled in that minimum. Afterwards, the
-control law holds the antisymmetric joint angle. Once a command steers the object, the moment arm is
-the distance from the pivot to the force's line of action.
+If ``control.law`` is ``"upright"``, the control law ignores the object angle until a command steers
+the object. The upright law applies the same torque and the same damping to both joints, as in the
+literature on blind grasping. A virtual spring acts between the fingers (`hand.upright`). The spring
+moves the minimum of the tips' elastic energy to the upright object pose, regardless of residual
+shear in the tips. Antisymmetric dither overcomes the joint friction until the object is upright.
+Afterwards, the control law holds the antisymmetric joint angle. Once a command steers the object,
+the moment arm is the distance from the pivot to the line of action of the force.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from softfinger.daemon.types import ObjectPose, Reading
 
 
 class Grip:
-    """Controller for the grip force (from tactile estimates) and for antisymmetric steering."""
+    """Controller for the grip force and the object angle."""
 
     def __init__(self, settings: Settings, fingers: list[int], grasp: GraspState) -> None:
         """Create the controller for ``fingers``, left first; ``grasp`` is read on each tick."""
@@ -50,7 +52,7 @@ class Grip:
         self.force = Setpoint(dt, control.smooth_time, state.force)  # mean tip force [N]
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # object angle [rad]
         self.slip = state.slip
-        self.commanded_max = math.inf  # highest commanded force allowed [N], set by `limit_force`
+        self.commanded_max = math.inf  # upper limit of the commanded force [N]
         self.target_angle = math.nan  # target object angle [rad], NaN if no target is set
         configure(state.slip, settings)
         law = state.law
@@ -103,7 +105,7 @@ class Grip:
 
     @property
     def stopping_ratio(self) -> float:
-        """Smallest possible stop angle divided by the current angle; 0 unless |angle| increases."""
+        """Smallest possible stop angle relative to the current angle; 0 unless |angle| rises."""
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
             return 0.0
@@ -111,11 +113,11 @@ class Grip:
 
     @property
     def is_turning(self) -> bool:
-        """True while the object angle setpoint is moving to its target."""
+        """True while the setpoint of the object angle has not reached its target."""
         return self._state.is_steering and self.angle.value != self.target_angle
 
     def start(self, measured: float, force: float) -> None:
-        """Begin the grip at the ``measured`` force and change the force to ``force`` [N]."""
+        """Begin the grip at the ``measured`` force [N], then change the force to ``force`` [N]."""
         kernels.start(self._state.array, self._grasp.array, self.force.windows, measured)
         self.target_angle = math.nan
         self.retarget(force)
@@ -138,13 +140,13 @@ class Grip:
         self._state.force_rate = change / self._control.force_time
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the force to ``force_max`` [N], and ramp to this limit within ``duration`` [s]."""
+        """Limit the force to ``force_max`` [N]; reach this limit within ``duration`` [s]."""
         self.commanded_max = force_max
         self.retarget(force_max)
         self._state.force_rate = abs(self.force.value - force_max) / duration
 
     def force_for_load(self) -> float:
-        """Return the force [N] required for the load, including slip margin and undetected load."""
+        """Return the force [N] that the load requires, including slip margin and hidden load."""
         law, grasp = self.slip.law, self._grasp
         load = self.slip.assumed_load
         if not law.has_shear and law.object_load == 0.0:  # Joint friction may hide a load.
@@ -159,7 +161,7 @@ class Grip:
         self._state.is_steering = True
 
     def set_joint_stiffness(self, joint_stiffness: float) -> None:
-        """Set the antisymmetric joint stiffness [N·m/rad] without a torque step."""
+        """Set the antisymmetric joint stiffness [N·m/rad] without a step in the torques."""
         state, (q1, q2) = self._state, self._grasp.q
         present = 0.5 * (q1 - q2)
         ratio = state.joint_stiffness / joint_stiffness
@@ -167,13 +169,14 @@ class Grip:
         state.joint_stiffness = joint_stiffness
 
     def begin_holding(self) -> None:
-        """Mark the grip as settled, so that external loads can be detected."""
+        """Mark the grip as settled so that loads can be detected."""
         kernels.begin_holding(self._state.array, self._grasp.array)
 
     def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
-        """Return joint torques [N·m], positive when closing, 0 for an unused finger.
+        """Return both joint torques [N·m]; positive torques close the fingers.
 
-        ``holding`` must be True only in a settled grip, in which only loads move the joints.
+        The torque of an unused finger is 0. ``holding`` is True in a settled grip, in which only
+        loads move the joints.
         """
         if self._single_finger is not None:
             return self._single_torque(reading, False)
@@ -189,10 +192,10 @@ class Grip:
         )
 
     def hold_goal(self, reading: Reading) -> tuple[float, float]:
-        """Return joint torques [N·m] while frames are late: hold the force and end any rotation.
+        """Return joint torques [N·m] that hold the force and end a rotation while frames are late.
 
-        Joint readings are still available, so damping and steering continue. Constant torques would
-        keep the object rotating.
+        Joint readings are still available, so damping and steering continue. With constant torques,
+        the object would continue to rotate.
         """
         if self._single_finger is not None:
             return self._single_torque(reading, True)

@@ -1,7 +1,7 @@
-"""State and kernels of the grip control laws; `control.grip` explains the control laws.
+"""Define the state and the kernels of the grip control laws; see `control.grip`.
 
-The kernels called from Python take the controller state, this tick's grasp, and the windows of both
-setpoints. Pairs are (left, right). All quantities are in SI units.
+Kernels that Python calls take the controller state, the grasp state of this tick, and the averaging
+windows of both setpoints. Pairs are (left, right). All quantities are in SI units.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_ERROR_SIGMA = 2.0  # force limit margin, in standard deviations of the torque constant
-_INTEGRAL_RATIO = 0.3  # integral limit as a fraction of the force target
+_TORQUE_ERROR_SIGMA = 2.0  # force margin, in standard deviations of the torque constant
+_INTEGRAL_RATIO = 0.3  # limit of the integral term, as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
-_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation due to equalising the tip forces [rad]
+_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation while the tip forces are equalised [rad]
 _DITHER_STEP_MAX = 0.05  # maximum time step of the dither, even after a late tick [s]
-_STIFFNESS_MIN = 100.0  # minimum stiffness by which gains are divided [N/m]
+_STIFFNESS_MIN = 100.0  # lower limit of the stiffness, which is used as a divisor [N/m]
 ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
 
 
@@ -39,13 +39,13 @@ class GripLaw(Record):
     force_bandwidth: float  # [rad/s]
     rotate_bandwidth: float  # [rad/s]
     rotate_speed: float  # [rad/s]
-    damping: float  # 2 ζ √J, which is multiplied by √stiffness to obtain the damping [N·m·s/rad]
+    damping: float  # 2 ζ √J, the ratio of the damping [N·m·s/rad] to √stiffness
     friction: float  # joint friction [N·m]
     driving: float  # motor torque divided by tip torque while a joint closes
     friction_speed: float  # joint speed above which friction is fully compensated [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
-    turn_decay: float  # decay factor for the rotation rate, applied on each tick without a frame
+    turn_decay: float  # factor that reduces the rotation rate on each tick without a frame
     is_blind: bool  # True for the `upright` law, which uses dither instead of angle measurements
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
@@ -69,11 +69,11 @@ class GripState(Record):
     is_steering: bool  # True if a target has been set for the object angle
     integral: float  # [N]
     grip_force: float  # sum of feed-forward and feedback [N]
-    offset_rate: float  # rate of change of the offset that rotates the object [rad/s]
+    offset_rate: float  # rate of change of `offset` [rad/s]
     offset: float  # goal for (q1 − q2)/2 [rad]
     dither_elapsed: float  # time since the dither began [s]
-    last_time: float  # start time, or time of the last tick with equal torques for both joints [s]
-    balance_offset: float  # part of the offset that equalises the tip forces [rad]
+    last_time: float  # time of the last tick with equal joint torques, or of the start [s]
+    balance_offset: float  # part of `offset` that equalises the tip forces [rad]
     closing_friction: float  # fraction of the joint friction that is compensated during closing
     torque: Pair  # most recent torques of both joints [N·m]
 
@@ -98,7 +98,7 @@ def start(
 
 @kernel
 def begin_holding(grips: Records[GripState], grasps: Records[GraspState]) -> None:
-    """Mark the grip as settled, so that loads can be detected."""
+    """Mark the grip as settled so that loads can be detected."""
     slip_monitor.begin(grips[0].slip, grasps[0])
 
 
@@ -114,8 +114,8 @@ def grip_torques(
 ) -> tuple[float, float]:
     """Return both joint torques [N·m].
 
-    ``angle`` is the object angle [rad] (NaN if unknown) and ``dq`` are the joint velocities
-    [rad/s]. ``holding`` is True in a settled grip, in which only loads move the joints.
+    ``angle`` is the object angle [rad], or NaN if the angle is unknown. ``dq`` contains the joint
+    velocities [rad/s]. ``holding`` is True in a settled grip, in which only loads move the joints.
     """
     g = grips[0]
     grasp = grasps[0]
@@ -152,7 +152,7 @@ def grip_torques(
 def hold_goal(
     grips: Records[GripState], grasps: Records[GraspState], dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return joint torques while frames are late: hold the force and end any rotation.
+    """Return joint torques [N·m] that hold the force and end a rotation while frames are late.
 
     Call this kernel instead of :func:`grip_torques`.
     """
@@ -182,8 +182,7 @@ def single_torque(
     closing_rate = 0.0
     if not frames_late:
         target = setpoint.advance(g.force, force_windows, g.force_rate)
-        # The object is fixed, so friction between the tip and the object may carry part of the
-        # torque.
+        # The supported object can't move, so friction at the tip may balance part of the torque.
         q, law = grasp.q[finger], g.law
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
         limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
@@ -211,13 +210,13 @@ def _rotation_per_offset(grasp: GraspState) -> float:
 
 @inner_kernel
 def _damping(law: GripLaw, stiffness: float, arm: float) -> float:
-    """Return the joint damping [N·m·s/rad] for a tip ``stiffness`` at a moment ``arm``."""
+    """Return the joint damping [N·m·s/rad] for a tip ``stiffness`` and a moment ``arm``."""
     return law.damping * math.sqrt(stiffness * arm * arm)
 
 
 @inner_kernel
 def _grip_force(g: GripState, target: float, measured: float, bound: float, limit: float) -> float:
-    """Return ``target`` plus force feedback, at most ``limit`` [N].
+    """Return the sum of ``target`` and the force feedback, but at most ``limit`` [N].
 
     ``bound`` limits the integral term.
     """
@@ -236,8 +235,9 @@ def _grip_force(g: GripState, target: float, measured: float, bound: float, limi
 def _force_limit(g: GripState, load: float, arm: float) -> float:
     """Return a sensor-independent upper limit for the grip force [N].
 
-    The limit is the target force, increased to allow for the torque constant error, joint friction
-    and the torque due to the detected ``load`` [N·m]. ``arm`` is the force's moment arm [m].
+    The limit is the target force plus margins for the torque constant error, for the joint friction
+    and for the torque ``load`` [N·m] of the detected load. ``arm`` is the moment arm of the force
+    [m].
     """
     law = g.law
     force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * law.torque_error)
@@ -246,7 +246,7 @@ def _force_limit(g: GripState, load: float, arm: float) -> float:
 
 @inner_kernel
 def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -> float:
-    """Move the antisymmetric goal and return its feed-forward rate [rad/s]."""
+    """Move the goal of the antisymmetric joint angle; return its feed-forward rate [rad/s]."""
     target = setpoint.advance(g.angle, windows, g.law.rotate_speed)
     rotation = _rotation_per_offset(grasp)
     offset_rate = g.angle.speed / rotation
@@ -263,10 +263,10 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
 
 @inner_kernel
 def _distribute(g: GripState, grasp: GraspState) -> None:
-    """Equalise the tip forces if friction between object and support keeps them unequal.
+    """Equalise the tip forces if friction between the object and its support makes them unequal.
 
-    The force controller acts only on the mean tip force. To equalise the forces, both fingers shift
-    sideways by a small angle, so the object rotates by at most _DISTRIBUTE_ANGLE.
+    The force controller acts only on the mean tip force. To equalise the forces, both fingers move
+    sideways by a small angle. The object then rotates by at most _DISTRIBUTE_ANGLE.
     """
     off = (
         0.5
@@ -283,7 +283,10 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
 
 @inner_kernel
 def _closing_rate(grasp: GraspState, rate: float, offset_rate: float) -> float:
-    """Return the closing rate [rad/s] for a force ``rate`` [N/s], also while the object rotates."""
+    """Return the closing rate [rad/s] that changes the force at ``rate`` [N/s].
+
+    The closing rate also compensates for a rotation of the object.
+    """
     arm = grasp.moment_arm
     rotation = grasp.jacobian_rotation
     d_rate = 2.0 * rate / _mean_stiffness(grasp)
@@ -321,7 +324,7 @@ def _torques(
 def _equal_torques(
     g: GripState, grasp: GraspState, target: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return joint torques with which both tips push equally hard at any object angle.
+    """Return joint torques that make both tips push equally hard at any object angle.
 
     After the dither, the joints hold their antisymmetric angle.
     """
@@ -352,23 +355,22 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     """Advance the dither; return its antisymmetric torque [N·m].
 
     The virtual spring from `hand.upright` acts between the fingers, and an oscillating torque
-    overcomes the joint friction. The oscillating torque fades out slowly, so that friction does not
-    leave a bias.
+    overcomes the joint friction. The oscillating torque decays slowly, so friction does not leave a
+    bias.
     """
     law, q = g.law, grasp.q
     antisymmetric = 0.5 * (q[0] - q[1])
     lengths = (law.half_separation, law.length, law.offset, law.radius)
     spring = upright_spring(mean(q), mean(grasp.d), target, grasp.tilt_moment_ratio, lengths)
     spring = min(spring, g.joint_stiffness)
-    # The hold that follows the dither must start with the current spring torque.
+    # When the dither ends, the hold must start with the current spring torque.
     g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
     # The amplitude rises during the first period and decays to zero by the end of the dither.
     phase = law.dither_rate * g.dither_elapsed
     amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
     if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-        # Use the clock instead of counting ticks, because late ticks would slow a dither that
-        # counts ticks. A slow dither could excite the resonance of the fingers on the soft tips (1
-        # to 2 Hz).
+        # Measure time with the clock. A tick count would slow the dither when ticks are late, and a
+        # slow dither could excite the resonance of the fingers on the soft tips at 1 to 2 Hz.
         g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
     return torque
@@ -376,9 +378,9 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
 
 @inner_kernel
 def _motor_torque(law: GripLaw, torque: float, rate: float) -> float:
-    """Return the motor torque required for a tip torque [N·m] at a joint ``rate`` [rad/s].
+    """Return the motor torque [N·m] required for a tip ``torque`` at a joint ``rate`` [rad/s].
 
-    A joint at standstill gets the torque required for closing.
+    At standstill, the torque required for closing is returned.
     """
     opening = min(max(-rate / law.friction_speed, 0.0), 1.0)
     return torque * (law.driving - opening * (law.driving - 1.0 / law.driving))
@@ -386,5 +388,5 @@ def _motor_torque(law: GripLaw, torque: float, rate: float) -> float:
 
 @inner_kernel
 def _friction(law: GripLaw, rate: float) -> float:
-    """Return the joint friction [N·m] at the commanded ``rate`` [rad/s]."""
+    """Return the joint friction torque [N·m] at the commanded ``rate`` [rad/s]."""
     return law.friction * clip(rate / law.friction_speed, 1.0)

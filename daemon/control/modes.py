@@ -1,4 +1,4 @@
-"""The hand's modes and commands. The commands page is generated from `COMMANDS`."""
+"""Define the hand's modes and commands. The commands page is generated from `COMMANDS`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Parameter(NamedTuple):
 
     required: bool
     unit: str
-    range: str  # range in words, including the settings that define the range
+    range: str  # range as text, with the names of the settings that define the range
     meaning: str
 
 
@@ -45,8 +45,8 @@ _NONE: Mapping[Any, Any] = MappingProxyType({})
 class CommandKind(NamedTuple):
     """Description of a command: effect, modes that accept it, parameters, reply and refusals.
 
-    ``reply`` names the reply fields other than ``mode``; `REPLY` explains them. ``refusals`` maps
-    reasons in the reply to causes that are specific to this command.
+    ``reply`` lists the reply fields other than ``mode``; `REPLY` explains all fields. ``refusals``
+    maps each reason to a cause that is specific to this command.
     """
 
     modes: frozenset[Mode]
@@ -204,5 +204,5 @@ COMMANDS: dict[str, CommandKind] = {
     ),
 }
 
-# Commands that never stiffen or move the hand. The daemon accepts late commands of this kind.
+# Commands that never stiffen or move the hand and therefore have a higher age limit.
 SAFE_COMMANDS = frozenset({"disarm", "tare", "clear"})

@@ -1,4 +1,4 @@
-"""Generate smooth setpoints that follow a jerk-limited path to a target that may jump.
+"""Generate smooth, jerk-limited setpoints for a target that may jump.
 
 The values may have any unit.
 """
@@ -18,7 +18,7 @@ class RunningMean(Record):
     """Running mean of the last ``length`` values; the values are stored in a separate window."""
 
     length: int
-    index: int  # position of the oldest value
+    index: int  # index of the oldest value
     sum: float
 
 
@@ -37,7 +37,7 @@ class SetpointState(Record):
 
 @inner_kernel
 def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
-    """Set the setpoint to ``value`` with zero speed."""
+    """Set the setpoint to ``value`` and its speed to zero."""
     s.target = s.ramp = s.value = value
     s.speed = 0.0
     s.idle_count = s.first.length + s.second.length
@@ -107,12 +107,12 @@ class Setpoint:
     """Rate-limited ramp, smoothed by two running means in series.
 
     The first mean limits the acceleration to rate/window; the second limits the jerk to
-    rate/(window · window/2). The value never overshoots, for any sequence of targets. The value
-    reaches the target 1.5 windows later than the ramp.
+    rate/(window · window/2). The value never overshoots, whatever the sequence of targets. The
+    value reaches the target 1.5 windows later than the ramp.
     """
 
     def __init__(self, dt: float, window: float, state: SetpointState) -> None:
-        """Create a setpoint in ``state``, with tick period ``dt`` and averaging ``window`` [s]."""
+        """Create a setpoint in ``state`` with tick period ``dt`` and averaging ``window`` [s]."""
         self.state = state
         self.state.dt = dt
         self.state.first.length = max(round(window / dt), 1)
@@ -122,16 +122,16 @@ class Setpoint:
         self.step(0.0)  # Compile the kernel before the first tick.
 
     def reset(self, value: float) -> None:
-        """Set the setpoint to ``value`` with zero speed."""
+        """Set the setpoint to ``value`` and its speed to zero."""
         _reset(self.state.array, self.windows, value)
 
     def step(self, rate: float) -> bool:
-        """Advance by one tick at up to ``rate`` [1/s]; return True once settled at the target."""
+        """Advance by one tick at up to ``rate`` [1/s]; return True if the target is reached."""
         return _step(self.state.array, self.windows, rate)
 
     @property
     def target(self) -> float:
-        """Target, which may be set on any tick."""
+        """Target value; it may be set on any tick."""
         return self.state.target
 
     @target.setter

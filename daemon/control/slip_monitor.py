@@ -1,35 +1,38 @@
-"""Estimate the load on a held object and the grip force that it requires.
+"""Estimate the load on a held object and the grip force that the load requires.
 
-The following is computed on each tick, with the names from `SlipLaw`, `SlipState` and `GraspState`:
+The monitor computes these quantities on each tick; see `SlipLaw`, `SlipState` and `GraspState`:
 
-    r         low-pass filtered torque residual of each joint; r̄ is the mean of both
+    r         low-pass filtered torque residual of each joint; r̄ is the mean of both joints
     L         load per tip: r̄ − offset = load_arm L + load_curvature L²               (`load_of`)
     load      min(4 max(|L| − friction/(2 load_arm), 0), |L| + friction/slope)
     needed    max(load, solid-tip shear, object_load/2)/(tip_friction (1 − margin) − shear),
               stored as `needed_force`
     force     min(max(commanded, needed), force_limit)
 
-**Offset.** Gear friction and errors in modulus and torque constant cause a residual even without a
+**Offset.** Gear friction, modulus errors and torque constant errors cause a residual even without a
 load. The offset is measured when holding begins, and again after the force or the angle has
 changed. A load detected during the previous hold is not part of the offset. The offset then follows
-r̄ slowly (_SETTLING_TIME). While the joints are at standstill, the offset follows the commanded
-torque immediately, because friction carries any torque that is added to a stuck joint. The offset
-stays within ±`friction` of its initial value. Because rubber relaxes, the offset may fall below the
-range by up to _RELAXATION_SHARE of the tip moment.
+r̄ slowly, with a time constant of up to _SETTLING_TIME. While the joints are at standstill, the
+offset immediately follows any change in the commanded torque. Friction balances a torque that is
+added to a stationary joint. The offset stays within ±`friction` of its initial value. Because
+rubber relaxes, the offset may also fall below this range, by up to _RELAXATION_SHARE of the tip
+moment.
 
-**Load.** Friction hides a load of up to friction/load_arm, which is 2 N per tip for the default
-hand. Loads below half of this value are ignored. Larger loads are increased by the load that
-friction may hide. Increasing the grip force by more than _UNCONFIRMED_SHARE requires confirmation:
-the object has rotated, both joints have yielded simultaneously, or |L| exceeds twice the friction.
+**Load.** Friction hides loads of up to friction/load_arm, which is 2 N per tip for the default
+hand. Loads below half of this value are ignored. The estimate of a larger load is increased by the
+load that friction may hide. Without confirmation, a load increases the grip force by at most
+_UNCONFIRMED_SHARE. A load is confirmed if the object has rotated, both joints have yielded
+simultaneously, or |L| exceeds 2 friction/load_arm.
 
-**Sudden events** increase the force immediately. The force increases to its limit if the torques
-jump beyond the noise while both joints yield, or if the shear in the frames of solid tips jumps. An
-object rotation beyond the tips' shear deformation μ (d1 + d2)/2W increases the force by
-_ROTATION_INCREASE. A sliding tip transmits only its friction force, so the size of a sudden load is
-unknown. In a pull, the two torques jump in the same direction; in a twist, they jump in opposite
-directions. A sideways push looks like a twist.
+**Sudden events** increase the force immediately. The force increases to its limit in two cases: the
+torques jump beyond the noise while both joints yield, or the shear jumps in the frames of solid
+tips. If the object rotates further than the shear deformation μ (d1 + d2)/2W of the tips, the force
+increases by _ROTATION_INCREASE. A sliding tip transmits only its friction force, so the size of a
+sudden load is unknown. In a pull, the two torques jump in the same direction; in a twist, they jump
+in opposite directions. A sideways push looks like a twist.
 
-A force increase is held for _SETTLING_TIME and then decreases by increase_max per _DECAY_TIME.
+A force increase is held for _SETTLING_TIME. The increase then decays at the rate
+increase_max/_DECAY_TIME.
 
 While the force changes or the object rotates, the motors also move the joints, so the load estimate
 is not updated. `docs/safety.md` lists the loads that cannot be detected.
@@ -53,10 +56,10 @@ _SETTLING_TIME = 1.0  # settling time of the residual, and hold time of a force 
 _DECAY_TIME = 2.0  # time to reduce the force by `grip_raise_max`, and decay time of rotations [s]
 _SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
 _ROTATION_INCREASE = 0.5  # relative force increase after the object has rotated
-_ROTATION_MARGIN = 1.5  # minimum significant rotation, relative to the rotation due to shear
-_SHEAR_JUMP = 0.6  # minimum shear jump measured by solid tips [N], equal to six standard deviations
+_ROTATION_MARGIN = 1.5  # smallest significant rotation, as a multiple of the rotation due to shear
+_SHEAR_JUMP = 0.6  # smallest significant shear jump at solid tips [N]; six standard deviations
 _AGREEMENT = 0.25  # minimum change at each joint or tip, as a fraction of the mean change
-_UNCONFIRMED_SHARE = 0.3  # highest unconfirmed force increase, as a fraction of the force
+_UNCONFIRMED_SHARE = 0.3  # maximum force increase without confirmation, as a fraction of the force
 _RELAXATION_SHARE = 0.2  # maximum relative force loss due to relaxation during a hold
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
 _SPARE_MIN = 0.3  # minimum usable fraction of the friction coefficient
@@ -69,13 +72,13 @@ class SlipLaw(Record):
     width: float  # object width [m]
     arm_min: float  # minimum moment arm [m]
     yield_speed: float  # minimum speed change of a joint that yields to a load [rad/s]
-    standstill: float  # maximum difference between a stationary joint's angle and its average [rad]
+    standstill: float  # maximum deviation of a stationary joint from its average angle [rad]
     force_max: float  # [N]
     friction: float  # Coulomb friction coefficient between tip and object
-    margin: float  # fraction of the friction coefficient that is kept as a margin
+    margin: float  # fraction of the friction coefficient that is reserved as a margin
     joint_friction: float  # [N·m]
     friction_max: float  # maximum joint torque during an approach [N·m]
-    load_friction: float  # fraction of the tip moment that gear friction can hold
+    load_friction: float  # fraction of the tip moment that gear friction can balance
     object_load: float  # [N]
     has_shear: bool  # True if the frames measure shear
     increase_max: float  # [N]
@@ -94,16 +97,16 @@ class SlipState(Record):
     torque: float  # mean torque of both joints on the previous tick [N·m]
     is_watched: bool  # True if the residual at the start of the hold is known
     offset: float  # residual without a load [N·m]
-    start_offset: float  # part of the offset at the start that friction can't explain [N·m]
+    start_offset: float  # part of the initial offset that friction can't explain [N·m]
     deviation: float  # part of the residual that is attributed to a load [N·m]
     moment: float  # moment of the tip forces at the start of the hold [N·m]
     holding_time: float  # time since the start of the hold, at most _SETTLING_TIME [s]
     load: float  # load per tip, including the part hidden by friction [N]
-    assumed_load: float  # maximum of `load`, measured shear and half the declared load [N]
+    assumed_load: float  # largest of `load`, measured shear and half the declared load [N]
     is_confirmed: bool  # True if a load may increase the force by more than _UNCONFIRMED_SHARE
     pull: float  # average pulling force measured by solid tips [N]
     twist: float  # average twisting force measured by solid tips [N]
-    usable_friction: float  # friction coefficient minus the shares of slip margin and rolling
+    usable_friction: float  # friction coefficient, reduced by the slip margin and by rolling
     rotation_seen: Pair  # value of `unexplained_rotation` at the previous update [rad]
     rotation: Pair  # unexplained rotation per tip during the last _DECAY_TIME [rad]
     has_turned: bool  # True if a rotation of the object in the grip was detected on this tick
@@ -152,8 +155,8 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     """Begin holding, or continue after the force or the angle has changed.
 
     Without a load, the offset equals the residual on this tick. A load from the previous hold is
-    assumed to persist, unless this assumption would move the offset out of its range. The range is
-    proportional to the force.
+    assumed to persist, unless this assumption would move the offset out of its range. The range
+    scales with the force.
     """
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
@@ -182,7 +185,7 @@ def mean(pair: Pair) -> float:
 
 @inner_kernel
 def _moment(grasp: GraspState) -> float:
-    """Return the mean joint torque that balances the normal forces [N·m]."""
+    """Return the mean joint torque [N·m] that balances the normal forces."""
     return mean(grasp.normal) * mean(grasp.moment_arm)
 
 
@@ -202,11 +205,11 @@ def update(
     dq: FloatPair,
     torques: Pair,
 ) -> float:
-    """Return the grip force [N]: ``commanded``, or more if the load requires it.
+    """Return the ``commanded`` grip force [N], increased if the load requires a higher force.
 
     ``holding`` is True while only loads move the joints. ``closing`` (−1 to 1) is the fraction of
-    joint friction included in the torques, ``dq`` are the joint velocities [rad/s], and ``torques``
-    are the joint torques of the previous tick [N·m].
+    the joint friction that the torques include. ``dq`` contains the joint velocities [rad/s].
+    ``torques`` contains the joint torques of the previous tick [N·m].
     """
     law = s.law
     spare_friction = _update_friction(s, grasp)
@@ -221,10 +224,10 @@ def update(
         s.has_turned = _has_turned(s, grasp)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.torque = mean(torques)
-    # Ignore the torques if joint friction could hide a load larger than the grip can carry.
+    # Ignore the torques if joint friction could hide a load that is too large for the grip.
     if law.friction * commanded * grasp.load_arm <= s.friction:
         s.load = 0.0
-    if law.has_shear:  # Any load beyond the measured shear is due to a force error.
+    if law.has_shear:  # A load above the measured shear results from a force error.
         s.load = min(s.load, pull + _SHEAR_JUMP)
     if grasp.sensor_fault:
         s.load = pull = s.needed_force = 0.0
@@ -235,7 +238,7 @@ def update(
 
 @inner_kernel
 def _update_friction(s: SlipState, grasp: GraspState) -> float:
-    """Set the joint friction and the usable tip friction; return the unbounded tip friction.
+    """Set the joint friction and the usable tip friction; return the latter before clipping.
 
     Rolling uses up part of the tip friction, and this part increases with the grip force.
     """
@@ -253,7 +256,7 @@ def _increased_force(s: SlipState, grasp: GraspState, commanded: float, sudden: 
     s.reflex_triggered = s.has_turned or sudden
     s.is_confirmed = s.is_confirmed or s.reflex_triggered
     # If the object is pushed towards one finger, the force on that finger's tip increases. The
-    # joint torques show the push earlier than the tip forces.
+    # joint torques show the push earlier than the tip forces do.
     by_torque = abs(grasp.torque_residual[0] - grasp.torque_residual[1])
     by_torque /= max(mean(grasp.moment_arm), s.law.arm_min)
     imbalance = 0.5 * max(abs(grasp.force[0] - grasp.force[1]), by_torque)
@@ -285,10 +288,10 @@ def _update_needed_force(s: SlipState, needed_force: float, commanded: float) ->
 
 @inner_kernel
 def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
-    """Return the highest grip force [N] that an increase may reach.
+    """Return the upper limit [N] of an increased grip force.
 
-    The force may be increased without confirmation up to the force that the ``declared`` load
-    requires.
+    An increase to ``declared`` [N], the force that the declared load requires, needs no
+    confirmation.
     """
     law = s.law
     share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
@@ -335,9 +338,9 @@ def _has_jumped(
     A pull changes both residuals equally, whereas a twist changes them in opposite directions. Four
     tests exclude other causes:
 
-    1. Both residuals change. A wrong current measurement or frame affects only one joint.
-    2. The change exceeds the noise. The noise threshold is higher soon after holding begins,
-       because friction may be released.
+    1. Both residuals change. A wrong current reading or a wrong frame affects only one joint.
+    2. The change exceeds the noise. The threshold is higher soon after holding begins, because
+       joint friction may be released.
     3. Both joints yield to the load.
     4. The load increases to a large fraction of the friction force. For this test, half of the load
        that joint friction may hide is added to the measured load.
@@ -367,7 +370,7 @@ def _has_jumped(
 def _detect_shear_jump(
     s: SlipState, pull: float, twist: float, is_held: bool, sudden_min: float
 ) -> bool:
-    """Average the load [N] measured by solid tips; return True if this load jumped."""
+    """Average the shear loads [N] that solid tips measure; return True if a shear load jumped."""
     pull_jump = pull - s.pull
     twist_jump = twist - s.twist
     s.pull += pull_jump * s.law.dt / _AVERAGE_TIME
@@ -390,7 +393,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     _update_offset(s, grasp, residual, torque_change)
-    # A residual change due to decreasing or reversing friction is not a load.
+    # If the residual changes because friction decreases or reverses, the change is not a load.
     deviation = residual - s.offset
     increase = residual - s.start_offset
     s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
@@ -407,7 +410,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
 
 @inner_kernel
 def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_change: float) -> None:
-    """Let the offset follow the ``residual`` [N·m] within the range that friction explains."""
+    """Let the offset follow the ``residual`` [N·m] within the range that friction can explain."""
     law = s.law
     is_standing = True
     for k in range(2):
@@ -427,7 +430,7 @@ def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_chan
 def _has_turned(s: SlipState, grasp: GraspState) -> bool:
     """Return True if the object has rotated further than the shear of the tips allows.
 
-    Both tips must show the rotation, because a single faulty sensor can simulate a rotation.
+    Both tips must show the rotation, because one faulty sensor can report a false rotation.
     """
     for k in range(2):
         s.rotation[k] += grasp.unexplained_rotation[k] - s.rotation_seen[k]

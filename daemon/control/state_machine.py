@@ -1,4 +1,4 @@
-"""State machine that handles the hand's commands and sets one servo goal on each tick.
+"""Run the state machine that handles the hand's commands and sets the servo goal on each tick.
 
 State        Mode       Action                           Event → next state
 -----------  ---------  -------------------------------  ------------------------------------------
@@ -21,18 +21,19 @@ Turning      ROTATING   the object rotates               angle reached → Settl
 
 Several states share these transitions:
 
-- all: a fault → Off (FAULT); `stop`, `disarm` → Off (DISARMED), but a fault persists until `clear`
-- with torque: `release` → Travelling (RELEASING)
-- Settled, Changing, Turning: `rotate` → Turning
-- Approaching, Pressing, Settled, Changing, Turning: the tips touch each other for _EMPTY_TIME →
-  Travelling (RELEASING)
-- Pressing, Settled, Changing, Turning: a contact is missing for `safety.frame_age_fault` frame
-  periods → Armed. The joints hold their positions while a contact is missing.
+- In every state, a fault leads to Off (FAULT). `stop` and `disarm` lead to Off (DISARMED), but a
+  fault persists until `clear`.
+- In every state with torque, `release` leads to Travelling (RELEASING).
+- In Settled, Changing and Turning, `rotate` leads to Turning.
+- From Approaching to Turning, contact between the tips for _EMPTY_TIME leads to Travelling
+  (RELEASING).
+- From Pressing to Turning, the joints hold their positions while a contact is missing. After
+  `safety.frame_age_fault` frame periods, the next state is Armed.
 
-Each transition creates a new instance of a state class. Timers and flags are attributes of the
-state that uses them and are discarded with it. `control.modes` lists the commands for each mode,
-`loop.requests` checks them, `control.fingers` drives the joints, `control.grip` computes the joint
-torques of a grip, and `safety.safety` limits the goals.
+Each transition creates a new instance of a state class. Timers and flags are attributes of a state
+and are discarded when the state ends. `control.modes` lists the commands for each mode, and
+`loop.requests` checks each command. `control.fingers` drives the joints, `control.grip` computes
+the joint torques, and `safety.safety` limits the goals.
 """
 
 from __future__ import annotations
@@ -47,31 +48,32 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
-# Maximum distance between a joint and its goal at arrival [rad]: five times the position error that
-# the default joint friction causes at the default servos.stiffness.
+# A joint has arrived if it is within this distance of its goal [rad]. The distance is five times
+# the position error due to joint friction with the default settings.
 _ARRIVAL_DISTANCE = 0.03
-# Tolerance as a fraction of the force target. With simulated sensors, the force noise is 0.3 to 0.6
-# % (1 σ).
+# Force tolerance as a fraction of the target. With simulated sensors, the force noise is 0.3 to
+# 0.6 % (1 σ).
 _FORCE_TOLERANCE = 0.03
 # Maximum force error due to joint or gear friction, as a fraction of the force target. With the
 # default finger, a friction torque of 0.05 N·m causes an error of 10 % at a force of 6 N. The
 # integral term removes the friction error within seconds.
 _FRICTION_TOLERANCE = 0.1
-# Waiting time before a joint or a force counts as held by friction [s]: a joint that is short of
-# its goal, or a force that is within _FRICTION_TOLERANCE of its target. The waiting time is ten
-# times the settling time of the force in a hand without friction.
+# Waiting time [s]. After this time, a joint that is short of its goal counts as stuck, and a force
+# within _FRICTION_TOLERANCE of its target counts as reached. _STUCK_TIME is ten times the settling
+# time of the force in a hand without friction.
 _STUCK_TIME = 2.0
-# Minimum duration of apparent contact between the tips in an empty grip [s]. The duration is longer
-# than one frame period at 25 Hz.
+# A grip is empty if the tips have apparently been in contact with each other for this time [s].
+# _EMPTY_TIME is longer than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
 # Tolerance for a streamed force target, as a fraction of the target. A streamed target may change
-# continuously, so a grip also counts as settled when the force follows a setpoint within the
-# tolerance.
+# continuously. A grip therefore also counts as settled if the force has reached a setpoint within
+# this tolerance of the target.
 _STREAM_TOLERANCE = 0.25
-# Smaller changes in a streamed setpoint or in the force increase are treated as noise. _FORCE_NOISE
-# is a fraction of the force. _ANGLE_NOISE is the standard deviation of the angle [rad].
+# A change in a streamed setpoint, or a force increase, is treated as noise if it is smaller than
+# these limits. _FORCE_NOISE is a fraction of the force. _ANGLE_NOISE is the standard deviation of
+# the angle [rad].
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
 
 
@@ -94,12 +96,12 @@ class Armed(ControlState):
 
     mode = Mode.ARMED
     current: float  # current limit [A]
-    following_count: int = 0  # remaining ticks during which the setpoints follow the joints
+    following_count: int = 0  # number of remaining ticks on which the setpoints follow the joints
 
 
 @dataclass
 class Travelling(ControlState):
-    """The joints move to their setpoint targets: MOVING or RELEASING."""
+    """The joints move to their setpoint targets, in mode MOVING or RELEASING."""
 
     mode: Mode
     arrived_for: float = 0.0  # time since the setpoints reached their targets [s]
@@ -111,7 +113,7 @@ class GraspCommand:
 
     force: float  # [N]
     is_streamed: bool  # True if the client streams the force
-    angle: float | None = None  # target after the grasp has settled [rad]
+    angle: float | None = None  # target angle after the grasp has settled [rad]
 
 
 @dataclass
@@ -127,7 +129,7 @@ class Approaching(ControlState):
 
 @dataclass
 class GripHistory:
-    """Data shared by the states of a grip, from contact of all fingers to the end of the grip."""
+    """Data that all states of one grip share; a grip begins when all fingers are in contact."""
 
     lost_for: float = 0.0  # [s]
     lost_current: float = 0.0  # current limit while a contact is missing [A]
@@ -156,13 +158,13 @@ class Pressing(Gripping):
 
 
 class Settled(Gripping):
-    """Force and angle are constant: only loads move the joints."""
+    """Force and angle are constant, so only loads move the joints."""
 
     mode = Mode.HOLDING
 
 
 class Changing(Gripping):
-    """Force or angle changes to another target."""
+    """The force or the angle changes to a new target."""
 
     mode = Mode.HOLDING
 
@@ -186,7 +188,8 @@ class Control:
         # Maximum duration of a contact loss [s], equal to the maximum time without frames.
         self._contact_loss_time = settings.safety.frame_age_fault / settings.tactile.rate
         # Settling time [s]. Force and angle count as settled when they have stayed at their targets
-        # for the averaging time of their setpoints. The setpoints are averaged twice.
+        # for this time. The settling time is twice `control.smooth_time` because the setpoints are
+        # averaged twice.
         self._settling_time = 2.0 * settings.control.smooth_time
 
     @property
@@ -218,7 +221,7 @@ class Control:
     # Commands
 
     def fail(self, reason: str, name: str) -> None:
-        """Latch a fault: torque stays off until ``clear``.
+        """Latch a fault; torque stays off until the ``clear`` command.
 
         ``name`` is the name of the violated limit in `safety.limits`.
         """
@@ -226,7 +229,7 @@ class Control:
         self.events.append(("error", name, reason))
 
     def arm(self) -> None:
-        """Switch torque on and hold the joints at their positions."""
+        """Switch torque on and hold the joints at their current positions."""
         # The servos switch torque on at the end of the first tick, so the joints may still move
         # until the second tick.
         self._enter(Armed(self._settings.safety.current_move, following_count=2))
@@ -241,7 +244,7 @@ class Control:
             self._enter(Off())
 
     def move(self, **angles: float) -> None:
-        """Move the ``left`` and/or ``right`` joint to the given angle [rad]."""
+        """Move the ``left`` joint, the ``right`` joint or both joints to the given angles [rad]."""
         if self.mode is not Mode.MOVING:
             self.fingers.hold_here()
         for name, q in angles.items():
@@ -249,7 +252,7 @@ class Control:
         self._enter(Travelling(Mode.MOVING))
 
     def release(self) -> None:
-        """Open the fingers to the hand's open angles."""
+        """Open the fingers to ``hand.open_angle``."""
         self.fingers.hold_here()
         for index in self.fingers.indices:
             self.fingers.set_target(index, self._settings.hand.open_angle[index])
@@ -259,7 +262,8 @@ class Control:
         """Close the fingers until all touch; then increase the mean tip force to ``force`` [N].
 
         If the hand is already gripping, only the force changes and the mode stays the same. Set
-        ``is_streamed`` if a client streams setpoints, so the force may change before it is reached.
+        ``is_streamed`` if a client streams setpoints. A streamed force may change before the grip
+        reaches it.
         """
         state = self.state
         if isinstance(state, Gripping):
@@ -324,7 +328,7 @@ class Control:
         self.grip.set_joint_stiffness(1.0 / compliance)
 
     def _change(self, state: Gripping) -> None:
-        """Leave Settled if the commanded force or angle differs from its settled value."""
+        """Leave the Settled state if the commanded force or angle has changed significantly."""
         grip, force, angle = self.grip, state.history.settled_force, state.history.settled_angle
         if isinstance(state, Settled) and not (
             abs(grip.commanded - force) < _FORCE_NOISE * force
@@ -360,7 +364,7 @@ class Control:
     def hold_goal(self, goal: Goal) -> None:
         """Hold the goals while frames are late. Call this method instead of :meth:`step`.
 
-        In a grip, the goals are torques: the joints stay damped, and any rotation stops.
+        In a grip, the goals are torques. The joints stay damped, and any rotation stops.
         """
         if goal.valid and isinstance(self.state, Gripping) and not self.state.history.lost_for:
             self.fingers.apply_torques(goal, self.grip.hold_goal(self.fingers.reading))
@@ -411,11 +415,11 @@ class Control:
                 self._enter_armed()
 
     def _empty_for(self, before: float, dt: float) -> float:
-        """Return the duration [s] of apparent tip-to-tip contact; after _EMPTY_TIME, release.
+        """Return the duration [s] of apparent contact between the tips.
 
-        Tips that press against each other would roll off to one side. When the tips touch each
-        other, both sensors measure the same contact, so the estimated object width is 0 to within
-        its standard error.
+        The fingers open after _EMPTY_TIME, because tips that press against each other would roll
+        off to one side. When the tips touch each other, both sensors measure the same contact. The
+        estimated object width is then 0 to within its standard error.
         """
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:
@@ -434,7 +438,8 @@ class Control:
         if not fingers.in_contact:
             self._handle_contact_loss(history, dt, goal)
             return
-        if history.lost_for:  # While the force increases again, joint motion is not due to a load.
+        if history.lost_for:
+            # While the force increases again, joint motion does not indicate a load.
             history.lost_for = state.reached_for = 0.0
             if isinstance(state, Settled):
                 self._enter(state := Changing(history))
@@ -446,7 +451,7 @@ class Control:
         history.empty_for = self._empty_for(history.empty_for, dt)
 
     def _handle_contact_loss(self, history: GripHistory, dt: float, goal: Goal) -> None:
-        """Hold the joints while a contact is missing; end the grip if it does not return."""
+        """Hold the joints while a contact is missing; after a time limit, end the grip."""
         if not history.lost_for:
             self.fingers.hold_here()
             # A sensor failure must not cause the joints to press harder.
@@ -459,7 +464,7 @@ class Control:
             self._enter(Armed(history.lost_current))
 
     def _check_settled(self, state: Gripping, dt: float) -> None:
-        """Enter Settled when force and angle have stayed at their targets."""
+        """Enter the Settled state when force and angle have stayed at their targets long enough."""
         grip, pose, history = self.grip, self.fingers.pose, state.history
         is_reached = True
         if not isinstance(state, Pressing):
@@ -500,7 +505,7 @@ class Control:
         return is_near and is_there and not grip.is_dithering
 
     def _end_turn_before_slip(self, history: GripHistory) -> None:
-        """End a rotation at the current angle if the tips would slip beyond it."""
+        """End a rotation at the current angle if the tips would slip at a larger angle."""
         law, angle = self._settings.control, self.fingers.pose.angle
         shear_max = law.tip_friction * (1.0 - law.slip_margin)
         if self.fingers.grasp.shear * self.grip.stopping_ratio > shear_max:
@@ -514,7 +519,7 @@ class Control:
             self.grip.steer(angle, angle)
 
     def _report_increase(self, history: GripHistory) -> None:
-        """Report slip and the start of each force increase that counteracts it."""
+        """Report slip, and report the start of each force increase."""
         grip = self.grip
         if grip.has_slipped:
             self._warn("slip", "the object is rotating in the grip")

@@ -1,6 +1,6 @@
 """Run tasks: command scripts that the daemon executes after startup.
 
-Tasks use the same commands as clients, with the same checks.
+The daemon checks the commands of a task in the same way as client commands.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from softfinger.daemon.types import State
 Step = tuple[dict[str, Any], Mode, float]  # command, final mode and subsequent pause [s]
 
 _STEP_TIMEOUT = 10.0  # s
-_RESTART_PAUSE = 2.0  # pause before a restart that gives the user time to read the message [s]
+_RESTART_PAUSE = 2.0  # pause before a restart, so that the user can read the message [s]
 
 
 class TaskEnded(SoftfingerError):
@@ -26,10 +26,10 @@ class TaskEnded(SoftfingerError):
 
 
 class Task:
-    """Issue a script's commands, each after the hand has reached the previous command's mode.
+    """Issue the commands of a script; each command waits until the previous step has ended.
 
-    ``restarts`` is True for simulated hands: the script then restarts after a fault. Real hardware
-    must not start moving by itself after a fault.
+    If ``restarts`` is True, the script restarts after a fault. ``restarts`` is False for real
+    hardware, which must not start moving by itself after a fault.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -52,7 +52,7 @@ class Task:
         Raises
         ------
         TaskEnded
-            If the hand is in a fault, has been disarmed, or a step times out.
+            If the hand has a fault or is disarmed, or if a step times out.
         """
         if state.mode != self._end_mode:
             if state.mode in (Mode.FAULT, Mode.DISARMED):

@@ -1,8 +1,8 @@
 """Check the hand's devices: the servos in the scene and the frames of each tactile board.
 
-The checks do not change settings. `softfinger doctor --fix` calls the functions named `repair`,
-which configure adapters and servos. Torque is switched off to write a servo's EEPROM, so the hand
-goes limp. Torque is never switched on, and the hand is never moved.
+The checks do not change settings. `softfinger doctor --fix` calls the `repair` functions, which
+configure adapters and servos. Torque is switched off before a servo's EEPROM is written, so the
+hand goes limp. Torque is never switched on, and the hand is never moved.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS, Frame
 
 _LISTEN_TIME = 0.5  # time during which frames are received [s]
-_REST_NOISE_RATIO = 3.0  # maximum median pressure at rest, as a multiple of the cell noise
-_RATE_TOLERANCE = 0.1  # tolerated relative frame rate error
-_POISSON_TOLERANCE = 0.02  # tolerance for ν, limited by the accuracy of the calibration
+_REST_NOISE_RATIO = 3.0  # maximum median pressure without load, as a multiple of the cell noise
+_RATE_TOLERANCE = 0.1  # tolerated relative error of the frame rate
+_POISSON_TOLERANCE = 0.02  # tolerance for Poisson's ratio, limited by the calibration accuracy
 
 
 def check_servos(settings: Settings) -> list[Finding]:
-    """Check each servo in the scene. If a servo does not reply, search all baud rates."""
+    """Check each servo in the scene. If a servo does not reply, search for it at all baud rates."""
     servos = settings.servos
     model = by_name(servos.model)
     try:
@@ -82,7 +82,7 @@ def check_servos(settings: Settings) -> list[Finding]:
 
 
 def _wait_for(line: ServoLine, settings: Settings) -> None:
-    """Like `run`, wait up to ``servos.open_timeout`` for servos that have not replied yet."""
+    """Wait up to ``servos.open_timeout`` for servos that have not replied yet, like `run`."""
     end = time.monotonic() + settings.servos.open_timeout
     missing = [settings.servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
     while missing:
@@ -96,9 +96,9 @@ def _try_exchange(
 ) -> list[Finding]:
     """If all servos are usable, measure how long the reads and writes of a tick take.
 
-    The writes have the same length and address as in a tick. The writes contain the values that the
-    registers already have, so nothing changes. If a servo has torque on, or might switch it on when
-    a goal is written, only the reads are measured.
+    The writes have the same length and address as in a tick. The writes contain the current
+    register values, so nothing changes. If torque is on, or if a write could switch torque on, only
+    the reads are measured.
     """
     if not all(each.table and not each.errors for each in found):
         return []
@@ -124,7 +124,7 @@ def _try_exchange(
 
 
 def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -> list[Finding]:
-    """Return the findings for one servo. ``late`` is True if the servo did not reply at once."""
+    """Return one servo's findings; ``late`` is True if the servo replied after the timeout."""
     name = servo.name
     if not servo.replies:
         if servo.errors:
@@ -217,7 +217,7 @@ def check_law(settings: Settings, finger: int) -> Finding:
 
 
 def check_board(settings: Settings, finger: int) -> Finding:
-    """Check that a board sends frames with the configured grid size and rate."""
+    """Check that a board sends frames of the configured grid size at the configured rate."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
     sensor = make_sensor(settings, RealClock(), None, finger)
@@ -248,7 +248,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
         )
         fix = "run `softfinger calibrate tare` once, or `softfinger send tare` after each start"
         return Finding("warn", name, text, fix)
-    # Depending on the timing, the frame count may be off by one.
+    # The frame count may be off by one, depending on the timing.
     if abs(frames - tactile.rate * spent) > max(_RATE_TOLERANCE * tactile.rate * spent, 1.5):
         text = f"{found}, expected {tactile.rate:g}"
         fix = f"if this machine is not busy, set tactile.rate = {rate:.0f}"
@@ -257,9 +257,10 @@ def check_board(settings: Settings, finger: int) -> Finding:
 
 
 def _rest(settings: Settings, finger: int, frame: Frame) -> float:
-    """Return the median pressure of all cells [Pa], which is the pressure of an unloaded cell.
+    """Return the median pressure of all cells [Pa].
 
-    A contact loads fewer than half of the cells.
+    The median is the pressure of an unloaded cell, because a contact loads fewer than half of the
+    cells.
     """
     calibration = calibration_for(settings, finger)
     scale = settings.tactile.pascal_per_count

@@ -1,4 +1,4 @@
-"""Check the scheduling, memory, idle states and clock, which affect whether ticks run on time.
+"""Check the machine's scheduling, memory lock, idle states, clock and kernel cache.
 
 The problems found here only degrade the timing, so they are reported as warnings. The checks read
 the limits of this process. A daemon that is started from the same shell has the same limits.
@@ -20,12 +20,12 @@ from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_fo
 _MEMORY = 1 << 30  # upper bound on the daemon's mapped memory [bytes]
 _WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
-# Minimum plausible Unix time [s]. If the time is earlier, the clock has never been set.
+# Minimum plausible Unix time [s]. If the time is earlier, the clock has not been set.
 _CLOCK_MIN = 1_700_000_000.0
 
 
 def check_machine() -> list[Finding]:
-    """Run all checks in this module."""
+    """Run the checks that do not depend on the settings."""
     return [
         check_scheduling(),
         check_memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]),
@@ -36,7 +36,7 @@ def check_machine() -> list[Finding]:
 
 
 def check_scheduling() -> Finding:
-    """Check that SCHED_FIFO is allowed, by briefly using it for this thread."""
+    """Check that SCHED_FIFO is allowed; the check briefly enables SCHED_FIFO for this thread."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
@@ -49,7 +49,7 @@ def check_scheduling() -> Finding:
 
 
 def check_memory_lock(limit: int) -> Finding:
-    """Check RLIMIT_MEMLOCK [bytes]; RLIM_INFINITY means unlimited."""
+    """Check the value of RLIMIT_MEMLOCK [bytes]; RLIM_INFINITY means unlimited."""
     if os.geteuid() == 0:
         return Finding("pass", "memory lock", "not limited for root")
     if limit == resource.RLIM_INFINITY:
@@ -78,7 +78,7 @@ def check_idle_states(path: Path) -> Finding:
 
 
 def check_wall_clock(now: float) -> Finding:
-    """Check that the Unix time ``now`` [s] is plausible; all published messages contain it."""
+    """Check that the Unix time ``now`` [s] is plausible, because all messages contain the time."""
     if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
@@ -87,7 +87,7 @@ def check_wall_clock(now: float) -> Finding:
 
 
 def wake_ups() -> list[float]:
-    """Measure wake-up delays [s] after sleeping in the same way as between ticks."""
+    """Sleep in the same way as between ticks, and return the wake-up delays [s]."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UP_COUNT):
@@ -98,7 +98,7 @@ def wake_ups() -> list[float]:
 
 
 def check_wake_ups(late: list[float]) -> Finding:
-    """Check wake-up delays [s]. A median above a quarter of the tick period causes a warning."""
+    """Return a warning if the median wake-up delay [s] exceeds a quarter of the tick period."""
     worst = max(late)
     middle = sorted(late)[len(late) // 2]
     text = (

@@ -1,4 +1,4 @@
-"""Check serial ports and sockets: existence, access, and the processes that use them."""
+"""Check that serial ports and sockets are available and not in use."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def serial_ports() -> list[tuple[str, str]]:
 
 
 def note_ports() -> Finding:
-    """List the existing ports in one finding."""
+    """Return one finding that lists the existing ports."""
     found = [
         f"{path} ({text})" if text not in ("", "n/a") else path for path, text in serial_ports()
     ]
@@ -39,7 +39,7 @@ def note_ports() -> Finding:
 
 
 def check_runtime_folder() -> Finding:
-    """Check that only this user may write to the folder for emulated ports and local stops."""
+    """Check that only this user may write to the runtime folder."""
     if fault := runtime_fault():
         return Finding("warn", "runtime folder", fault)
     return Finding("pass", "runtime folder", str(runtime_folder()))
@@ -49,7 +49,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     """Check that a port exists, can be opened, and is not in use by another process.
 
     The port is closed afterwards. ``key`` is the setting that names the port. ``mode_of_daemon`` is
-    the mode of a running daemon that may be using the port; it is empty if no daemon runs.
+    the mode of a running daemon that may be using the port, or empty if no daemon is running.
     """
     try:
         mode = Path(path).stat()
@@ -134,7 +134,7 @@ def users(path: str) -> list[tuple[int, str]]:
 
 
 def _uses(folder: Path, device: int) -> bool:
-    """Return True if the process has the device open and does not own its pseudo-terminal."""
+    """Return True if the process has the device open but does not own the pseudo-terminal."""
     opened = False
     for link in (folder / "fd").iterdir():
         try:
@@ -162,7 +162,7 @@ _TIMEOUT = 0.5  # timeout for a daemon's reply [s]
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
-    """Check that all addresses can be bound; if not, report whether a daemon is using them."""
+    """Check that all addresses can be bound; if one is in use, report whether a daemon uses it."""
     found = [
         _check(settings, "stream.address", settings.stream.address),
         _check(settings, "commands.address", settings.commands.address),

@@ -1,6 +1,6 @@
-"""Save the registers of the scene's servos to a file, and restore registers from a file.
+"""Save the registers of the servos to a file, and restore the registers from a file.
 
-The file contains JSON; the register names are those in `servos.register_table.REGISTERS`:
+The file contains JSON with the register names from `servos.register_table.REGISTERS`:
 ``{"servos": [{"id": 1, "model": "XM430-W350", "firmware": 48, "registers": {NAME: value}}]}``.
 """
 
@@ -53,7 +53,7 @@ class StoredServos(Section):
 
 
 def save_registers(settings: Settings, path: Path) -> list[Finding]:
-    """Save all registers, except ID and baud rate, of each servo that replies."""
+    """Save each replying servo's registers, except the ID and baud rate registers."""
     servos: list[StoredServo] = []
     found = []
     with open_line(settings.servos.port, settings.servos.baud) as line:
@@ -143,7 +143,7 @@ def _restore(
 
 
 def _stored(path: Path) -> dict[int, StoredServo]:
-    """Return the servos in a register file as a dictionary, keyed by ID.
+    """Read a register file and return a dictionary of its servos, keyed by ID.
 
     Raises ServoError if the file format is invalid.
     """

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 # The process
 MEMORY_MAX = 128 << 20  # data segment limit [bytes]; Python and libzmq use a third of this limit
-DESCRIPTOR_COUNT = 64  # number of file descriptors in addition to those of clients
-CLIENT_COUNT_MAX = 256  # maximum number of connections, commands and stream combined
+DESCRIPTOR_COUNT = 64  # number of file descriptors in addition to one for each client
+CLIENT_COUNT_MAX = 256  # maximum number of command and stream connections combined
 STEP_CPU_TIME_MAX = 3.0  # CPU time limit of one step [s], after which the kernel ends the process
-# Limit on the elapsed time of one step [s]. The elapsed time may exceed the CPU time, because the
-# process may have to wait on a busy machine.
+# Limit on the elapsed time of one step [s]. On a busy machine, the process may have to wait, so the
+# elapsed time may exceed the CPU time.
 STEP_TIME_MAX = 30.0
 # Longest poll interval [s]. After a longer interval, the gateway stamps new requests with the time
 # of the previous poll.
@@ -26,14 +26,14 @@ SOCKET_QUEUE_LENGTH = 64  # number of requests, replies or subscriptions queued 
 PART_SIZE_RATIO = 4  # size limit of one message part, as a multiple of commands.max_bytes
 PART_COUNT_MAX = 16  # maximum number of parts in a request, including routing frame and envelope
 ENVELOPE_SIZE_MAX = 1024  # maximum combined size of routing frame and envelope [bytes]
-HANDSHAKES_PER_TURN = 64  # maximum number of handshakes before the loop and the stream are served
-SUBSCRIPTION_SIZE_MAX = 1024  # maximum size [bytes]; handshake messages are longer than topics
+HANDSHAKES_PER_TURN = 64  # maximum number of handshakes in a step
+SUBSCRIPTION_SIZE_MAX = 1024  # maximum message size [bytes]; handshakes are longer than topics
 SUBSCRIPTIONS_PER_TURN = 64
-REPEAT_INTERVAL = 0.1  # minimum interval between message repetitions for late subscribers [s]
-KEY_CHECK_INTERVAL = 0.5  # interval between key folder checks [s]
+REPEAT_INTERVAL = 0.1  # minimum time between repetitions of messages for late subscribers [s]
+KEY_CHECK_INTERVAL = 0.5  # time between checks of the key folder [s]
 
 # Time after a stop during which only status requests are accepted [s]. A flood of requests extends
-# the time.
+# this time.
 REFUSAL_TIME = 0.02
 ANSWER_DELAY_MAX = 0.25  # maximum delay of replies after a stop [s]
 
@@ -45,15 +45,15 @@ URGENT_SIZE_MAX = 256  # size limit of an urgent request [bytes]
 CLIENT_QUEUE_LENGTH = 64  # queued requests per client
 TOTAL_QUEUE_LENGTH = 2048  # queued requests of all clients
 TOTAL_RATE = 2000.0  # requests per second, all clients combined
-CLIENT_RATE_MIN = 2.0  # requests per second, guaranteed to each client
-RECOVERY_TIME = 0.05  # pause after which a client over its rate limit is accepted again [s]
+CLIENT_RATE_MIN = 2.0  # guaranteed number of requests per second for each client
+RECOVERY_TIME = 0.05  # pause after which a client that exceeded its rate is accepted again [s]
 
 # Steps
 STEP_WAIT_MAX = 0.01  # longest wait in a step [s]
 TURN_TIME = 0.004  # time limit for reading requests in a step [s]
-LINGER_TIME = 0.2  # time limit for sending queued messages once the loop has ended [s]
+LINGER_TIME = 0.2  # time limit for sending queued messages after the loop has ended [s]
 
-READY = "ready"  # printed by the process once its sockets are bound
+READY = "ready"  # text that the process prints once its sockets are bound
 
 
 class Config(NamedTuple):
@@ -70,5 +70,5 @@ class Config(NamedTuple):
     per_second: float = 200.0  # request rate limit per client
     ipc_mode: int = 0o600  # permissions of an ipc socket file
     keys: str = ""  # folder created by `softfinger keys`
-    stream_setting: str = "stream.address"  # name of the stream address in error messages
-    latest: str = ""  # address that publishes the first topic in single frames
+    stream_setting: str = "stream.address"  # setting name in errors about the stream address
+    latest: str = ""  # address on which the first topic is published in single frames

@@ -5,12 +5,12 @@ may have one such request at a time. Other requests are forwarded to the loop a 
 Further requests wait in queues, and the clients are served in turn. If a client exceeds its rate
 limit, its requests are refused until the client pauses.
 
-Each request is stamped with its arrival time and the number of stops that preceded it. The libzmq
-thread reads ahead, so the gateway can't determine whether a request arrived before or after a stop.
-After a stop or a gap between two polls, the gateway therefore stamps requests as if they had
-arrived earlier, until the socket has been empty and few requests have arrived. Replies are also
-held back for a limited time, because a client may respond to a reply with a new request, which the
-gateway would refuse.
+Each request is stamped with its arrival time and the number of preceding stops. The libzmq thread
+reads ahead, so the gateway can't determine whether a request arrived before or after a stop. After
+a stop or a long gap between two polls, the gateway therefore stamps requests as if they had arrived
+earlier. The normal stamps resume when the socket has been empty and few requests have arrived.
+Replies are also delayed for a limited time. Otherwise, a client could respond to a reply with a new
+request that the gateway would refuse.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _QUEUE_FULL_REFUSAL = refusal("too many commands are waiting", Reason.BUSY)
 
 
 class Client:
-    """One connection, with its queued requests and a token bucket for one second of requests."""
+    """Client connection, with its queued requests and a token-bucket rate limiter."""
 
     def __init__(self) -> None:
         self.waiting: deque[Ask] = deque()
@@ -77,31 +77,31 @@ class CommandEndpoint:
         self._too_many = refusal(text, Reason.BUSY)
         self._channel = channel
         self._clock = clock
-        self.refused = 0  # number of requests refused because of rate and queue limits
+        self.refused = 0  # number of requests that were refused because of rate or queue limits
         self.stops = 0  # stop count stamped on new requests
         self._fence = 0  # current stop count
         self._last_poll = clock()
-        # Time of the last poll before a gap between polls, or infinity once all requests that
-        # arrived in the gap have been read.
+        # Time of the last poll before a gap between polls. The time is infinite once all requests
+        # from the gap have been read.
         self._dated = math.inf
-        self._unread_max = 0  # maximum number of requests from the gap that are still unread
+        self._unread_max = 0  # upper limit of the number of unread requests from the gap
         self._since = 0.0  # time of the last stop, gap or check for older requests
         self._arrived = 0  # number of requests since `_since`, excluding status requests
         self._replies: deque[list[bytes]] = deque()  # replies that have not been sent yet
         # Current delay of the replies [s]. One step adds at most REFUSAL_TIME, so a stall of the
         # process has little effect.
         self._held_for = 0.0
-        # Clients that sent a request in the last second, in the order of their last requests.
+        # Clients that sent a request in the last second, ordered by the time of their last request.
         self._clients: dict[bytes, Client] = {}
         self._turns: deque[Client] = deque()  # clients with queued requests
         self._urgent: deque[Ask] = deque()
-        self.count = 0  # number of queued requests, not counting urgent ones
-        self._under_way = [0, 0]  # number of requests that await the loop's reply: normal, urgent
+        self.count = 0  # number of queued requests, excluding urgent requests
+        self._under_way = [0, 0]  # number of normal and of urgent requests that await a reply
 
     def fence(self, stops: int) -> None:
         """Stamp requests as older than the last stop until all earlier requests are read.
 
-        Replies are held back for a limited time until all earlier requests are read.
+        Replies are delayed during this time, but at most by `bounds.ANSWER_DELAY_MAX`.
         """
         if self.stops == self._fence:
             self._held_for = 0.0
@@ -109,7 +109,7 @@ class CommandEndpoint:
         self._since, self._arrived = self._clock(), 0
 
     def read(self) -> None:
-        """Read and forward requests for up to `bounds.TURN_TIME`, and send replies that are due."""
+        """Read requests for up to `bounds.TURN_TIME`, then forward requests and send replies."""
         began = self._clock()
         gap, self._last_poll = began - self._last_poll, began
         if gap > bounds.POLL_GAP_MAX:
@@ -150,7 +150,7 @@ class CommandEndpoint:
             ends, route = 0, parts[:1]
         self._arrived += b"status" not in payload
         self._unread_max -= 1
-        if self._unread_max < 0:  # more requests than the socket queues can hold
+        if self._unread_max < 0:  # All requests that arrived in the gap have been read.
             self._dated = math.inf
         client = self._clients.pop(parts[0], None) or Client()
         while self._clients and self._clients[oldest := next(iter(self._clients))].last < now - 1.0:

@@ -36,7 +36,7 @@ class ClientSockets:
     """Sockets that enforce the gateway's limits and admit only clients with a stored key."""
 
     def __init__(self, config: bounds.Config) -> None:
-        """Load the keys; without a key folder, all clients are accepted. Raises KeyFileError."""
+        """Load the keys; if there is no key folder, accept all clients. Raises KeyFileError."""
         self._config = config
         self._folder = Path(config.keys)
         self._keys = load_server(self._folder) if config.keys else None
@@ -54,7 +54,7 @@ class ClientSockets:
         config, is_router = self._config, kind == zmq.ROUTER
         part_size = bounds.PART_SIZE_RATIO * config.max_bytes
         opened: zmq.Socket[Any] = self._context.socket(kind)
-        # Set the socket options before bind, because options apply only to later connections.
+        # Set the options before binding, because an option affects only later connections.
         for option, value in (
             (zmq.MAXMSGSIZE, part_size if is_router else bounds.SUBSCRIPTION_SIZE_MAX),
             (zmq.SNDHWM, bounds.SOCKET_QUEUE_LENGTH if is_router else config.queue),
@@ -119,7 +119,7 @@ def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
     before = os.umask(0o777 & ~ipc_mode)
     try:
         if path and (taken := free_socket_path(Path(path), socket.SOCK_STREAM)):
-            raise AddressError(f"{address} {taken}")  # libzmq would replace the file.
+            raise AddressError(f"{address} {taken}")  # libzmq would replace an existing file.
         # libzmq binds only to numeric addresses.
         bound.bind(address.replace("tcp://localhost:", "tcp://127.0.0.1:"))
     except (zmq.ZMQError, OSError) as error:
@@ -132,7 +132,7 @@ def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
 
 
 def read_parts(source: zmq.Socket[Any]) -> list[zmq.Frame]:
-    """Read the parts of the next message, but at most one part more than allowed.
+    """Read the next message and return its parts, but at most one part more than allowed.
 
     Returns an empty list if there is no message.
     """
@@ -149,19 +149,19 @@ class StreamEndpoint:
     def __init__(self, sockets: ClientSockets, config: bounds.Config) -> None:
         """Bind the sockets. Raises AddressError."""
         self.socket = sockets.open(zmq.XPUB, config.stream, config.stream_setting)
-        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # report every subscription to a topic
+        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # also report repeated subscriptions
         self._latest = sockets.open(zmq.PUB, config.latest, "stream.latest")
         self._always_wanted = bool(config.latest) << _LATEST_TOPIC
         self._topics = [name.encode() for name in config.topics]
         self._prefixes: set[bytes] = set()
         self._kept: dict[int, deque[bytes]] = {}  # each topic's last messages, for late subscribers
-        self._came_late = 0  # bit mask of topics to repeat for late subscribers
+        self._came_late = 0  # bit mask of topics to send again to late subscribers
         self._repeat_at = 0.0  # earliest time of the next repetition
 
     def read(self, now: float) -> int:
         """Read subscriptions, and send stored messages to new subscribers.
 
-        Returns a bit mask of the topics with subscribers.
+        Returns a bit mask of the topics that have subscribers.
         """
         for _ in range(bounds.SUBSCRIPTIONS_PER_TURN):
             parts = read_parts(self.socket)

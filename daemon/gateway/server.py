@@ -1,8 +1,9 @@
 """Run the gateway process. One thread serves the loop and the clients.
 
-The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, with the link's
-file descriptor and a `Config` as JSON. The process prints `READY` once its sockets are bound, and
-exits when the loop disconnects. If the process exits for another reason, it prints the reason.
+The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, where FD is the
+file descriptor of the link and CONFIG is a `Config` as JSON. The process prints `READY` once its
+sockets are bound, and exits when the loop disconnects. If an error ends the process, the process
+prints the error.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _TIMER_INTERVAL = 0.5  # interval between resets of the timers that end a stalle
 
 
 class Server:
-    """Serve clients until the loop disconnects; call `step` repeatedly."""
+    """Server for the loop and the clients; call `step` until the loop disconnects."""
 
     def __init__(
         self, channel: Channel, config: bounds.Config, clock: Callable[[], float] = machine_time

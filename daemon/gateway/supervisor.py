@@ -56,15 +56,15 @@ class Gateway:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
-                # The process runs in its own session, because Ctrl-C must not end the process
-                # before the daemon's last messages have been sent.
+                # The process runs in its own session, so Ctrl-C does not end the process before the
+                # daemon's last messages have been sent.
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )
         self._channel = Channel(ours)
 
     def _connect(self) -> None:
-        """Wait until the process is ready, and connect the link. Raises AddressError."""
+        """Wait until the process is ready, then connect the link. Raises AddressError."""
         assert self.process.stdout is not None
         output, text = self.process.stdout.fileno(), b""
         if select.select([output], [], [], _BIND_TIMEOUT)[0]:

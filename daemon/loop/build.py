@@ -62,9 +62,9 @@ class Daemon:
 
         Parameters
         ----------
-        on_event : called with the level, kind and text of each event wire : True to serve clients
-        over ZeroMQ, or a `Link` whose owner exchanges the messages hand : settings of the simulated
-        hand; None to use the daemon's settings
+        on_event : function that receives the level, kind and text of each event
+        wire : True to serve clients over ZeroMQ, or a `Link` whose owner exchanges the messages
+        hand : settings of the simulated hand; None to use the daemon's settings
         """
         self.settings = settings
         self._hand_settings = settings if hand is None else hand
@@ -189,7 +189,7 @@ class Daemon:
             closer = self._closers.pop()
             try:
                 closer()
-            # The remaining functions, such as torque off, must still run.
+            # The remaining closers must still run, because one of them turns torque off.
             except Exception as error:
                 logging.getLogger(__name__).error("closing: %s", error)
 

@@ -101,10 +101,10 @@ class Loop:
         if publisher is not None:
             self._publishing = Publishing(settings, publisher, sensors, self.statistics)
         self.heartbeat: Callable[[float], None] | None = None  # called with each tick's end time
-        self._reports: deque[tuple[str, str, str]] = deque()  # events raised outside the tick
+        self._reports: deque[tuple[str, str, str]] = deque()  # events reported outside a tick
         self._ending = False
         self._stopping = False
-        self._began = -math.inf  # start of the current tick, machine time [s]
+        self._began = -math.inf  # machine time at the start of the current tick [s]
         self._commanded = False  # True if a potentially slow command was executed on this tick
 
     # Other threads and signal handlers may call the following methods.
@@ -186,7 +186,7 @@ class Loop:
     # The tick
 
     def tick(self, now: float) -> float:
-        """Run the pipeline once at clock time ``now``; return the machine time at its end."""
+        """Run the pipeline once at clock time ``now``; return the machine time at the end."""
         state, clock, statistics = self.state, self._clock, self.statistics
         began = self._began = clock.host()
         state.seq += 1

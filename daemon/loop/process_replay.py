@@ -1,8 +1,9 @@
 """Run the installed code, tick by tick, on a recording's readings, frames and commands.
 
 The servos, sensors, clock and commands are replayed from the recording. The estimator, tables,
-filter, control and limits come from the installed code. If the recording contains all inputs since
-the first tick, and code and settings are unchanged, the states are reproduced bit for bit.
+filter, control and limits come from the installed code. The states are reproduced bit for bit under
+two conditions: the recording contains all inputs since the first tick, and the code and the
+settings are unchanged.
 """
 
 from __future__ import annotations
@@ -77,8 +78,9 @@ class ProcessReplay:
 
         Parameters
         ----------
-        taken : the tick's ``hand/input`` message frames : new frames by finger index commands :
-        commands that were executed on the tick
+        taken : ``hand/input`` message of the tick
+        frames : new frames by finger index
+        commands : commands that were executed on the tick
         """
         loop = self._loop
         self._clock.sleep_until(taken["t"])
@@ -180,7 +182,7 @@ class _Commands:
             try:
                 handler(request, 0.0)
             except Refused:
-                pass  # Comparing the states will reveal any difference.
+                pass  # A refusal causes a difference between the states.
         self.waiting = []
 
     def close(self) -> None:

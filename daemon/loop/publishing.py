@@ -1,9 +1,9 @@
 """Decide which topics to publish on each tick, and measure the actual rates.
 
-Each topic is published on every n-th tick (counted by ``seq``); n is chosen so that the rate is
-closest to the requested rate. If n is large enough, statistics are published a few ticks after the
-state, so that one tick does not publish everything. Every n-th tactile frame is published.
-`wire.publisher` sends the messages; this module does not change the state.
+Each topic is published on every n-th tick, counted by ``seq``. The divisor n is chosen so that the
+rate is closest to the requested rate. If n is large enough, statistics are published a few ticks
+after the state, so that one tick does not publish everything. Every n-th tactile frame is
+published. `wire.publisher` sends the messages; this module does not change the state.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ class Publishing:
         self.truth: Truth | None = None  # for simulated hands only
         self._numbers = [0, 0]  # number of published frames per finger
         self._seen: list[Frame | None] = [None, None]  # newest frame per finger
-        self._published = [-1, -1]  # number of the last published group of frames, per finger
+        self._published = [-1, -1]  # `Frame.seq` // n of the last published frame, per finger
         self._states = self._maps = 0  # numbers of published messages
-        # Time [s] and counts when the rates were last published.
+        # Time [s] and counts when the rates were last calculated.
         self._counted: tuple[float, ...] = (0.0,) * 6
 
     def __call__(self, state: State) -> None:

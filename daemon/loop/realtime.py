@@ -1,9 +1,9 @@
 """Configure scheduling, memory and timers for a steady tick, and notify systemd.
 
-The measures in the ``[realtime]`` settings are applied once, after warm-up. Each measure is
-optional: if the system refuses a measure, a warning explains the consequence and gives the command
-that grants the permission. `daemon.clock` implements the busy wait before a deadline. The `Service`
-class sends the READY, WATCHDOG and STOPPING notifications to systemd with sd_notify.
+The ``[realtime]`` settings are applied once, after warm-up. Each setting is optional. If the system
+refuses a setting, a warning explains the consequence and gives the command that grants the
+permission. `daemon.clock` implements the busy wait before a deadline. The `Service` class sends the
+READY, WATCHDOG and STOPPING notifications to systemd.
 """
 
 from __future__ import annotations
@@ -50,20 +50,20 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 # flags, nice, priority, runtime, deadline, period.
 _ATTRIBUTE_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 _ATTRIBUTES = struct.Struct("=IIQiIQQQ")
-_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # range of time slices accepted by the kernel [ns]
+_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # range of time slices that the kernel accepts [ns]
 
 
 class RealTime:
-    """Real-time measures, active inside ``with RealTime(settings): loop.run()``.
+    """Real-time settings, active inside ``with RealTime(settings): loop.run()``.
 
-    Open the object in the loop thread, after warm-up. Opening never raises an exception;
-    ``granted`` and ``refused`` list the outcome of each measure. In virtual time, only the garbage
-    collector and the thread switch interval are adjusted.
+    Create the object in the loop thread, after warm-up. A refused setting does not raise an
+    exception. ``granted`` and ``refused`` list the outcome of each setting. In virtual time, only
+    the garbage collector and the thread switch interval are adjusted.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.granted: list[str] = []
-        self.refused: list[str] = []  # rejected settings, each with its consequence and remedy
+        self.refused: list[str] = []  # refused settings, each with its consequence and remedy
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
@@ -85,12 +85,12 @@ class RealTime:
             self._granted(f"busy-waiting for {wanted.spin * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
-        """Return one event for all granted measures, and one event for each refused measure."""
+        """Return one event for all granted settings, and one event for each refused setting."""
         events = [("info", "realtime", ", ".join(self.granted))] if self.granted else []
         return events + [("warning", "realtime", text) for text in self.refused]
 
     def close(self) -> None:
-        """Undo all measures. Never raises."""
+        """Undo all settings. Never raises."""
         while self._undo:
             try:
                 self._undo.pop()()
@@ -114,8 +114,8 @@ class RealTime:
         """Keep the garbage collector and other threads from delaying the loop.
 
         A full collection of all NumPy and Numba objects takes tens of milliseconds, so existing
-        objects are frozen. Another thread may hold the interpreter lock for one switch interval,
-        which is 5 ms by default.
+        objects are frozen. Another thread may hold the interpreter lock for one switch interval, so
+        the default of 5 ms is reduced.
         """
         self._undo += [gc.unfreeze, partial(sys.setswitchinterval, sys.getswitchinterval())]
         if freeze:
@@ -125,10 +125,11 @@ class RealTime:
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
     def _schedule(self, priority: int) -> None:
-        """Set SCHED_FIFO for the loop thread and, one level lower, for other interpreter threads.
+        """Set SCHED_FIFO for all threads of the interpreter.
 
-        If a reader thread is preempted while it holds the interpreter lock, the loop is delayed.
-        Native threads, such as ZeroMQ's, and child processes keep normal scheduling.
+        The loop thread gets ``priority``, and the other threads get one level less. Otherwise, the
+        loop would be delayed if a reader thread were preempted while holding the interpreter lock.
+        Native threads, such as ZeroMQ's, and child processes keep the normal scheduling.
         """
         undo: list[Callable[[], object]] = []
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -184,8 +185,8 @@ class RealTime:
     def _lock_memory(self) -> None:
         """Lock each page in memory on first access. Warm-up has already accessed the loop's pages.
 
-        Locking all pages immediately would take almost a second, although two thirds of the
-        compiler libraries' pages are never accessed. If locked memory is limited, only existing
+        Locking all pages immediately would take almost a second, although two thirds of the pages
+        of the compiler libraries are never accessed. If locked memory is limited, only existing
         mappings are locked, because later mappings would otherwise fail.
         """
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
@@ -201,7 +202,7 @@ class RealTime:
             self._granted("memory locked", libc.munlockall)
 
     def _hold_latency(self) -> None:
-        """Prevent deep processor idle states until the file that this method opens is closed."""
+        """Prevent deep processor idle states as long as the device file stays open."""
         try:
             descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -248,10 +249,10 @@ def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
 
 
 class Service:
-    """Notifier for systemd via the socket in ``NOTIFY_SOCKET``. Never blocks or raises.
+    """Sender of notifications to systemd over ``NOTIFY_SOCKET``. Never blocks or raises.
 
     Each systemd notification is one datagram. The loop calls `alive` on every tick. Most calls only
-    compare times; only a few messages are sent per watchdog period.
+    compare times, because a few messages per watchdog period are sufficient.
     """
 
     def __init__(self, address: str, watchdog: float = 0.0) -> None:
@@ -270,7 +271,7 @@ class Service:
 
     @classmethod
     def of_environment(cls, environment: Mapping[str, str] = os.environ) -> Service | None:
-        """Return the service described by the environment, or None without systemd."""
+        """Return the service for this environment, or None if systemd did not start the process."""
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@") or len(address) < 2:
             return None
@@ -280,7 +281,7 @@ class Service:
         return cls(address, watchdog)
 
     def alive(self, t: float) -> None:
-        """Send a keep-alive message if due at ``t`` [s]. The first message reports READY."""
+        """Send a keep-alive message if one is due at ``t`` [s]. The first message reports READY."""
         if t < self._due:
             return
         self._due = t + self._every

@@ -80,7 +80,7 @@ def _malformed(text: str) -> Refused:
 
 
 def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
-    """Return the range of a command parameter, or an infinite range if it depends on the grip.
+    """Return the range of a command parameter. The range is infinite if it depends on the grip.
 
     A force must be greater than the lower bound.
     """
@@ -126,14 +126,14 @@ class Lease:
         return self._owner or "the client in control"
 
     def renew(self, command: Command, now: float) -> None:
-        """Take or extend the client's lease after a command has been executed."""
+        """Grant or extend the client's lease after a command has been executed."""
         if command.name not in NO_LEASE_COMMANDS:
             self._owner = command.client
             self._until = now + self.seconds
 
 
 class Requests:
-    """Request executor. Only the loop thread may call it, between two stages of a tick."""
+    """Request executor. Only the loop thread may use it, between two stages of a tick."""
 
     def __init__(
         self,
@@ -192,7 +192,8 @@ class Requests:
             If the request is rejected. The message gives the reason.
         """
         state, control = self._state, self._control
-        # A stop command is accepted in every mode and from every client, even with unknown fields.
+        # A stop command is accepted in every mode and from every client, even if it has unknown
+        # fields.
         if request["command"] == "stop":
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}
@@ -356,14 +357,14 @@ class Requests:
         self._emit("info", "servos", "reconnected")
 
     def _reopen(self, name: str) -> None:
-        """Reopen the sensors that have lost their port.
+        """Reopen the sensors whose port was lost.
 
         Sensors are reopened only by ``clear`` and ``arm``, while torque is off.
 
         Raises
         ------
         Refused
-            If a sensor cannot be opened on ``clear``. A hand may be armed without sensors.
+            If ``clear`` cannot reopen a sensor. A hand may be armed without sensors.
         """
         if self._state.torque:
             return

@@ -1,13 +1,13 @@
-"""Measure the loop timing: histograms of the stage durations, and tick delays.
+"""Collect the loop's stage durations in histograms, and monitor the tick delays.
 
 A single kernel call per tick updates the histograms. The daemon publishes the quantiles of the
 histograms once per second. Each octave above 1 ns is divided into 32 bins. A quantile is reported
 as the upper edge of its bin, so it is never too small and at most 3.2 % too large. The maximum is
 exact.
 
-Tick delays, measured in machine time, are reported in occasional events and as a possible cause of
-faults. While a tick is late, real hardware is uncontrolled, whereas a simulated hand on its own
-clock waits (`daemon.clock.HandClock`).
+Tick delays are measured in machine time and reported in occasional events. A fault text also
+mentions a tick delay if the delay may be the cause. While a tick is late, real hardware is
+uncontrolled, whereas a simulated hand on its own clock waits (`daemon.clock.HandClock`).
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _BIN_EDGES = np.ldexp(
 _UPPER_EDGES = np.append(_BIN_EDGES.ravel()[:-1], np.inf)
 
 LATENESS_MIN = 0.05  # minimum delay that is reported [s]
-# Minimum time between reports [s]. In addition, the total delay must have doubled since the
-# previous report.
+# Minimum time between reports [s]. A report also requires that the total delay has doubled since
+# the previous report.
 REPORT_INTERVAL = 60.0
-ATTRIBUTION_TIME = 0.25  # time after a late tick during which faults may be attributed to it [s]
-# Limits that can be exceeded because of a single late tick.
+ATTRIBUTION_TIME = 0.25  # time after a late tick in which faults may be attributed to the delay [s]
+# Limits that a single late tick can violate.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
 Event = tuple[str, str, str]
@@ -65,7 +65,8 @@ def _bin(value: float) -> int:
 def record(counts: Counts, largest: FloatArray, times: tuple[float, float, float, float]) -> None:
     """Add one tick's times [s], in the order of `TIMES`, to the histograms.
 
-    ``counts`` int64 [times, bins] and ``largest`` float64 [times] are updated in place.
+    The arrays ``counts`` (int64 [times, bins]) and ``largest`` (float64 [times]) are updated in
+    place.
     """
     for i in range(len(times)):
         counts[i, _bin(times[i])] += 1
@@ -107,7 +108,7 @@ class Statistics:
 
 
 class Lateness:
-    """Delay monitor for one loop's ticks."""
+    """Monitor for the tick delays of one loop."""
 
     def __init__(self, settings: Settings, timing: Timing, waits: bool) -> None:
         """Create the monitor; it writes only the ``busy_s`` field of the loop's ``timing``.
@@ -118,14 +119,14 @@ class Lateness:
         self._period = 1.0 / settings.loop.rate
         self._waits = waits
         self._sum = 0.0  # total delay of the ticks, or total time that the hand has waited [s]
-        self._reported = (0.0, -math.inf)  # total delay and time at the last report [s]
+        self._reported = (0.0, -math.inf)  # total delay and clock time at the last report [s]
         self._busy_until = -math.inf
 
     def look(self, t: float, own_doing: bool) -> Event | None:
         """Evaluate the tick that began at ``t`` [s]; return an event to emit, or None.
 
-        ``timing`` must already contain the start time of this tick. ``own_doing`` is True if a
-        command executed on the previous tick may have delayed this tick.
+        ``timing.tick_s`` must already be set for this tick. ``own_doing`` is True if a command
+        executed on the previous tick may have delayed this tick.
         """
         timing = self._timing
         gap = 0.0 if own_doing else timing.tick_s - self._period

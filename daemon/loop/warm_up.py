@@ -1,9 +1,9 @@
 """Compile a scene's kernels by running each part of the pipeline once before the first tick.
 
-`loop.build` runs all parts before the loop is created, and therefore before torque can be on. On
-first use, `processes.compile` first compiles the parts in parallel processes. Each part builds the
-objects that it needs, runs them on an artificial contact and discards them. Components that are not
-in the scene are skipped.
+`loop.build` runs all parts before the loop is created, and therefore before torque can be switched
+on. On first use, `processes.compile` compiles the parts in parallel beforehand. Each part builds
+the objects that it needs, runs them on an artificial contact and discards them. Components that are
+not in the scene are skipped.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from softfinger.kinematics.hand.servo_heat import (
 
 
 class WantedScene:
-    """Scene whose kernels are compiled; ``on_event`` receives events about its finger models."""
+    """Scene whose kernels are compiled; ``on_event`` receives events about the finger models."""
 
     def __init__(
         self, settings: Settings, on_event: Callable[[str, str, str], None] | None = None
@@ -93,7 +93,7 @@ def named(name: str) -> Part:
 
 
 def is_built(part: Part, settings: Settings) -> bool:
-    """Return True if the cache contains ``part`` for this tip type and the current sources."""
+    """Return True if the cache contains ``part`` for this tip type and the current code."""
     folder = kernel_folder()
     return folder is not None and is_marked(folder, _kind(part, settings))
 
