@@ -24,7 +24,7 @@ def make_tip(settings: Settings) -> Fingertip:
 
 
 def law_problem(material: Material, limit: float) -> str:
-    """Describe the fit error of a law if the relative force error exceeds ``limit``, or return ""."""
+    """Describe the fit error of a law if the force error exceeds ``limit``, otherwise return ""."""
     found = material.worst_force_error
     if found <= limit:
         return ""

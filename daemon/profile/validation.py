@@ -127,10 +127,10 @@ def _set_forces(settings: Settings) -> list[tuple[str, float]]:
 
 
 def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
-    """Yield the key, force [N] and displacement [m] of an upright spring tip for each configured
-    force.
+    """Yield the key, force [N] and displacement [m] of a spring tip for each configured force.
 
-    The force is computed as in `Material.force_error`, by summing over strain steps.
+    The tip is upright. The force is computed as in `Material.force_error`, by summing over strain
+    steps.
     """
     if settings.tip.physics != "springs":
         return

@@ -34,7 +34,7 @@ _AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
 # Half the thermometer's resolution [°C]. A rounded reading may reach the limit while the actual
 # temperature is lower by half the resolution.
 _HALF_STEP = 0.5
-_TARGET_MARGIN = 3.0  # margin below the limit for the target temperature after a reduction [°C]
+_TARGET_MARGIN = 3.0  # target temperature after a reduction, measured downwards from the limit [°C]
 _FRACTION_MAX = 0.97  # maximum ratio of new to old force; a smaller reduction is not worthwhile
 _FRACTION_MIN = 0.6  # minimum ratio of new to old force, because the first estimate is uncertain
 _SETTLING_TIME = 10.0  # time from a reduction to the next evaluation [s]

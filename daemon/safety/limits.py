@@ -1,9 +1,9 @@
-"""Define all limits of the hand, with their checks and consequences, in the ``LIMITS`` table.
+"""Define the ``LIMITS`` table with the check and the consequence of each limit.
 
 - ``warn``: reported once on ``hand/event``, and again only after the problem has been absent for a
   while.
-- ``limit``: the goal is modified before it is sent; ``status`` counts the affected ticks. -
-``fault``: torque is turned off until ``clear``. ``clear`` is refused while the cause persists.
+- ``limit``: the goal is modified before it is sent; ``status`` counts the affected ticks.
+- ``fault``: torque is turned off until ``clear``. ``clear`` is refused while the cause persists.
 
 Each row decorates its check function, so the rows are in the order of this file. If several fault
 limits are violated, the first row in the table determines the reported fault. ``softfinger limits``
@@ -72,7 +72,7 @@ class JointMotion:
         self._drift = [0.0, 0.0]  # angle minus integrated velocity [rad]
 
     def restart(self) -> None:
-        """Discard all readings, so that the next reading is not compared with an earlier reading."""
+        """Discard all readings. The next reading is not compared with an earlier reading."""
         self.jumped = 0
         self._request_time = self._t = -math.inf
 
@@ -127,7 +127,7 @@ class View:
         self.bad_goal = False  # True if a goal was not finite since the previous check
         self.grip_width = math.nan  # object width at the start of the grip [m]
         self._target = math.nan  # commanded grip force on the previous tick [N]
-        self.rise_t = math.inf  # time of a commanded increase that the tips have not measured [s]
+        self.rise_t = math.inf  # time of a commanded force increase that is not yet measured [s]
         self.rise_felt = 0.0  # measured force at `rise_t` [N]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":

@@ -98,7 +98,7 @@ class Safety:
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
         self._found: dict[_Watch, str] = {}  # current violations of fault limits
-        self.must_hold = False  # True if late frames require holding the goal during a grip
+        self.must_hold = False  # True if the goal of a grip must be held because frames are late
         self.warnings: list[Breach] = []  # new warnings, which the loop reports and removes
         self.limited: Counter[str] = Counter()  # number of ticks with a modified goal, per limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate

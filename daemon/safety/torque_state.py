@@ -186,9 +186,7 @@ class TorqueState:
         return silence > 0.0
 
     def _report(self) -> None:
-        """Report once that torque off is unconfirmed, and latch a fault unless one is already
-        latched.
-        """
+        """Report once that torque off is unconfirmed, and latch a fault if none is latched."""
         if self._reported:
             return
         self._reported = True
