@@ -1,7 +1,7 @@
 """Read, check, write and apply a sensor's calibration file.
 
-Each sensor has one JSON file. A calibration step that has not been run is null in the file. Its
-value then comes from the settings. `kinematics.calibration` explains the numbers.
+Each sensor has one JSON file. A calibration step that has not been run is null in the file. The
+settings provide the values of a missing step. `kinematics.calibration` explains the numbers.
 """
 
 from __future__ import annotations
@@ -93,7 +93,8 @@ class CurveStep(_StepModel):
 class CentreStep(_StepModel):
     """Position of the tip centre on the sensor [m], and rotation of the sensor [rad].
 
-    ``std`` is the standard deviation of the centre. ``rotation`` is null if it was not measured.
+    ``std`` is the standard deviation of the centre. ``rotation`` is null if the rotation was not
+    measured.
     """
 
     date: str
@@ -105,7 +106,10 @@ class CentreStep(_StepModel):
 
 
 class ModulusStep(_StepModel):
-    """Measured modulus [Pa] or points of a stress-strain law, with a relative residual."""
+    """Measured modulus [Pa], or points of a measured stress-strain law.
+
+    ``residual`` is the relative residual of the fit.
+    """
 
     date: str
     modulus: Positive
@@ -115,7 +119,7 @@ class ModulusStep(_StepModel):
     residual: Finite
 
     def material(self) -> Material:
-        """Return the tip's stress-strain law. Raises ValueError for unsuitable points."""
+        """Return the tip's stress-strain law. Raises ValueError if the points are unsuitable."""
         if self.strain:
             return Material.from_points(self.strain, self.stress)
         return Material.constant(self.modulus)
@@ -124,8 +128,8 @@ class ModulusStep(_StepModel):
 class ScalesStep(_StepModel):
     """A finger's calibration factors, each stored as (mean, relative standard deviation).
 
-    The factors are measured in grips. ``modulus`` is relative to the modulus in this file, or in
-    the settings if the file contains no modulus.
+    The factors are measured while the hand grips an object. ``modulus`` is relative to the modulus
+    in this file, or in the settings if the file contains no modulus.
     """
 
     date: str
@@ -154,7 +158,7 @@ class Calibration(_StepModel):
 
     @property
     def identity(self) -> str:
-        """Sensor label and date of the file. The finger name replaces a missing label."""
+        """Sensor label and date of the file. The finger identifies a sensor without a label."""
         return f"{self.sensor.label or self.sensor.finger} {self.date}"
 
     def summary(self) -> str:
@@ -245,7 +249,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 class Converter:
-    """Converter from one sensor's counts to pressures [Pa]."""
+    """Conversion of one sensor's counts to pressures [Pa]."""
 
     def __init__(
         self, calibration: Calibration, pascal_per_count: float, full_count: int | None = None
@@ -322,7 +326,8 @@ def least_end(ends: FloatArray) -> float:
     """Return the smallest measuring range of all working cells.
 
     The range of a cell extends from its zero offset to saturation. Cells that are nearly saturated
-    without a load are ignored. Their small ranges would make all other cells count as saturated.
+    without a load are ignored. The small range of such a cell would make all other cells count as
+    saturated.
     """
     return float(ends[ends >= _FAULTY * np.median(ends)].min())
 

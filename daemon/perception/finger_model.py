@@ -71,7 +71,7 @@ def make_models(
             calibration = calibration_for(settings, finger)
         if measured:
             if name not in settings.scene.fingers:
-                continue  # The other finger's model is copied below.
+                continue  # Copy the model of the other finger below.
             material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
             table = make_table(settings, material, tip)
         elif calibration is not None and calibration.modulus is not None:

@@ -7,9 +7,9 @@ footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain:                 frame
 amplitude   MODULUS + GAIN, if the gain was fitted                     2 %, frame covariance
 
 A frame shows the hand at the time when the sensor scanned the cells. Each frame is therefore
-compared with the state at the scan time. The joint history is used to reconstruct this state.
-`estimate.systematic` is the covariance of the errors that all frames share. This covariance does
-not count as noise; it only increases the published standard deviations.
+compared with the state at the scan time. The joint history provides the state at the scan time.
+`estimate.systematic` is the covariance of the errors that all frames share. The systematic
+covariance does not count as noise; it only increases the published standard deviations.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class FingerMotion(NamedTuple):
 
 @inner_kernel
 def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int) -> FingerMotion:
-    """Interpolate the motion history at time ``t``. Times outside the history are clamped."""
+    """Interpolate the motion history at time ``t``, clamped to the ends of the history."""
     size = len(history)
     before = after = newest
     fraction = 0.0
@@ -139,9 +139,9 @@ def _rates(
 ) -> tuple[float, float]:
     """Return the rates of d [m/s] and θ [rad/s] at the time ``scan``.
 
-    The latency slopes use these rates. Each rate is averaged over ±1 standard deviation of the
-    latency, because the joints may have stopped within this interval. Rates below the velocity
-    resolution are set to 0.
+    The rates determine the derivatives with respect to the latency. Each rate is averaged over ±1
+    standard deviation of the latency, because the joints may have stopped within this interval.
+    Rates below the velocity resolution are set to 0.
     """
     span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_INTERVAL_MIN)
     first = _motion_at(history, h.newest_row, scan - span, finger)
@@ -299,8 +299,8 @@ def _update_amplitude(
     """Update the state with the amplitude of a frame.
 
     ``found`` is (d, gain), and ``noise`` is the frame covariance without its systematic part. The
-    errors of d and gain are correlated. The footprint update has already used the correlated part,
-    so this update uses only the rest.
+    errors of d and gain are correlated. The footprint update has already used the correlated part
+    of the errors. The amplitude update therefore uses only the uncorrelated part.
     """
     d, gain = found
     d_noise = noise[0, 0]
@@ -377,8 +377,9 @@ def _update_angle(
 def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: float) -> None:
     """Update the state with the footprint, using the current slopes.
 
-    If the innovation exceeds the gate and the other tip's innovation has the opposite sign, the
-    object has moved sideways. If the signs are equal and the gain is fixed, the gain has changed.
+    A large innovation whose sign is opposite to that of the other tip's innovation means that the
+    object has moved sideways. If both innovations have the same sign and the gain is fixed, the
+    sensor gain has changed.
     """
     d_innovation = innovation / h.slopes[D + finger]
     other = h.tip[1 - finger].d_innovation
@@ -398,11 +399,11 @@ def _is_rejected(
     """Return True if a frame of a held object is an outlier, and count consecutive outliers.
 
     A jump in angle or displacement is an outlier unless the other tip or the joints confirm the
-    jump. A rotation must appear at both tips. In addition, the joints must be moving or the
-    rotation must continue. A displacement is accepted if the joints are moving or if both tips are
-    displaced. A blow displaces both tips, because it presses the object into one tip and away from
-    the other. The first frame of a real jump is also rejected, because the other tip's frame has
-    not arrived yet.
+    jump. A rotation is accepted if both tips show the rotation while the joints are moving. If the
+    joints are at rest, the rotation must continue in the next frame. A displacement is accepted if
+    the joints are moving or if both tips are displaced. A blow displaces both tips, because it
+    presses the object into one tip and away from the other. The first frame of a real jump is also
+    rejected, because the other tip's frame has not arrived yet.
     """
     grasp = h.grasp
     tip = h.tip[finger]

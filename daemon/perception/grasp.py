@@ -57,7 +57,7 @@ class GraspState(Record):
     unexplained_rotation: Pair  # accumulated object rotation that the joints do not explain [rad]
 
     # Consistency
-    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running averages, expected to be about 1
+    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running averages; the expected value is 1
     angle_jump: Pair  # angle in the newest frame minus the predicted angle, during a grip [rad]
     d_jump: Pair  # d in the newest frame minus the predicted d [m]; 0 if d is not measured
     rejects_frames: Pair  # 1 if too many consecutive frames were rejected

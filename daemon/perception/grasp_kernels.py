@@ -88,7 +88,7 @@ class GraspResult(NamedTuple):
 def _log_slope(h: HandFilter, finger: int) -> float:
     """Return ∂ ln F/∂d [1/m] of a tip.
 
-    With a fixed gain, the slope of the footprint channel is returned. If two channels used
+    If the gain is fixed, the slope of the footprint channel is returned. If two channels used
     different slopes, unobservable directions of the state would appear observable.
     """
     tip = h.tip[finger]
@@ -150,7 +150,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
 def _relative_law_error(tip: TrackedTip, fraction: float) -> float:
     """Return the relative error of the tip force at ``fraction`` = d/radius.
 
-    The contact table and the material law cause this error.
+    The error is due to the contact table and the material law.
     """
     t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)

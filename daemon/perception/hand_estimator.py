@@ -17,8 +17,8 @@ the default hand and a disc of radius R = 20 mm, the result is 0.4. The predicti
 for which the result would be 1.5. The frames correct the error of the prediction. A rotation of a
 disc therefore takes longer, and the disc rolls further than commanded. A curved contact appears
 less tilted than it is, so φ is about 5 % too small for a disc. If the fingers are straight or lean
-outwards, joint motion does not rotate the line between the contacts. A disc with R ≥ 30 mm can be
-held, but its rotation stops at the tip limits.
+outwards, the line does not follow the joint motion. A disc with R ≥ 30 mm can be held, but its
+rotation stops at the tip limits.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ class HandEstimator:
         if not in_contact:
             tip = self._state.tip[finger]
             if tip.in_contact:
-                self.grasp.free_torque[finger] = 0.0  # The next approach measures it again.
+                self.grasp.free_torque[finger] = 0.0  # measured again during the next approach
                 tip.free_torque_max[:] = 0.0
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0

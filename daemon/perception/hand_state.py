@@ -1,4 +1,4 @@
-"""State of the hand, its prediction from joint motion, and its update with one measurement.
+"""Define the hand's state, predict it from joint motion, and update it with one measurement.
 
 `docs/estimation.md` derives the model and lists the manoeuvres that make each state observable.
 
@@ -45,7 +45,7 @@ ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4
 HISTORY_TIME = 0.5
 LAW_POINTS = 17  # number of evenly spaced values of d from 0 to the tip radius
 
-GATE = 3.0  # larger innovations are down-weighted; in standard deviations
+GATE = 3.0  # number of standard deviations beyond which innovations are down-weighted
 OUTLIER_GATE = 5.0  # minimum deviation that counts as a fault, in standard deviations
 MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
 MODEL_ERROR_TIME = 0.1  # correlation time of the model error [s]
@@ -325,7 +325,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
-    # Before contact, the gap shrinks at the same rate as d would grow during contact.
+    # Before contact, the gap shrinks at the rate at which d grows during contact.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:
@@ -473,7 +473,7 @@ def _encoder_measurement(h: HandFilter, finger: int, q: float, step: float) -> t
 def _measure_free_torque(
     h: HandFilter, finger: int, t: float, dt: float, speed_change: float
 ) -> None:
-    """Measure the friction of a freely moving joint, which is the maximum joint torque.
+    """Measure the friction of a joint as the maximum torque during free motion.
 
     Readings from the last `frame_age_max` seconds are excluded. During this time, the tip may
     already be in contact although no frame shows the contact.

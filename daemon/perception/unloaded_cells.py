@@ -1,8 +1,8 @@
 """Measure the zero shift and the noise of a sensor with the cells outside the tip.
 
 An unloaded cell reads its zero offset plus noise. With a tip radius of 20 mm, about 60 % of a 58 mm
-grid lies outside the tip. The cells there show the zero offset and the noise even while the tip is
-in contact. A second contact that loads only a few unloaded cells does not change their median.
+grid lies outside the tip. The outer cells show the zero offset and the noise even while the tip is
+in contact. A second contact that loads only a few outer cells does not change the median reading.
 Readings are clipped at 0, so unloaded cells cannot show a zero offset below 0.
 `perception.frame_channels` detects a negative offset from the joint motion while the fingers close.
 """

@@ -67,7 +67,7 @@ class Section(BaseModel):
 
 
 def names_backend(kind: Kind) -> AfterValidator:
-    """Return a validator for backend names, with the same error messages as for a Literal."""
+    """Return a validator for backend names. Error messages are worded like those of a Literal."""
 
     def check(name: str) -> str:
         try:

@@ -2,10 +2,11 @@
 
 The module predicts when a servo will reach ``safety.temperature_max``. If the remaining time is
 less than ``heat_warn``, `safety.limits` issues a warning. The grip force is then reduced to the
-highest force that the servo can sustain indefinitely, but not below the force that the load
-requires. If the load does not allow a sufficient reduction, an error is reported _ERROR_TIME
-seconds before the servo reaches the limit. ``heat_action`` is performed _ACTION_TIME seconds before
-the limit. The reduced force applies until the grip ends, even if a client commands another force.
+highest force that the servo can sustain indefinitely. The grip force is never reduced below the
+force that the load requires. If the load does not allow a sufficient reduction, an error is
+reported _ERROR_TIME seconds before the servo reaches the limit. ``heat_action`` is performed
+_ACTION_TIME seconds before the limit. The reduced force applies until the grip ends, even if a
+client commands another force.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ _AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
 # Half the thermometer's resolution [°C]. A rounded reading may reach the limit while the actual
 # temperature is lower by half the resolution.
 _HALF_STEP = 0.5
-_TARGET_MARGIN = 3.0  # target temperature after a reduction, measured downwards from the limit [°C]
+_TARGET_MARGIN = 3.0  # margin between the temperature limit and the target temperature [°C]
 _FRACTION_MAX = 0.97  # maximum ratio of new to old force; a smaller reduction is not worthwhile
 _FRACTION_MIN = 0.6  # minimum ratio of new to old force, because the first estimate is uncertain
 _SETTLING_TIME = 10.0  # time from a reduction to the next evaluation [s]
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
-# Winding's fraction of the total heat capacity, and fraction of the total thermal resistance
+# Fraction of the total heat capacity in the winding, and fraction of the total thermal resistance
 # between winding and case.
 _WINDING_SHARE, _COUPLING_SHARE = 0.04, 0.4
 

@@ -55,8 +55,8 @@ class JointMotion:
     """Check of joint angles against the measured velocities and the maximum velocity.
 
     An encoder may jump, freeze while the joint rotates, or drift while the joint is at standstill.
-    The angles of a faulty encoder are inconsistent with the measured velocity. In this case, the
-    finger's bit is set in ``jumped``.
+    The angles of a faulty encoder are inconsistent with the measured velocity. If an encoder is
+    faulty, the bit of its finger is set in ``jumped``.
     """
 
     def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:
@@ -193,8 +193,8 @@ FingerCheck = Callable[[View, State, float, int], str]
 class Limit:
     """One row of the limit table. As a decorator, `Limit` adds the row with the decorated check.
 
-    Rows without a check are added directly. The limits in these rows are applied in `Safety.write`,
-    on the bus or in the gateway.
+    A row without a check is appended to `LIMITS` directly. A limit without a check is applied in
+    `Safety.write`, on the bus or in the gateway.
     """
 
     name: str
@@ -205,7 +205,7 @@ class Limit:
     check: Check | None = None
     lasts: float | str = 0.0  # minimum duration of a violation [s], or the name of a setting
     fraction: float = 1.0  # fraction of the bound at which a violation is reported
-    in_turn: bool = False  # True if the check takes turns with other checks, one check per tick
+    in_turn: bool = False  # True if the check takes turns with others, one check per tick
     gripping: bool = False  # True if the limit applies only while gripping
 
     def __call__(self, check: Check) -> Check:
@@ -443,8 +443,8 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     )
 
 
-# Smallest overlap of the tips that is reported, in tip radii. Offset errors and frame latency cause
-# smaller overlaps.
+# Smallest reported overlap of the tips, in tip radii. Offset errors and frame latency cause smaller
+# overlaps.
 _OVERLAP_RATIO = 0.5
 
 

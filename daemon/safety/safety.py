@@ -104,7 +104,7 @@ class Safety:
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
         dt = 1.0 / settings.loop.rate
         self._step = limits.goal_speed * dt
-        # In position mode, no current limit restricts the effect of a goal jump.
+        # In position mode, the current limit does not reduce the effect of a goal jump.
         self._travel = 0.0 if settings.servos.mode == "position" else limits.goal_reach
         self._rise = limits.current_rate * dt
         self._ends = [(i, hand.q_min[i], hand.q_max[i]) for i in view.fingers]

@@ -4,7 +4,7 @@ Joint angles and currents remain consistent, because each servo reports its own 
 tactile sensors show the error. A tip in contact tilts by about the angle through which its finger
 rotates. The tilt therefore shows which of the two reported joint angles belongs to the finger. If
 the object does not yield, the tip force rises although the servo reports a stationary joint. During
-a rotation, the object rotates opposite to the command.
+a commanded rotation, the object rotates in the wrong direction.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class Servos(Protocol):
 class JointPlant(Protocol):
     """Simulated joints and motors for simulated and emulated servos.
 
-    Index 0 is the left finger's joint. Positive motion and positive current close the finger.
+    Index 0 is the left finger's joint. Positive velocities and currents close the finger.
     """
 
     q: FloatArray  # true joint angles [rad] at the time of the last `advance`
@@ -135,8 +135,8 @@ def make_servos(settings: Settings, clock: Clock, hand: object) -> Servos | None
 
     Returns None if the scene has no servos.
 
-    ``hand`` is the simulated hand. It is passed only to backends that use it. Raises the same
-    errors as the backend's constructor.
+    ``hand`` is the simulated hand. Only backends that use the simulated hand receive ``hand``.
+    Raises the same errors as the backend's constructor.
     """
     found = backend("servos", settings.servos.backend)
     if settings.servos.backend == "none":

@@ -35,8 +35,8 @@ _WATCHDOG_FIRMWARE = 38
 _FAULT_AFTER_LONG = 0.5  # value of servos.fault_after above which a notice is issued [s]
 _CONSTANT_RATIO_MAX = 1.3  # maximum ratio of a torque constant to its data sheet value
 _TEMPERATURE_MARGIN = 10  # margin below the temperature limit at which a notice is issued [°C]
-# Tolerance beyond the joint limits [rad]. An angle outside this tolerance means that the zero
-# offset is wrong, or that the servo lost its turn count while it was switched off.
+# Tolerance beyond the joint limits [rad]. Outside this tolerance, the zero offset is wrong or the
+# servo has lost its turn count while switched off.
 ANGLE_MARGIN = 0.25
 
 

@@ -230,8 +230,8 @@ _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MO
 # MX-106, the velocity limit is the no-load speed, because the manual's limits apply to firmware
 # before version 42. For the XW430-T200, the e-Manual lists 6.9 N·m at 4.9 A, which is the stall
 # torque of the XW540-T140. The row of the XW430-T200 therefore contains the data of the XH430-W210,
-# with the stall torque multiplied by the gear ratio 200 : 213. For the XW430-T333, this calculation
-# gives 3.2 N·m. The e-Manual lists 3.1 N·m at 1.3 A.
+# with the stall torque multiplied by the gear ratio 200 : 213. For the XW430-T333, scaling by the
+# gear ratio gives 3.2 N·m. The e-Manual lists 3.1 N·m at 1.3 A.
 _430 = 82, (28.5, 46.5, 34.0)  # mass [g], size [mm]
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)

@@ -1,9 +1,9 @@
 """Drive the joints through dynamixel-sdk with one read and one write per tick.
 
 A fast sync read returns the current, velocity, position and alert bit of all servos. Servos with
-older firmware are read with the normal sync read. Every 10 ms, the read also covers the stored
-goals, the bus watchdog and the clock of each servo, which adds 28 bytes per servo. Four times per
-second, the read also covers supply voltage and temperature, which adds 11 bytes per servo.
+older firmware are read with the normal sync read. Every 10 ms, the read covers 28 more bytes per
+servo: the stored goals, the bus watchdog and the clock. Four times per second, the read covers 11
+more bytes per servo: supply voltage and temperature.
 
 One sync write sends goal current and goal position as adjacent registers (:mod:`servos.torque`).
 Current mode and position mode have a single goal, so they do not need indirect addresses. The

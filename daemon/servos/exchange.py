@@ -41,7 +41,7 @@ _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2
 
 
 class TickReads:
-    """Group reads of a tick, one for each register span and length. All are of the same type."""
+    """Group reads of a tick, one for each register span and length."""
 
     def __init__(
         self,

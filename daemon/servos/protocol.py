@@ -13,7 +13,7 @@ All other SDK functions are used unchanged.
 - ``GroupSyncRead`` discards the servos' error bytes and returns 0 after a failure. As a result,
   alerts are lost, and the joint appears to be at position 0.
 - ``broadcastPing`` always waits for 253 servos, which takes 0.8 s at 1 Mbaud.
-- ``PortHandler`` measures deadlines on the wall clock and adds 34 ms. A missing servo therefore
+- ``PortHandler`` measures deadlines with the wall clock and adds 34 ms. A missing servo therefore
   causes a delay of 35 ms, and adjusting the system clock changes the deadline. ``PortHandler`` also
   opens ports that are in use by another process.
 """
@@ -258,7 +258,7 @@ class GroupWrite:
 
 
 class ServoLine:
-    """Exchanges with single servos on an open port. Each is tried up to `TRY_COUNT` times."""
+    """Exchanges with single servos on an open port, with up to `TRY_COUNT` attempts each."""
 
     def __init__(self, port: SerialPort, handler: PacketHandler | None = None) -> None:
         self.port = port

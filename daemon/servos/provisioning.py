@@ -137,7 +137,7 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
     """Return True if several servos with different register values reply to this ID.
 
     Two servos with one ID may send identical ping replies. The replies to a read differ, for
-    example in supply voltage, position and running time, and therefore corrupt each other.
+    example in supply voltage, position and running time, so the replies corrupt each other.
     """
     handler, damaged, silent = line.handler, 0, 0
     for _ in range(_READ_COUNT):
@@ -186,7 +186,7 @@ class Plan:
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
-    """Assign the servos found by a search at the baud ``rates`` to the joints.
+    """Assign the found servos to the joints. ``rates`` are the baud rates of the search.
 
     A servo that replies with the ID of a missing servo at another baud rate counts as the missing
     servo. If exactly one servo is missing and exactly one servo is unassigned, the unassigned servo

@@ -37,7 +37,7 @@ class HandPlant(JointPlant, Protocol):
         """Thermal model of each joint's motor."""
 
     def hold_torque_until(self, t: float) -> None:
-        """Switch torque off at time ``t`` [s], unless the method is called again before."""
+        """Switch torque off at time ``t`` [s], unless the method is called again before ``t``."""
 
 
 class SimulatedServos:
