@@ -91,7 +91,7 @@ class Scan(NamedTuple):
     rotation: float  # object rotation since the scan [rad]
     d_rate: float  # at the scan [m/s]
     theta_rate: float  # at the scan [rad/s]
-    spread: float  # variance of d within the cell response time [m²]
+    spread: float  # variance of d during the response time of the cells [m²]
     relaxation: float  # relaxation factor
 
 

@@ -72,7 +72,7 @@ class TipResult(NamedTuple):
     d_std: float
     theta_std: float
     force_std: float
-    inside: bool  # True if d and θ lie within the contact table
+    inside: bool  # True if d and θ lie within the range of the contact table
 
 
 class GraspResult(NamedTuple):
@@ -100,7 +100,7 @@ def _log_slope(h: HandFilter, finger: int) -> float:
 
 @inner_kernel
 def _set_torque_slopes(h: HandFilter) -> float:
-    """Set the slopes of the mean joint torque due to the tip forces, and return this torque [N·m].
+    """Return the mean joint torque due to the tip forces [N·m], and set the slopes of the torque.
 
     Each joint contributes (1 + TORQUE) M, where M is the moment of the tip force about the joint. M
     equals the joint torque divided by (1 + TORQUE), minus the torque residual. M is proportional to

@@ -179,7 +179,7 @@ class HandEstimator:
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
-            return  # Prediction from joint motion continues, and the age of the contact increases.
+            return  # The contact is still predicted from joint motion, but becomes older.
         # Before the first joint reading, use the frame alone.
         in_contact = estimate.contact and self._joints_read
         if in_contact and self._in_contact[finger] and not has_changed:

@@ -83,7 +83,7 @@ class TrackedTip(Record):
     shear: float  # shear force in the hand plane, measured by a solid tip [N]
     log_slope: float  # ∂ ln F/∂d, low-pass filtered [1/m]
     d_innovation: float  # innovation of d in the newest frame [m]
-    shared_variance: Pair  # variances of d and θ due to errors common to all frames
+    shared_variance: Pair  # variances of d and θ due to errors that all frames share
     q: float  # tracked joint angle [rad]
     encoder: float  # last encoder reading [rad]
     speed: float  # joint speed [rad/s]
@@ -102,7 +102,7 @@ class HistoryRow(Record):
 
     t: float
     d: Pair
-    spread: Pair  # variance of d during the cell response time [m²]
+    spread: Pair  # variance of d during the response time of the cells [m²]
     angle: float
     q: Pair
     relaxation: Pair
@@ -113,8 +113,8 @@ class HandFilter(Record):
 
     mean: Annotated[FloatArray, STATES]
     covariance: Annotated[FloatArray, STATES, STATES]
-    prior_mean: Annotated[FloatArray, STATES]  # state means before a contact
-    prior_variance: Annotated[FloatArray, STATES]  # state variances before a contact
+    prior_mean: Annotated[FloatArray, STATES]  # means of the states before a contact
+    prior_variance: Annotated[FloatArray, STATES]  # variances of the states before a contact
     slopes: Annotated[FloatArray, STATES]  # row of the measurement matrix, zero between updates
     scratch: Annotated[FloatArray, STATES]
     half_separation: float  # half the pivot separation [m]

@@ -90,7 +90,7 @@ class RepeatDetector:
         """
         self._enabled = enabled
         self.period = 0  # repetition period in frames, or 0 if frames do not repeat
-        self._repeated_count = 0  # number of consecutive frames that repeat with this period
+        self._repeated_count = 0  # number of consecutive frames that have repeated with `period`
         self._fault_count = fault_count
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
         self._last: NDArray[np.uint16] | None = None  # frame
@@ -222,7 +222,7 @@ class FingerPerception:
         return frame
 
     def published(self) -> NDArray[np.uint16]:
-        """Return the newest frame [rows, cols] for publication, in the unit given in ``info``."""
+        """Return the newest frame [rows, cols] in the unit that ``info`` specifies."""
         assert self.frame is not None
         assert self._readings is not None
         if not self._publishes_pressure:

@@ -177,8 +177,8 @@ def find(path: Path) -> Path:
 def profile_text(path: Path) -> str:
     """Return a profile's text.
 
-    Raises OSError like `read_file`, UnicodeDecodeError if the file is not UTF-8, and RecursionError
-    if a key has too many parts.
+    Raises the same errors as `read_file`. Raises UnicodeDecodeError if the file is not UTF-8 text.
+    Raises RecursionError if a key has too many parts.
     """
     text = read_file(path, _FILE_SIZE_MAX).decode("utf-8-sig")
     if _DEEP_KEY.search(text):

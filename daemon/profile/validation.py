@@ -147,7 +147,7 @@ def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
 
 
 def _sides(settings: Settings) -> tuple[float, float]:
-    """Return width and height of the sensor [m]."""
+    """Return the width and the height of the sensor [m]."""
     tactile = settings.tactile
     return tactile.cols * tactile.pitch, tactile.rows * (tactile.pitch_y or tactile.pitch)
 

@@ -38,7 +38,7 @@ _HALF_STEP = 0.5
 _TARGET_MARGIN = 3.0  # margin between the temperature limit and the target temperature [°C]
 _FRACTION_MAX = 0.97  # maximum ratio of new to old force; a smaller reduction is not worthwhile
 _FRACTION_MIN = 0.6  # minimum ratio of new to old force, because the first estimate is uncertain
-_SETTLING_TIME = 10.0  # time from a reduction to the next evaluation [s]
+_SETTLING_TIME = 10.0  # time between a force reduction and the next evaluation [s]
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
 # Fraction of the total heat capacity in the winding, and fraction of the total thermal resistance
 # between winding and case.

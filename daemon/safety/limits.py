@@ -1,7 +1,7 @@
 """Define the ``LIMITS`` table with the check and the consequence of each limit.
 
-- ``warn``: reported once on ``hand/event``, and again only after the problem has been absent for a
-  while.
+- ``warn``: a warning is sent on ``hand/event``. It is repeated only after a second without the
+  violation.
 - ``limit``: the goal is modified before it is sent; ``status`` counts the affected ticks.
 - ``fault``: torque is turned off until ``clear``. ``clear`` is refused while the cause persists.
 

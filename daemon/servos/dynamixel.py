@@ -60,7 +60,7 @@ _VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a 
 _CHECK_TIMEOUT = 0.2  # reply timeout during the checks [s]; `clear` blocks the loop for this time
 # Reply timeout for an emulated hand [s]. The hand's clock pauses while the machine is late.
 _BUSY_TIME = 0.04
-_CLOSING_TRY_COUNT = 10  # number of torque-off attempts when closing
+_CLOSING_TRY_COUNT = 10  # number of torque-off attempts before the port is closed
 
 
 class DynamixelServos:

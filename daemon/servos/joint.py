@@ -83,7 +83,9 @@ class JointScale:
         return self.direction * counts * self.velocity
 
     def amperes(self, counts: float) -> float:
-        """Convert a signed current [counts] to a motor current [A], positive when closing."""
+        """Convert a signed current [counts] to a motor current [A]. Positive currents close the
+        joint.
+        """
         return self.direction * counts * self.current_unit
 
     def position_counts(self, q: float) -> int:
@@ -96,7 +98,9 @@ class JointScale:
         return round(self.direction * dq / self.velocity)
 
     def current_counts(self, current: float) -> int:
-        """Convert a motor current [A], positive when closing, to the nearest signed count."""
+        """Convert a motor current [A] to the nearest signed count. Positive currents close the
+        joint.
+        """
         return round(self.direction * current / self.current_unit) if self.current_unit else 0
 
     def bound_counts(self, current: float) -> int:
@@ -116,7 +120,7 @@ class Joint:
     q: float = 0.0  # angle in the last valid reading [rad]
     dq: float = 0.0  # [rad/s]
     sent: deque[bytes] = field(default_factory=deque)  # recently sent goals as register bytes
-    ticks: int = -1  # servo clock reading at the last check
+    ticks: int = -1  # value of the servo clock at the last check
     ticked: float = math.inf  # time when the servo clock last advanced [s]
 
     @property

@@ -190,13 +190,13 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 
     A servo that replies with the ID of a missing servo at another baud rate counts as the missing
     servo. If exactly one servo is missing and exactly one servo is unassigned, the unassigned servo
-    counts as the missing servo. In both cases, the servo must be of the configured model. Servos
-    with corrupted replies are not changed.
+    counts as the missing servo. In both cases, only servos of the configured model are considered.
+    Servos with corrupted replies are not changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
-    # An emulator that does not simulate line timing replies at every baud rate.
+    # Every baud rate gets a reply from an emulator that does not simulate line timing.
     anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}

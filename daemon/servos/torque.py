@@ -1,7 +1,7 @@
 """Switch torque on in verified steps, switch torque off, and manage the bus watchdog.
 
-Torque is switched on at the current angle with zero motor current. Indirect addresses make goal
-current and goal position adjacent registers. Indirect addresses are in RAM and are therefore set
+Torque is switched on at the current angle with zero motor current. Indirect addresses map goal
+current and goal position to adjacent registers. Indirect addresses are in RAM and are therefore set
 whenever torque is switched on.
 """
 
