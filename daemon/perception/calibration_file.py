@@ -68,17 +68,13 @@ class TareStep(_StepModel):
 
 
 class EquilibrateStep(_StepModel):
-    """Gain of each cell, or 0 for a dead cell.
-
-    ``spread`` and ``residual`` are the relative spread of the cells before and after the
-    correction.
-    """
+    """Gain of each cell, or 0 for a dead cell."""
 
     date: str
     gain: list[list[Finite]]
     dead: int
-    spread: Finite
-    residual: Finite
+    spread: Finite  # relative spread of the cells before the correction
+    residual: Finite  # relative spread of the cells after the correction
 
 
 class CurveStep(_StepModel):
@@ -91,32 +87,25 @@ class CurveStep(_StepModel):
 
 
 class CentreStep(_StepModel):
-    """Position of the tip centre on the sensor [m], and rotation of the sensor [rad].
-
-    ``std`` is the standard deviation of the centre. ``rotation`` is null if the rotation was not
-    measured.
-    """
+    """Position of the tip centre on the sensor [m], and rotation of the sensor [rad]."""
 
     date: str
     centre: tuple[Finite, Finite]
-    rotation: Finite | None
+    rotation: Finite | None  # null if the rotation was not measured
     scale: Finite = 1.0
     residual: Finite
-    std: NonNegative = 0.0
+    std: NonNegative = 0.0  # standard deviation of the centre [m]
 
 
 class ModulusStep(_StepModel):
-    """Measured modulus [Pa], or points of a measured stress-strain law.
-
-    ``residual`` is the relative residual of the fit.
-    """
+    """Measured modulus [Pa], or points of a measured stress-strain law."""
 
     date: str
     modulus: Positive
     strain: list[Finite] = []
     stress: list[Finite] = []
     offset: Finite
-    residual: Finite
+    residual: Finite  # relative residual of the fit
 
     def material(self) -> Material:
         """Return the tip's stress-strain law. Raises ValueError if the points are unsuitable."""
@@ -173,10 +162,7 @@ def now() -> str:
 
 
 def sensor_of(settings: Settings, finger: int) -> Sensor:
-    """Return the identity of a finger's sensor.
-
-    If the settings contain no label, the label is the USB serial number.
-    """
+    """Return the identity of a finger's sensor. The USB serial number replaces a missing label."""
     tactile = settings.tactile
     return Sensor(
         finger=_NAMES[finger],
@@ -286,10 +272,7 @@ class Converter:
         return self.pressure(self.readings(counts))
 
     def readings(self, counts: NDArray[Any]) -> FloatArray:
-        """Return the argument of the calibration curve, x = max(counts − zero, 0)·gain.
-
-        ``counts`` may be averaged over frames.
-        """
+        """Return the argument of the calibration curve, x = max(counts − zero, 0)·gain."""
         return np.asarray(np.maximum(counts - self.zero, 0.0) * self.gain)
 
     def pressure(self, readings: FloatArray) -> FloatArray:

@@ -54,7 +54,7 @@ class GraspState(Record):
     pull_shear: float  # shear due to a pulling load, measured by solid tips [N]
     twist_shear: float  # shear due to a twisting load, measured by solid tips [N]
     free_torque: Pair  # maximum torque of each joint during the approach, before contact [N·m]
-    unexplained_rotation: Pair  # accumulated object rotation that the joints do not explain [rad]
+    unexplained_rotation: Pair  # accumulated object rotation not explained by joint motion [rad]
 
     # Consistency
     nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running averages; the expected value is 1

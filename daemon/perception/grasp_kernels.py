@@ -148,10 +148,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _relative_law_error(tip: TrackedTip, fraction: float) -> float:
-    """Return the relative error of the tip force at ``fraction`` = d/radius.
-
-    The error is due to the contact table and the material law.
-    """
+    """Return the relative error of the tip force at ``fraction`` = d/radius."""
     t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)
     return interpolate(tip.law_error[k], tip.law_error[k + 1], t - k)

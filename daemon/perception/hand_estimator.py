@@ -13,12 +13,12 @@ therefore compares the frames with the setting ``object.taper``.
 
 A disc has no faces. For a disc, φ is the direction of the line between the contacts, and ``rotate``
 turns this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per radian of joint angle. With
-the default hand and a disc of radius R = 20 mm, the result is 0.4. The prediction assumes faces,
-for which the result would be 1.5. The frames correct the error of the prediction. A rotation of a
-disc therefore takes longer, and the disc rolls further than commanded. A curved contact appears
-less tilted than it is, so φ is about 5 % too small for a disc. If the fingers are straight or lean
-outwards, the line does not follow the joint motion. A disc with R ≥ 30 mm can be held, but its
-rotation stops at the tip limits.
+the default hand and a disc of radius R = 20 mm, the line rotates by 0.4 rad per radian. The
+prediction assumes faces, which would rotate by 1.5 rad per radian. The frames correct the error of
+the prediction. A rotation of a disc therefore takes longer, and the disc rolls further than
+commanded. A curved contact appears less tilted than it is, so φ is about 5 % too small for a disc.
+If the fingers are straight or lean outwards, the line does not follow the joint motion. A disc with
+R ≥ 30 mm can be held, but its rotation stops at the tip limits.
 """
 
 from __future__ import annotations
@@ -273,10 +273,7 @@ class HandEstimator:
 
 
 def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
-    """Return (∂U/∂θ)/(F θ d) for a nearly upright tip.
-
-    The ratio is 2/3 for springs and about 0 for solid rubber.
-    """
+    """Return (∂U/∂θ)/(F θ d) of a nearly upright tip (springs: 2/3, solid rubber: about 0)."""
     d, theta = 0.15 * radius, 0.05
     contact = table(d, theta)
     return float(contact.energy_theta / (contact.force * d)) / theta

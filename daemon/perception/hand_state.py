@@ -441,10 +441,7 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
 
 @inner_kernel
 def _edge(h: HandFilter, q: float, direction: float) -> float:
-    """Return the angle of the count edge that a joint crosses on its way to ``q`` [rad].
-
-    A positive ``direction`` selects the edge below ``q``.
-    """
+    """Return the edge of the count ``q`` [rad]: below ``q`` for a positive ``direction``."""
     return q - math.copysign(0.5 * h.encoder_resolution, direction)
 
 

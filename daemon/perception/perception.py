@@ -39,10 +39,7 @@ class Perception:
         sensors: Mapping[int, TactileSensor],
         models: tuple[FingerModel, FingerModel],
     ) -> None:
-        """Create the perception.
-
-        ``sensors`` maps finger indices to sensors. Without sensors, the mapping is empty.
-        """
+        """Create the perception; ``sensors`` maps finger indices to sensors."""
         self.events: list[Event] = []  # events that the loop publishes and then removes
         self.fingers = [
             FingerPerception(sensor, models[finger], settings, self.events)

@@ -1,4 +1,4 @@
-"""Measure the zero shift and the noise of a sensor with the cells outside the tip.
+"""Use the cells outside the tip to measure the zero shift and the noise of a sensor.
 
 An unloaded cell reads its zero offset plus noise. With a tip radius of 20 mm, about 60 % of a 58 mm
 grid lies outside the tip. The outer cells show the zero offset and the noise even while the tip is

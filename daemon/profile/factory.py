@@ -66,10 +66,7 @@ def make_table(
 
 @lru_cache(maxsize=8)
 def _built(tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
-    """Build a contact table, which takes about 0.16 s.
-
-    The cache allows all hands in one process to share the table.
-    """
+    """Build a contact table in about 0.16 s. All hands in one process share the table."""
     return ContactTable.build(tip, material, tolerance)
 
 

@@ -1,4 +1,4 @@
-"""Load a TOML profile as validated `Settings`, and report all of its errors at once.
+"""Load a TOML profile, validate it as `Settings`, and report all of its errors at once.
 
 `profile.settings` defines the allowed values of each key. `profile.validation` checks combinations
 of keys.

@@ -30,7 +30,7 @@ from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardwa
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 from softfinger.kinematics.hand.geometry import tip_position
 
-_NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention the noise
+_NOISE_RATIO = 1.5  # messages mention noise that exceeds ``tactile.noise`` by this factor
 _WARNING_FRACTION = 0.9  # fraction of a fault limit above which a warning is issued
 # Minimum ratio of current to position error [A/rad]. The position loops of all servos exceed this
 # ratio.

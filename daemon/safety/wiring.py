@@ -31,7 +31,7 @@ class WiringWatch:
         self.swapped = ""  # description of a detected swap, or an empty string
         self._has_two_fingers = len(fingers) == len(FINGERS)
         self._touching = -1  # index of the only finger that touches the object, or -1
-        self._since = 0.0  # start of the single-finger contact [s]
+        self._since = 0.0  # time at which the contact with one finger began [s]
         self._q = [0.0, 0.0]  # joint angles after the touch [rad]
         self._tilt = math.nan  # tilt after the touch [rad]
         self._force = 0.0  # force after the touch [N]

@@ -83,9 +83,7 @@ class JointScale:
         return self.direction * counts * self.velocity
 
     def amperes(self, counts: float) -> float:
-        """Convert a signed current [counts] to a motor current [A]. Positive currents close the
-        joint.
-        """
+        """Convert a signed current [counts] to a motor current [A], positive when closing."""
         return self.direction * counts * self.current_unit
 
     def position_counts(self, q: float) -> int:
@@ -98,9 +96,7 @@ class JointScale:
         return round(self.direction * dq / self.velocity)
 
     def current_counts(self, current: float) -> int:
-        """Convert a motor current [A] to the nearest signed count. Positive currents close the
-        joint.
-        """
+        """Convert a motor current [A], positive when closing, to the nearest signed count."""
         return round(self.direction * current / self.current_unit) if self.current_unit else 0
 
     def bound_counts(self, current: float) -> int:

@@ -281,10 +281,7 @@ def _current_limit(model: ServoModel, current_max: float) -> Requirement:
 
 
 def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iterable[Requirement]:
-    """Yield the requirements for the position limits in position mode.
-
-    Servos silently reject goals outside these limits.
-    """
+    """Yield the requirements for the position limits. Servos silently reject goals outside them."""
     ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
     first, last = sorted(scale.position_counts(q) for q in ends)
     needed = f"the joint requires {first} to {last}"

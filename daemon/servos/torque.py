@@ -33,10 +33,7 @@ _MOTION_MAX = 8  # allowed motion of a limp joint before torque is on, in counts
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
-    """Return the address for writing goals.
-
-    In a mode with two goals, the address is an indirect data address.
-    """
+    """Return the address for writing goals. Two goals require an indirect data address."""
     if mode == reg.CURRENT_MODE:
         return reg.GOAL_CURRENT
     if mode == reg.POSITION_MODE:
