@@ -377,9 +377,9 @@ def _update_angle(
 def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: float) -> None:
     """Update the state with the footprint, using the current slopes.
 
-    A large innovation whose sign is opposite to that of the other tip's innovation means that the
-    object has moved sideways. If both innovations have the same sign and the gain is fixed, the
-    sensor gain has changed.
+    If the innovations of the two tips have opposite signs, a large innovation means that the object
+    has moved sideways. If the signs are equal and the gain is fixed, a large innovation means that
+    the sensor gain has changed.
     """
     d_innovation = innovation / h.slopes[D + finger]
     other = h.tip[1 - finger].d_innovation

@@ -3,10 +3,10 @@
 The module predicts when a servo will reach ``safety.temperature_max``. If the remaining time is
 less than ``heat_warn``, `safety.limits` issues a warning. The grip force is then reduced to the
 highest force that the servo can sustain indefinitely. The grip force is never reduced below the
-force that the load requires. If the load does not allow a sufficient reduction, an error is
-reported _ERROR_TIME seconds before the servo reaches the limit. ``heat_action`` is performed
-_ACTION_TIME seconds before the limit. The reduced force applies until the grip ends, even if a
-client commands another force.
+force required for the load, including the slip margin. If the load does not allow a sufficient
+reduction, an error is reported _ERROR_TIME seconds before the servo reaches the limit.
+``heat_action`` is performed _ACTION_TIME seconds before the limit. The reduced force applies until
+the grip ends, even if a client commands another force.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Check the replies, registers and limits of the servos before use.
 
-The checks read registers but do not change them. Each problem is reported with a fix.
+The checks read registers but do not change them.
 """
 
 from __future__ import annotations

@@ -6,10 +6,11 @@ and RAM may therefore contain values from another program. `connect` checks the 
 `softfinger doctor --fix` writes the EEPROM. `arm` writes the RAM registers that are marked
 ``armed``.
 
-Registers that do not affect goal tracking, limits or bus replies are omitted. A search finds the ID
-and baud rate. The registers for moving threshold, LED and external ports have no effect on the
-motion. Velocity gains and goal velocity apply only to velocity mode. `servos.torque` writes goal
-current, goal position, bus watchdog and indirect addresses on each `arm`.
+Registers that do not affect goal tracking, limits or bus replies in the hand's operating modes are
+omitted. A search finds the ID and baud rate. The registers for moving threshold, LED and external
+ports have no effect on the motion. Velocity gains and goal velocity apply only to velocity mode.
+`servos.torque` writes goal current, goal position, bus watchdog and indirect addresses on each
+`arm`.
 """
 
 from __future__ import annotations
