@@ -1,1 +1,1 @@
-"""Perception: calibrate tactile frames, estimate contacts and filter them."""
+"""Calibrate tactile frames, estimate the contacts and filter the estimates."""

@@ -1,7 +1,7 @@
-"""Read, check, write and apply the calibration file of a sensor.
+"""Read, check, write and apply a sensor's calibration file.
 
-Each sensor has one JSON file. A calibration step that has not been run yet is null; the settings
-then provide the value. `kinematics.calibration` explains the numbers.
+Each sensor has one JSON file. A calibration step that has not been run is null in the file. The
+settings provide the values of a missing step. `kinematics.calibration` explains the numbers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _FAULTY = 0.2  # minimum range of a working cell, as a fraction of the median ra
 
 
 class CalibrationFileError(TactileError):
-    """File that can't be used or belongs to another sensor. The message gives the reason."""
+    """The calibration file is unusable or belongs to another sensor."""
 
 
 class _StepModel(BaseModel):
@@ -40,7 +40,7 @@ class _StepModel(BaseModel):
 
 
 class Sensor(_StepModel):
-    """Identity of a sensor: finger, label or serial number, and grid."""
+    """Identity of a sensor: its finger, its label or serial number, and its cell grid."""
 
     finger: Literal["left", "right"]
     label: str
@@ -51,12 +51,11 @@ class Sensor(_StepModel):
 
 
 class TareStep(_StepModel):
-    """Mean reading of each unloaded cell and the typical cell noise (standard deviation) [counts].
+    """Zero offset of each cell, and typical standard deviation of the cell noise [counts].
 
-    ``correlation[i][j]`` is the noise correlation of two cells that are i rows and j columns apart;
-    it is empty for independent noise. ``drift`` is the standard deviation of the common-mode change
-    of all cells. ``excess`` [counts] is the mean reading above the zero offset; it is positive
-    because readings are clipped at 0.
+    ``correlation[i][j]`` is the noise correlation of two cells that are i rows and j columns apart.
+    ``correlation`` is empty if the noise is not correlated. ``drift`` is the standard deviation of
+    the drift that all cells share. ``excess`` [counts] is the mean of max(reading − zero, 0).
     """
 
     date: str
@@ -69,17 +68,17 @@ class TareStep(_StepModel):
 
 
 class EquilibrateStep(_StepModel):
-    """Gain of each cell (0 for dead cells), and relative spread before and after the correction."""
+    """Gain of each cell, or 0 for a dead cell."""
 
     date: str
     gain: list[list[Finite]]
     dead: int
-    spread: Finite
-    residual: Finite
+    spread: Finite  # relative spread of the cells before the correction
+    residual: Finite  # relative spread of the cells after the correction
 
 
 class CurveStep(_StepModel):
-    """Curve p = c_1 x^b + c_2 x² + c_3 x³ [Pa], stored as (b, c_1, c_2, c_3), and its residual."""
+    """Curve p = c_1 x^b + c_2 x² + c_3 x³ [Pa], stored as (b, c_1, c_2, c_3)."""
 
     date: str
     kind: Literal["power", "cubic"]
@@ -88,38 +87,38 @@ class CurveStep(_StepModel):
 
 
 class CentreStep(_StepModel):
-    """Tip centre on the sensor and its ``std`` [m]; rotation [rad], or null if not measured."""
+    """Position of the tip centre on the sensor [m], and rotation of the sensor [rad]."""
 
     date: str
     centre: tuple[Finite, Finite]
-    rotation: Finite | None
+    rotation: Finite | None  # null if the rotation was not measured
     scale: Finite = 1.0
     residual: Finite
-    std: NonNegative = 0.0
+    std: NonNegative = 0.0  # standard deviation of the centre [m]
 
 
 class ModulusStep(_StepModel):
-    """Modulus E [Pa] and its relative residual, or points of a stress-strain law [Pa]."""
+    """Measured modulus [Pa], or points of a measured stress-strain law."""
 
     date: str
     modulus: Positive
     strain: list[Finite] = []
     stress: list[Finite] = []
     offset: Finite
-    residual: Finite
+    residual: Finite  # relative residual of the fit
 
     def material(self) -> Material:
-        """Return the tip's stress-strain law. Raises ValueError for unsuitable points."""
+        """Return the tip's stress-strain law. Raises ValueError if the points are unsuitable."""
         if self.strain:
             return Material.from_points(self.strain, self.stress)
         return Material.constant(self.modulus)
 
 
 class ScalesStep(_StepModel):
-    """Finger calibration factors measured in grips, each as (mean, relative standard deviation).
+    """A finger's calibration factors, each stored as (mean, relative standard deviation).
 
-    The factors are the modulus relative to this file or the settings, the sensor gain, and the
-    joint's torque constant.
+    The factors are measured while the hand grips an object. ``modulus`` is relative to the modulus
+    in this file, or in the settings if the file contains no modulus.
     """
 
     date: str
@@ -131,8 +130,7 @@ class ScalesStep(_StepModel):
 class Calibration(_StepModel):
     """All calibration steps of one sensor. Add a step with ``model_copy(update=…)``.
 
-    ``wants`` maps the names of ``[tip]`` settings to the values that `calibrate law` requires for
-    its measurements.
+    ``wants`` maps names of ``[tip]`` settings to the values that `calibrate law` found.
     """
 
     format: Literal[1] = 1
@@ -149,22 +147,22 @@ class Calibration(_StepModel):
 
     @property
     def identity(self) -> str:
-        """Sensor label (or finger name if there is no label) and date of the file."""
+        """Sensor label and date of the file. The finger identifies a sensor without a label."""
         return f"{self.sensor.label or self.sensor.finger} {self.date}"
 
     def summary(self) -> str:
-        """Return the identity and the completed steps on one line."""
+        """Return the identity and the completed calibration steps as one line of text."""
         steps = [name for name in _STEPS if getattr(self, name) is not None]
         return f"{self.identity}: {', '.join(steps) or 'no step'}"
 
 
 def now() -> str:
-    """Return the current date and time in the file's format."""
+    """Return the current UTC date and time in ISO 8601 format."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def sensor_of(settings: Settings, finger: int) -> Sensor:
-    """Return the sensor of ``finger``. Without a label, the sensor's USB serial number is used."""
+    """Return the identity of a finger's sensor. The USB serial number replaces a missing label."""
     tactile = settings.tactile
     return Sensor(
         finger=_NAMES[finger],
@@ -177,7 +175,7 @@ def sensor_of(settings: Settings, finger: int) -> Sensor:
 
 
 def load_calibration(path: Path) -> Calibration:
-    """Read and check a file. Raises CalibrationFileError."""
+    """Read and check a calibration file. Raises CalibrationFileError."""
     try:
         calibration = Calibration.model_validate_json(read_file(path).decode())
     except (OSError, UnicodeDecodeError) as error:
@@ -196,7 +194,7 @@ def load_calibration(path: Path) -> Calibration:
 
 
 def calibration_for(settings: Settings, finger: int) -> Calibration | None:
-    """Return the calibration of a finger's sensor, or None if the settings name no file.
+    """Return the calibration of a finger's sensor, or None if the settings contain no file name.
 
     Raises CalibrationFileError if the file can't be read or belongs to another sensor.
     """
@@ -211,7 +209,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """Describe how the sensor in a file differs from ``there``; return "" if they are equal."""
+    """Describe the differences between two sensors; return "" if the sensors are equal."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "unnamed", there.label or "unnamed"),
@@ -227,7 +225,7 @@ def difference(file: Sensor, there: Sensor) -> str:
 def save_calibration(path: Path, calibration: Calibration) -> None:
     """Write the file atomically.
 
-    If writing fails, keep the old file and raise CalibrationFileError.
+    If writing fails, the old file is kept and CalibrationFileError is raised.
     """
     text = json.dumps(calibration.model_dump(mode="json"), ensure_ascii=False) + "\n"
     try:
@@ -237,7 +235,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 class Converter:
-    """Converter from one sensor's counts to pressures [Pa]."""
+    """Conversion of one sensor's counts to pressures [Pa]."""
 
     def __init__(
         self, calibration: Calibration, pascal_per_count: float, full_count: int | None = None
@@ -274,21 +272,20 @@ class Converter:
         return self.pressure(self.readings(counts))
 
     def readings(self, counts: NDArray[Any]) -> FloatArray:
-        """Return x = max(counts − zero, 0)·gain, the argument of the curve, for (mean) counts."""
+        """Return the argument of the calibration curve, x = max(counts − zero, 0)·gain."""
         return np.asarray(np.maximum(counts - self.zero, 0.0) * self.gain)
 
     def pressure(self, readings: FloatArray) -> FloatArray:
         """Convert readings to pressure [Pa].
 
-        The curve is extended to negative readings as an odd function, because noise may make
-        readings negative.
+        Noise may make readings negative, so the curve is extended as an odd function.
         """
         exponent, c1, c2, c3 = self._curve.tolist()
         x = np.abs(readings)
         return np.asarray(np.sign(readings) * (c1 * x**exponent + c2 * x**2 + c3 * x**3))
 
     def at(self, count: int) -> FloatArray:
-        """Return a new array with each cell's pressure [Pa] at a reading of ``count``."""
+        """Return each cell's pressure [Pa] at a reading of ``count`` in a new array."""
         return self(np.full(self.zero.shape, count, np.uint16))
 
     @property
@@ -304,21 +301,22 @@ class Converter:
 
     @property
     def quantum(self) -> float:
-        """Typical pressure per count [Pa]: the mean slope of the curve."""
+        """Mean slope of the calibration curve [Pa per count]."""
         return self.saturation / self._full
 
 
 def least_end(ends: FloatArray) -> float:
-    """Return the lowest saturation limit of all cells, relative to each cell's zero offset.
+    """Return the smallest measuring range of all working cells.
 
-    Cells that are nearly saturated without a load are ignored. Otherwise, the low limit of these
-    cells would make all other cells count as saturated.
+    The range of a cell extends from its zero offset to saturation. Cells that are nearly saturated
+    without a load are ignored. The small range of such a cell would make all other cells count as
+    saturated.
     """
     return float(ends[ends >= _FAULTY * np.median(ends)].min())
 
 
 def _contradiction(calibration: Calibration) -> str:
-    """Return a message if values in the file contradict each other; otherwise, return ""."""
+    """Describe the first contradiction between values in the file; return "" if there is none."""
     sensor = calibration.sensor
     tables = {}
     if calibration.tare:
@@ -349,7 +347,7 @@ def _contradiction(calibration: Calibration) -> str:
 
 
 def _usb_serial(settings: Settings, finger: int) -> str:
-    """Return the serial number of the USB adapter on the finger's port, or "" if there is none."""
+    """Return the serial number of the USB adapter on a finger's port, or "" without an adapter."""
     tactile = settings.tactile
     if tactile.backend in ("simulated", "replay", "none"):
         return ""

@@ -1,4 +1,4 @@
-"""Build the model of a finger's tip and sensor from the settings and the calibration file."""
+"""Build models of the fingertips and sensors from the settings and the calibration files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class FingerModel:
 
     @property
     def own_material(self) -> bool:
-        """True if the tip's stress-strain law comes from its calibration."""
+        """True if the tip's stress-strain law comes from a calibration file."""
         return self.calibration is not None and self.calibration.modulus is not None
 
 
@@ -53,8 +53,8 @@ def make_models(
 ) -> tuple[FingerModel, FingerModel]:
     """Create the models of both fingers.
 
-    If the modulus of a tip is not calibrated, the stress-strain law comes from the settings. The
-    model of a finger that is not in the scene or has no sensor is based only on the settings.
+    If the modulus of a tip is not calibrated, the stress-strain law comes from the settings. A
+    calibration file is read only for a finger that is in the scene and has a sensor.
 
     Raises the same exceptions as `profile.factory.make_table` and
     `calibration_file.calibration_for`.
@@ -71,7 +71,7 @@ def make_models(
             calibration = calibration_for(settings, finger)
         if measured:
             if name not in settings.scene.fingers:
-                continue  # The loop below copies the other finger's model.
+                continue  # Copy the model of the other finger below.
             material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
             table = make_table(settings, material, tip)
         elif calibration is not None and calibration.modulus is not None:
@@ -102,11 +102,11 @@ def make_models(
 
 
 def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
-    """Return a finger's prior from `calibrate scales`, if available, or from the settings."""
+    """Return a finger's prior, either from a run of `calibrate scales` or from the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales
-        # The gain varies with temperature and load, so it remains uncertain even after a
-        # calibration.
+        # The gain varies with temperature and load, so its prior is never more precise than the
+        # error in the settings.
         gain = found.gain[0], max(found.gain[1], settings.tactile.gain_error)
         return Prior(found.modulus, gain, found.torque)
     error = settings.material.modulus_error or MODULUS_ERROR

@@ -6,10 +6,10 @@ footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain:                 frame
             ln F(D, θ) + MODULUS + GAIN − (∂ ln F/∂d) ḋ LATENCY
 amplitude   MODULUS + GAIN, if the gain was fitted                     2 %, frame covariance
 
-A frame shows the hand at the time of the scan. Each frame is therefore compared with the state at
-the scan time, reconstructed from the joint history. `estimate.systematic`, the covariance that all
-frames share, is not part of the noise and is never estimated; it only increases the published
-standard deviations.
+A frame shows the hand at the time when the sensor scanned the cells. Each frame is therefore
+compared with the state at the scan time. The joint history provides the state at the scan time.
+`estimate.systematic` is the covariance of the errors that all frames share. The systematic
+covariance does not count as noise; it only increases the published standard deviations.
 """
 
 from __future__ import annotations
@@ -65,10 +65,10 @@ _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confir
 _NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; an object held with less force may rock
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
 # A footprint that grows within the response time of the cells appears wider and flatter. _WIDENING
-# and _FLATTENING are the relative changes divided by var(d)/d², determined by fitting a paraboloid
-# to the mean of several paraboloids.
+# and _FLATTENING are the relative changes in d and gain, divided by var(d)/d². Both constants
+# result from fitting a paraboloid to the mean of several paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
-_SLOPE_SMOOTHING = 0.9  # low-pass coefficient for ∂ ln F/∂d, applied on every frame
+_SLOPE_SMOOTHING = 0.9  # low-pass coefficient per frame for ∂ ln F/∂d
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
 _FIRST_D_ERROR = 0.5  # relative standard deviation of d in the first frames of a contact
 
@@ -91,12 +91,12 @@ class Scan(NamedTuple):
     rotation: float  # object rotation since the scan [rad]
     d_rate: float  # at the scan [m/s]
     theta_rate: float  # at the scan [rad/s]
-    spread: float  # variance of d within the cell response time [m²]
+    spread: float  # variance of d during the response time of the cells [m²]
     relaxation: float  # relaxation factor
 
 
 class FingerMotion(NamedTuple):
-    """Predicted motion of one finger, integrated up to one instant."""
+    """Accumulated predicted motion of one finger at one instant."""
 
     d: float
     spread: float
@@ -107,7 +107,7 @@ class FingerMotion(NamedTuple):
 
 @inner_kernel
 def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int) -> FingerMotion:
-    """Interpolate the history at time ``t``, which is clamped to the ends of the history."""
+    """Interpolate the motion history at time ``t``, clamped to the ends of the history."""
     size = len(history)
     before = after = newest
     fraction = 0.0
@@ -137,10 +137,11 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
 def _rates(
     h: HandFilter, history: Records[HistoryRow], finger: int, scan: float, sense: float
 ) -> tuple[float, float]:
-    """Return the rates of d [m/s] and θ [rad/s] at the ``scan``, used for the latency slopes.
+    """Return the rates of d [m/s] and θ [rad/s] at the time ``scan``.
 
-    The rates are secants over ±1 standard deviation of the latency, because the joints may have
-    stopped in between. Rates below the velocity resolution are set to 0.
+    The rates determine the derivatives with respect to the latency. Each rate is averaged over ±1
+    standard deviation of the latency, because the joints may have stopped within this interval.
+    Rates below the velocity resolution are set to 0.
     """
     span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_INTERVAL_MIN)
     first = _motion_at(history, h.newest_row, scan - span, finger)
@@ -160,7 +161,7 @@ def _rates(
 def _motion_since(
     h: HandFilter, history: Records[HistoryRow], finger: int, t: float, sense: float
 ) -> Scan:
-    """Return the motion since the scan of the frame with time stamp ``t``."""
+    """Return a finger's motion since the scan of the frame with time stamp ``t``."""
     scan = t - h.mean[LATENCY]
     row = _motion_at(history, h.newest_row, scan, finger)
     d_rate, theta_rate = _rates(h, history, finger, scan, sense)
@@ -205,10 +206,11 @@ def update(
     systematic: FloatArray,
     table: FloatArray,
 ) -> bool:
-    """Update the state with one finger's frame from time ``t``; return False if it is rejected.
+    """Update the state with one finger's frame from time ``t``; return False for a rejected frame.
 
-    ``covariance`` is the [4, 4] covariance of d, θ, tilt_y and gain; ``systematic`` is the part of
-    this covariance that all frames share. A gain variance above 0 means that the gain was fitted.
+    ``covariance`` is the 4 × 4 covariance matrix of d, θ, tilt_y and gain. ``systematic`` is the
+    part of ``covariance`` that all frames share. A gain variance above 0 means that the gain was
+    fitted.
     """
     h = hands[0]
     tip = h.tip[finger]
@@ -252,7 +254,7 @@ def update(
     tip.shear = found.shear
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
-    if tip.gain_is_fixed:  # The filter estimates GAIN, so remove the error due to the gain.
+    if tip.gain_is_fixed:  # Subtract the gain error, because the filter estimates the gain.
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = not cells_respond
@@ -280,7 +282,7 @@ def update(
 def _without_lag(
     h: HandFilter, found: FrameContact, scan: Scan, is_fitted: bool, log_slope: float
 ) -> tuple[float, float]:
-    """Return d and gain, corrected for slow cells and for relaxation of the tip."""
+    """Return d and gain, corrected for the cells' response time and the tip's relaxation."""
     if is_fitted:
         spread = min(scan.spread / (found.d * found.d), _SPREAD_MAX)
         flattening = 1.0 - _FLATTENING * spread
@@ -294,10 +296,11 @@ def _without_lag(
 def _update_amplitude(
     h: HandFilter, finger: int, scan: Scan, found: FloatPair, noise: FloatArray
 ) -> None:
-    """Update the state with the amplitude; ``found`` is (d, gain) with the covariance ``noise``.
+    """Update the state with the amplitude of a frame.
 
-    The errors of d and gain are correlated, and the footprint update has already used the common
-    part.
+    ``found`` is (d, gain), and ``noise`` is the frame covariance without its systematic part. The
+    errors of d and gain are correlated. The footprint update has already used the correlated part
+    of the errors. The amplitude update therefore uses only the uncorrelated part.
     """
     d, gain = found
     d_noise = noise[0, 0]
@@ -322,9 +325,10 @@ def _is_finite(h: HandFilter) -> bool:
 
 @inner_kernel
 def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> None:
-    """Reset a finger's states on first contact; ``face`` is the angle in the first frame [rad].
+    """Reset a finger's states on first contact.
 
-    If the other tip is not in contact either, all states are reset.
+    ``face`` is the angle of the object face in the first frame [rad]. If the other tip is not in
+    contact, all states are reset.
     """
     for pair in (MODULUS, GAIN, TORQUE, D_BIAS, ANGLE_BIAS):
         state = pair + finger
@@ -355,7 +359,7 @@ def _update_angle(
     theta_rate: float,
     is_new_contact: bool,
 ) -> None:
-    """Update the state with a frame's angle.
+    """Update the state with the face angle measured in a frame.
 
     An innovation beyond the gate means that the object has rotated unexpectedly.
     """
@@ -373,8 +377,9 @@ def _update_angle(
 def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: float) -> None:
     """Update the state with the footprint, using the current slopes.
 
-    Innovations of opposite sign beyond the gate mean that the object has moved sideways. With a
-    fixed gain, innovations of the same sign mean that the gain has changed.
+    If the innovations of the two tips have opposite signs, a large innovation means that the object
+    has moved sideways. If the signs are equal and the gain is fixed, a large innovation means that
+    the sensor gain has changed.
     """
     d_innovation = innovation / h.slopes[D + finger]
     other = h.tip[1 - finger].d_innovation
@@ -391,13 +396,14 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
 def _is_rejected(
     h: HandFilter, finger: int, sense: float, scan: Scan, theta_noise: float, d_noise: float
 ) -> bool:
-    """Return True if a frame is an outlier while an object is held; count these outliers.
+    """Return True if a frame of a held object is an outlier, and count consecutive outliers.
 
-    A jump is an outlier unless the other tip or the joints confirm it. A rotation is accepted if
-    both tips show it and either the joints move or the rotation continues. A displacement is
-    accepted if the joints move or both tips show it: a blow presses the object into one tip and
-    away from the other. The first frame of a real jump is also rejected, because the other tip's
-    frame has not arrived yet.
+    A jump in angle or displacement is an outlier unless the other tip or the joints confirm the
+    jump. A rotation is accepted if both tips show the rotation while the joints are moving. If the
+    joints are at rest, the rotation must continue in the next frame. A displacement is accepted if
+    the joints are moving or if both tips are displaced. A blow displaces both tips, because it
+    presses the object into one tip and away from the other. The first frame of a real jump is also
+    rejected, because the other tip's frame has not arrived yet.
     """
     grasp = h.grasp
     tip = h.tip[finger]
@@ -412,7 +418,7 @@ def _is_rejected(
     d = grasp.d_jump[finger]
     angle_jumps = abs(angle) > max(2.0 * IMAGE_SHIFT_MIN, OUTLIER_GATE * angle_std)
     d_jumps = abs(d) > max(IMAGE_SHIFT_MIN * h.radius, OUTLIER_GATE * d_std)
-    # threshold: two velocity units per joint
+    # The threshold is two velocity units per joint.
     joints_move = abs(tip.speed) + abs(h.tip[other].speed) > 4.0 * h.velocity_unit
     continues = tip.rejected_count > 0 and abs(angle - tip.last_angle_jump) > IMAGE_SHIFT_MIN
     tip.last_angle_jump = angle

@@ -24,7 +24,7 @@ CHANNELS = (
 
 
 class GraspState(Record):
-    """Forces on the held object, their moment arms, and the consistency of each channel.
+    """Tip forces on the held object, moment arms, and consistency of the measurement channels.
 
     Pairs are (left, right). All quantities are in SI units.
     """
@@ -44,7 +44,7 @@ class GraspState(Record):
     moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
     jacobian_rotation: Pair  # r1, r2 in φ̇ = r1 q̇1 − r2 q̇2
     jacobian_slide: float  # ∂(d1 + d2)/∂φ [m/rad]
-    energy_arm: Pair  # joint torque divided by tip force, from the energy gradient [m]
+    energy_arm: Pair  # joint torque per unit of tip force, computed from the energy gradient [m]
 
     # A load L along the object faces changes the mean torque residual by load_arm L +
     # load_curvature L².
@@ -53,20 +53,20 @@ class GraspState(Record):
     load_curvature: float  # [m/N]
     pull_shear: float  # shear due to a pulling load, measured by solid tips [N]
     twist_shear: float  # shear due to a twisting load, measured by solid tips [N]
-    free_torque: Pair  # maximum torque of each joint during an approach without contact [N·m]
-    unexplained_rotation: Pair  # accumulated object rotation that the joints do not explain [rad]
+    free_torque: Pair  # maximum torque of each joint during the approach, before contact [N·m]
+    unexplained_rotation: Pair  # accumulated object rotation not explained by joint motion [rad]
 
     # Consistency
-    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running average, expected to be 1
-    angle_jump: Pair  # angle in the newest frame minus predicted angle, during a grip [rad]
-    d_jump: Pair  # d in the newest frame minus predicted d [m], or 0 if d is not measured
+    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running averages; the expected value is 1
+    angle_jump: Pair  # angle in the newest frame minus the predicted angle, during a grip [rad]
+    d_jump: Pair  # d in the newest frame minus the predicted d [m]; 0 if d is not measured
     rejects_frames: Pair  # 1 if too many consecutive frames were rejected
     d_bias: Pair  # [m]
     d_bias_std: Pair
     angle_bias: Pair  # [rad]
     angle_bias_std: Pair
     has_bias: Pair  # 1 if the sensor's bias is significant
-    gain_change: Pair  # logarithm of the ratio of the gain to its prior
+    gain_change: Pair  # ln(sensor gain / prior gain)
     gain_std: Pair
     gain_prior_std: Pair
     has_wrong_current: Pair  # 1 if the joint's current has differed from its goal for too long

@@ -1,11 +1,11 @@
-"""Compute the grasp from the estimated state; update it with joint torques and force balance.
+"""Compute the grasp from the state, and update the state with joint torques and force balance.
 
 Channel   Measures                                                         Noise
 torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05 N·m and torque
           while the joints close                                           held by the gears
 balance   ln N1 − ln N2 = 0, where N are the normal forces                 5 % and 0.4 N
 
-The force on a tip is ρ e^MODULUS F(D, θ), where F is the tip's contact table and ρ is the tip's
+The force on a tip is ρ e^MODULUS F(D, θ). F is the tip's contact table, and ρ is the tip's
 relaxation factor.
 """
 
@@ -63,7 +63,7 @@ _D_BIAS_MIN = 0.1  # fraction of d
 
 
 class TipResult(NamedTuple):
-    """Result for one tip, including standard deviations [m, rad, N, J]."""
+    """Estimates for one tip and their standard deviations [m, rad, N, J]."""
 
     d: float
     theta: float
@@ -72,11 +72,11 @@ class TipResult(NamedTuple):
     d_std: float
     theta_std: float
     force_std: float
-    inside: bool  # True if d and θ lie within the contact table
+    inside: bool  # True if d and θ lie within the range of the contact table
 
 
 class GraspResult(NamedTuple):
-    """Result for both tips and the object [rad, m]."""
+    """Estimates for both tips, and the object's angle [rad] and width [m]."""
 
     left: TipResult
     right: TipResult
@@ -88,8 +88,8 @@ class GraspResult(NamedTuple):
 def _log_slope(h: HandFilter, finger: int) -> float:
     """Return ∂ ln F/∂d [1/m] of a tip.
 
-    With a fixed gain, ∂ ln F/∂d is the slope of the footprint channel. Using two different slopes
-    would make unobservable directions appear observable.
+    If the gain is fixed, the slope of the footprint channel is returned. If two channels used
+    different slopes, unobservable directions of the state would appear observable.
     """
     tip = h.tip[finger]
     slope: float = tip.log_slope
@@ -100,11 +100,11 @@ def _log_slope(h: HandFilter, finger: int) -> float:
 
 @inner_kernel
 def _set_torque_slopes(h: HandFilter) -> float:
-    """Set the derivatives of the mean joint torque that the tip forces cause; return it [N·m].
+    """Return the mean joint torque due to the tip forces [N·m], and set the slopes of the torque.
 
     Each joint contributes (1 + TORQUE) M, where M is the moment of the tip force about the joint. M
-    is the scaled joint torque minus the torque residual. M is proportional to the tip force ρ
-    e^MODULUS F(D, θ), so ∂M/∂MODULUS = M and ∂M/∂D = M ∂ ln F/∂d.
+    equals the joint torque divided by (1 + TORQUE), minus the torque residual. M is proportional to
+    the tip force ρ e^MODULUS F(D, θ). Therefore, ∂M/∂MODULUS = M and ∂M/∂D = M ∂ ln F/∂d.
     """
     expected = 0.0
     for k in range(2):
@@ -119,7 +119,7 @@ def _set_torque_slopes(h: HandFilter) -> float:
 
 @inner_kernel
 def _update_by_torques(h: HandFilter, dt: float) -> None:
-    """Update the state with the mean closing torque and with the tip force balance."""
+    """Update the state with the mean closing torque and with the balance of the normal forces."""
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
     h.torque_max = max(h.torque_max, torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
@@ -148,7 +148,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _relative_law_error(tip: TrackedTip, fraction: float) -> float:
-    """Return the relative F error due to table and material law at ``fraction`` = d/radius."""
+    """Return the relative error of the tip force at ``fraction`` = d/radius."""
     t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)
     return interpolate(tip.law_error[k], tip.law_error[k + 1], t - k)
@@ -235,7 +235,7 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
 def _write_load(
     h: HandFilter, table1: FloatArray, table2: FloatArray, theta: FloatPair, motion: Motion
 ) -> None:
-    """Write the normal forces, the shear at equilibrium, and the torques that a load explains."""
+    """Write the normal forces, the shear at equilibrium, and the torques attributed to a load."""
     grasp = h.grasp
     taper = h.mean[TAPER]
     d = h.mean[D], h.mean[D + 1]
@@ -271,7 +271,11 @@ def _write_load(
 
 @inner_kernel
 def _write_shear(h: HandFilter) -> None:
-    """Split the shear of solid tips into a pull (opposite signs) and a twist (same sign)."""
+    """Split the shear of solid tips into pull and twist.
+
+    A pull shears the two tips in opposite directions. A twist shears both tips in the same
+    direction.
+    """
     left = h.tip[0].shear
     right = h.tip[1].shear
     common = math.copysign(min(abs(left), abs(right)), left)
@@ -312,9 +316,9 @@ def _has_bias(grasp: GraspState, finger: int) -> bool:
 
 @inner_kernel
 def _is_larger_bias(bias: Pair, finger: int, smallest: float) -> bool:
-    """Return True if a sensor's bias exceeds ``smallest`` and is not below the other sensor's bias.
+    """Return True if a sensor's bias exceeds ``smallest`` and the bias of the other sensor.
 
-    A bias in one sensor also appears, with a smaller value, in the other sensor's estimate.
+    A bias in one sensor also causes a smaller apparent bias in the other sensor.
     """
     size = abs(bias[finger])
     is_larger: bool = size > smallest and size >= abs(bias[1 - finger])

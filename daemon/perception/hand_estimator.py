@@ -1,21 +1,24 @@
 """Estimate the contacts and the object pose on each tick.
 
 Frames are precise but late and infrequent; joint readings are frequent but coarse. While an object
-is held, the joint motion predicts d and the object angle φ through the rolling constraints
-(`hand.grasp_state`), and each frame corrects the predicted values. `hand_state` contains the state
-and its prediction; `frame_channels` and `grasp_kernels` contain the measurements.
+is held, the estimator predicts the displacement d and the object angle φ from the joint motion. The
+prediction uses the rolling constraints in `hand.grasp_state`. Each frame corrects the predicted
+values. `hand_state` defines and predicts the state. `frame_channels` and `grasp_kernels` update the
+state with measurements.
 
-φ is the angle of the bisector of the object faces. The taper α between the faces is estimated from
-the frames of both tips, starting from ``object.taper``. A shifted sensor looks like a taper, so the
-``hand.angle`` limit compares the frames with ``object.taper``.
+The object angle φ is the direction of the bisector between the two object faces. The taper α is the
+angle between the faces. The filter starts α at ``object.taper`` and updates it with the frames of
+both tips. A shifted sensor has the same effect on the frames as a taper. The ``hand.angle`` limit
+therefore compares the frames with the setting ``object.taper``.
 
-A disc has no faces. φ is then the direction of the line between the contacts, and ``rotate`` acts
-on this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per unit of joint angle. For a
-radius R of 20 mm and the default hand, the line rotates by 0.4 rad per rad of joint angle, whereas
-the prediction for faces is 1.5. The frames correct the difference, so a rotation takes longer and
-the disc rolls further than commanded. A curved contact appears less tilted than it is, so φ is
-about 5 % too small. If the fingers are straight or lean outwards, the line does not follow the
-joints: a disc with R ≥ 30 mm can be held, but its rotation stops at the tip limits.
+A disc has no faces. For a disc, φ is the direction of the line between the contacts, and ``rotate``
+turns this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per radian of joint angle. With
+the default hand and a disc of radius R = 20 mm, the line rotates by 0.4 rad per radian. The
+prediction assumes faces, which would rotate by 1.5 rad per radian. The frames correct the error of
+the prediction. A rotation of a disc therefore takes longer, and the disc rolls further than
+commanded. A curved contact appears less tilted than it is, so φ is about 5 % too small for a disc.
+If the fingers are straight or lean outwards, the line does not follow the joint motion. A disc with
+R ≥ 30 mm can be held, but its rotation stops at the tip limits.
 """
 
 from __future__ import annotations
@@ -64,8 +67,8 @@ class HandEstimator:
     ) -> None:
         """Create the estimator.
 
-        Each tip has a contact table, priors and a material. The material provides the stress-strain
-        law error.
+        Each tip has a contact table, priors and a material. The material provides the error of the
+        stress-strain law.
         """
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
@@ -110,12 +113,12 @@ class HandEstimator:
             _tilt_moment_ratio(table, state.radius) for table in tables
         )
         self._joints_read = False
-        self._factors_outdated = True  # True if frames have arrived since the last write
+        self._factors_outdated = True  # True if the factors have changed since they were written
         self._in_contact = [False, False]
         self._invalid = [Invalid.NO_FRAME] * 2  # reason for rejecting each finger's newest estimate
 
     def _set_prior(self, settings: Settings, priors: tuple[Prior, Prior]) -> None:
-        """Set the priors and reset the state to them."""
+        """Set the priors and reset the state to the priors."""
         state = self._state
         for finger, prior in enumerate(priors):
             for at, (mean, error) in (
@@ -140,7 +143,7 @@ class HandEstimator:
     def predict(self, reading: Reading, goal: Goal | None = None) -> None:
         """Predict the state at the time of a valid reading.
 
-        If a grip sets the servo currents, ``goal`` is the goal that was active during the reading.
+        While a grip sets the servo currents, ``goal`` is the goal at the time of the reading.
         """
         self._joints_read = True
         q1, q2 = reading.q
@@ -168,16 +171,15 @@ class HandEstimator:
         contact: Contact,
         has_changed: bool = True,
     ) -> None:
-        """Update the state with a finger's ``frame`` and ``estimate``; write both to ``contact``.
+        """Update the state with the ``estimate`` from a finger's ``frame``, and fill ``contact``.
 
-        ``has_changed`` is False for a frame that is identical to an earlier one. An identical frame
-        during contact comes from a board that is frozen or sends old data, so the frame is not
-        used.
+        ``has_changed`` is False for a frame that is identical to an earlier frame. During contact,
+        an identical frame indicates a frozen board or old data, so the filter ignores the frame.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
-            return  # Prediction from joint motion continues, and the age of the contact increases.
+            return  # The contact is still predicted from joint motion, but becomes older.
         # Before the first joint reading, use the frame alone.
         in_contact = estimate.contact and self._joints_read
         if in_contact and self._in_contact[finger] and not has_changed:
@@ -206,7 +208,7 @@ class HandEstimator:
         if not in_contact:
             tip = self._state.tip[finger]
             if tip.in_contact:
-                self.grasp.free_torque[finger] = 0.0  # will be measured during the next approach
+                self.grasp.free_torque[finger] = 0.0  # measured again during the next approach
                 tip.free_torque_max[:] = 0.0
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0
@@ -254,7 +256,7 @@ class HandEstimator:
                 contact.invalid, pose.valid = contact.invalid or Invalid.STALE, False
 
     def _write_factors(self, contact: Contact, finger: int) -> None:
-        """Write the calibration factors and the consistency of the channels."""
+        """Write a finger's calibration factors and channel consistency to ``contact``."""
         state, grasp = self._state, self.grasp
         at = states.MODULUS + finger
         contact.modulus_scale = modulus = math.exp(state.mean.item(at))
@@ -271,7 +273,7 @@ class HandEstimator:
 
 
 def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
-    """Return (∂U/∂θ)/(F θ d) near upright: 2/3 for springs, about 0 for solid rubber."""
+    """Return (∂U/∂θ)/(F θ d) of a nearly upright tip (springs: 2/3, solid rubber: about 0)."""
     d, theta = 0.15 * radius, 0.05
     contact = table(d, theta)
     return float(contact.energy_theta / (contact.force * d)) / theta
@@ -285,9 +287,11 @@ def _fill_from_frame(
     prior: Prior,
     radius: float,
 ) -> None:
-    """Fill ``contact`` from a single frame, using the tip's contact ``table`` and ``law`` error.
+    """Fill ``contact`` with the estimate from a single frame.
 
-    The frame amplitude is divided between modulus and gain according to their priors.
+    ``table`` is the tip's contact table, and ``law`` is the relative error of its forces. The
+    amplitude of a frame depends on both the tip modulus and the sensor gain. A deviation in
+    amplitude is divided between modulus and gain in proportion to their prior variances.
     """
     contact.d, contact.theta = estimate.d, estimate.tilt_x
     contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std

@@ -1,4 +1,4 @@
-"""State of the hand, its prediction from joint motion, and its update with one measurement.
+"""Define the hand's state, predict it from joint motion, and update it with one measurement.
 
 `docs/estimation.md` derives the model and lists the manoeuvres that make each state observable.
 
@@ -16,8 +16,8 @@ LATENCY         s      frame age beyond `tactile.latency`           (constant in
 FRICTION        N·m    mean joint torque not explained by the       slow drift
                        grip force
 
-The states up to TORQUE are pairs: the left finger's state is at the index, and the right finger's
-state is at the next index. All quantities are in SI units.
+The states up to TORQUE exist once per finger. The named index refers to the left finger, and the
+next index refers to the right finger. All quantities are in SI units.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ FloatArray = NDArray[np.float64]
 D, ENCODER, D_BIAS, ANGLE_BIAS, MODULUS, GAIN, TORQUE = range(0, 14, 2)
 ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 
-# Measurement channels in the order of `grasp.CHANNELS`; the first four exist once per tip.
+# Index of each measurement channel in `grasp.CHANNELS`. The first four channels exist once per tip.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-# Time span of the stored joint motion [s], which limits the assumed age of a frame.
+# Time span of the stored joint motion [s]. The assumed age of a frame is limited to this span.
 HISTORY_TIME = 0.5
-LAW_POINTS = 17  # number of nodes in d, from 0 to the radius
+LAW_POINTS = 17  # number of evenly spaced values of d from 0 to the tip radius
 
-GATE = 3.0  # maximum innovation with full effect, in standard deviations
+GATE = 3.0  # number of standard deviations beyond which innovations are down-weighted
 OUTLIER_GATE = 5.0  # minimum deviation that counts as a fault, in standard deviations
-MODEL_ERROR = 0.05  # relative error of predicted motion and of normal forces
-MODEL_ERROR_TIME = 0.1  # correlation time of motion and normal-force errors [s]
+MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
+MODEL_ERROR_TIME = 0.1  # correlation time of the model error [s]
 TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with position and time
 
 # Random walks during a grip (per √s)
@@ -65,7 +65,7 @@ _WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times ga
 _VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
 _VARIANCE_MIN = 1e-6  # minimum ratio of measurement variance to predicted variance
 _CURRENT_ERROR = 0.25  # tolerated deviation of a current from its goal, as a fraction of the goal
-_CURRENT_NOISE = 0.02  # additional tolerance due to current noise [A]
+_CURRENT_NOISE = 0.02  # additional tolerance for current noise [A]
 _RELAXATION_MIN = 0.02  # lower bound of the relaxation factor
 
 
@@ -74,35 +74,35 @@ class TrackedTip(Record):
 
     in_contact: bool
     touch_time: float  # time at which the contact began [s]
-    has_new_frame: bool  # True if a frame has arrived since the last update from torques
+    has_new_frame: bool  # True if a frame has arrived since the last update with joint torques
     gain_is_fixed: bool  # True if the frames measure force times gain instead of displacement
     rejected_count: int  # number of consecutive rejected frames
     last_angle_jump: float  # `grasp.angle_jump` of the previous frame [rad]
     current_off_time: float  # time since the current began to differ from its goal [s]
     tilt_y: float  # [rad]
-    shear: float  # shear along the face in the hand plane, measured by a solid tip [N]
+    shear: float  # shear force in the hand plane, measured by a solid tip [N]
     log_slope: float  # ∂ ln F/∂d, low-pass filtered [1/m]
     d_innovation: float  # innovation of d in the newest frame [m]
-    shared_variance: Pair  # variances of d and θ due to errors common to all frames
+    shared_variance: Pair  # variances of d and θ due to errors that all frames share
     q: float  # tracked joint angle [rad]
     encoder: float  # last encoder reading [rad]
     speed: float  # joint speed [rad/s]
     torque: float  # joint torque [N·m]
     free_torque: float  # average torque without contact [N·m]
-    free_torque_max: Pair  # maximum |free_torque| in the current and previous windows [N·m]
+    free_torque_max: Pair  # maximum |free_torque| in the current and the previous window [N·m]
     window_start: float  # [s]
-    travel: Pair  # accumulated predicted motion of d [m] and of the joint [rad]
+    travel: Pair  # accumulated predicted change in d [m] and in the joint angle [rad]
     law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F
     relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered long-term forces [N]
     relaxation: float  # relaxation factor ρ, the ratio of tip force to long-term force
 
 
 class HistoryRow(Record):
-    """History row: predicted motion at one instant, filtered by the cell response."""
+    """Predicted motion at one instant, low-pass filtered with the response time of the cells."""
 
     t: float
     d: Pair
-    spread: Pair  # variance of d during the cell response time [m²]
+    spread: Pair  # variance of d during the response time of the cells [m²]
     angle: float
     q: Pair
     relaxation: Pair
@@ -113,8 +113,8 @@ class HandFilter(Record):
 
     mean: Annotated[FloatArray, STATES]
     covariance: Annotated[FloatArray, STATES, STATES]
-    prior_mean: Annotated[FloatArray, STATES]  # state means before a contact
-    prior_variance: Annotated[FloatArray, STATES]  # state variances before a contact
+    prior_mean: Annotated[FloatArray, STATES]  # means of the states before a contact
+    prior_variance: Annotated[FloatArray, STATES]  # variances of the states before a contact
     slopes: Annotated[FloatArray, STATES]  # row of the measurement matrix, zero between updates
     scratch: Annotated[FloatArray, STATES]
     half_separation: float  # half the pivot separation [m]
@@ -125,14 +125,14 @@ class HandFilter(Record):
     velocity_unit: float  # [rad/s]
     latency: float  # `tactile.latency` [s]
     frame_rate: float  # `tactile.rate` [Hz]
-    frame_age_max: float  # maximum time that a channel may be missing or wrong [s]
+    frame_age_max: float  # maximum time for which a channel may be missing or wrong [s]
     rejected_max: float  # maximum number of consecutive rejected frames
     response: float  # `tactile.response` [s]
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
     relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
-    torque_constant: float  # output torque per current of a closing joint [N·m/A]
+    torque_constant: float  # output torque per ampere of a closing joint [N·m/A]
     inertia: float  # joint inertia [kg·m²]
-    load_held: float  # fraction of the tip moment that gears carry when the torque decreases
+    load_held: float  # fraction of the tip moment that gear friction carries as torque decreases
     is_single: bool  # True for a one-finger hand
     is_gripping: bool  # True if a grip controls the joint torques
     gain_is_known: bool  # True if `estimator.free_gain` is false
@@ -142,7 +142,7 @@ class HandFilter(Record):
     closing_speed: float  # mean closing speed of both joints [rad/s], low-pass filtered
     last_closing_speed: float  # value of `closing_speed` on the previous tick [rad/s]
     torque_max: float  # maximum mean torque during this grip [N·m]
-    balance_time: float  # time of the last update from torques and force balance [s]
+    balance_time: float  # time of the last update with joint torques and force balance [s]
     tip: Annotated[Records[TrackedTip], 2]
     grasp: GraspState
 
@@ -152,7 +152,7 @@ class HandFilter(Record):
 
 @inner_kernel
 def predicted_variance(h: HandFilter) -> float:
-    """Return the variance slopesᵀ P slopes and store P slopes in `scratch`."""
+    """Return slopesᵀ P slopes and store P slopes in `scratch`; P is the covariance matrix."""
     expected = 0.0
     for i in range(STATES):
         total = 0.0
@@ -165,13 +165,15 @@ def predicted_variance(h: HandFilter) -> float:
 
 @inner_kernel
 def correct(h: HandFilter, channel: int, innovation: float, variance: float, gate: float) -> None:
-    """Update the state with one scalar measurement, using `slopes`, then set the slopes to 0.
+    """Update the state with one scalar measurement whose derivatives are in `slopes`.
 
-    ``variance`` is the noise variance. The variance is increased if the innovation exceeds ``gate``
-    standard deviations, so that the innovation then equals ``gate`` standard deviations. An
-    innovation that is not finite is ignored. `grasp.nis` contains the exponential moving average of
-    each ``channel``'s normalised innovation squared. Each value is limited to ``gate`` squared. The
-    averaging time constant is one second of frames.
+    ``variance`` is the variance of the measurement noise. If the innovation exceeds ``gate``
+    standard deviations, the noise variance is increased until the innovation equals ``gate``
+    standard deviations. An innovation that is not finite is ignored. Finally, all slopes are set to
+    0.
+
+    `grasp.nis[channel]` is an exponential moving average of the normalised innovation squared. Each
+    value in the average is limited to ``gate`` squared. The time constant is one second of frames.
     """
     expected = predicted_variance(h)
     square = innovation * innovation
@@ -197,7 +199,7 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
 
 @inner_kernel
 def reset(h: HandFilter, state: int, mean: float, variance: float) -> None:
-    """Set one state to ``mean`` and ``variance``, uncorrelated with the other states."""
+    """Set the mean and variance of one state, and remove its correlation with the other states."""
     h.covariance[state, :] = 0.0
     h.covariance[:, state] = 0.0
     h.covariance[state, state] = variance
@@ -231,7 +233,11 @@ def _walk(h: HandFilter, state: int, per_root_second: float, dt: float) -> None:
 
 @inner_kernel
 def walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: float) -> None:
-    """Add process noise to a pair: ``common`` to its mean, ``opposite`` to its difference."""
+    """Add process noise to a pair of states.
+
+    ``common`` changes both states by the same amount; ``opposite`` changes them by opposite
+    amounts.
+    """
     alike = common * common * dt
     other = opposite * opposite * dt
     h.covariance[state, state] += alike + other
@@ -253,8 +259,8 @@ def predict(
 ) -> None:
     """Predict the state at time ``t`` from a joint reading [rad, rad/s, A].
 
-    ``goal`` is the current commanded by a grip [A], or 0 if it does not apply. ``is_gripping`` is
-    True while a grip sets the joint torques.
+    ``goal`` is the current that a grip commands for each joint [A]. If a goal is 0, the measured
+    current is used. ``is_gripping`` is True while a grip sets the joint torques.
     """
     h = hands[0]
     h.is_gripping = is_gripping
@@ -287,7 +293,7 @@ def predict(
 
 @inner_kernel
 def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> None:
-    """Store this tick's motion, low-pass filtered by the cell response."""
+    """Low-pass filter the motion with the response time of the cells, and store the result."""
     smoothing = math.exp(-dt / h.response) if h.response > 0.0 else 0.0
     last = history[h.newest_row]
     h.newest_row = (h.newest_row + 1) % len(history)
@@ -311,15 +317,15 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 
 @inner_kernel
 def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
-    """Advance joints, tips and object according to the measured velocities ``dq`` [rad/s].
+    """Advance the joints, tips and object by the motion at velocities ``dq`` [rad/s] during ``dt``.
 
-    The object rolls by turn1 Δq1 − turn2 Δq2, and both displacements change by the same amount,
-    half the change in d1 + d2 (docs/estimation.md).
+    The object rotates by turn1 Δq1 − turn2 Δq2. Each displacement changes by half the change in d1
+    + d2 (docs/estimation.md).
     """
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
-    # Before contact, the gap shrinks at the same rate as d would grow during contact.
+    # Before contact, the gap shrinks at the rate at which d grows during contact.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:
@@ -338,8 +344,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     right.q += step2
     left.travel[1] += step1
     right.travel[1] += step2
-    # An impossible step would corrupt the state permanently. A taper of 180°, for example, leads to
-    # impossible steps.
+    # An impossible step, for example due to a taper of 180°, would corrupt the state permanently.
     if not abs(d_step1) + abs(d_step2) + abs(rotation) * h.radius < h.radius:
         return
     left.travel[0] += d_step1
@@ -363,9 +368,9 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
 
 @inner_kernel
 def _add_rounding_noise(h: HandFilter, finger: int, by: float, turn: float, dt: float) -> None:
-    """Add the effect of a joint's velocity rounding on its encoder state, the tips and the object.
+    """Add process noise for the rounding of a joint's velocity.
 
-    A joint angle error also changes d by ``by`` [m/rad] and φ by ``turn``.
+    Per radian, an error in the joint angle changes d by ``by`` [m] and φ by ``turn`` [rad].
     """
     variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
     h.scratch[:] = 0.0
@@ -414,10 +419,11 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 
 @inner_kernel
 def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
-    """Update the state with the encoder angle, which is precise when the count changes.
+    """Update the state with the encoder angle.
 
-    Between two changes, the angle is known to within one count. ``step`` [rad] is the joint motion
-    since the last reading, computed from the velocity.
+    The angle is precise at the moment when the encoder count changes. Between two changes, the
+    angle is uncertain by one count. ``step`` is the joint motion since the last reading [rad],
+    computed from the joint velocity.
     """
     tip = h.tip[finger]
     at = ENCODER + finger
@@ -435,13 +441,16 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
 
 @inner_kernel
 def _edge(h: HandFilter, q: float, direction: float) -> float:
-    """Return the edge [rad] of the count ``q`` that a joint crosses in this ``direction``."""
+    """Return the edge of the count ``q`` [rad]: below ``q`` for a positive ``direction``."""
     return q - math.copysign(0.5 * h.encoder_resolution, direction)
 
 
 @inner_kernel
 def _encoder_measurement(h: HandFilter, finger: int, q: float, step: float) -> tuple[float, float]:
-    """Return the joint angle and the width of its uniform error [rad]; 0 means no information."""
+    """Return the joint angle and the width of its uniform error distribution [rad].
+
+    A width of 0 means that the reading contains no new information.
+    """
     tip = h.tip[finger]
     resolution = h.encoder_resolution
     jump = q - tip.encoder
@@ -461,10 +470,10 @@ def _encoder_measurement(h: HandFilter, finger: int, q: float, step: float) -> t
 def _measure_free_torque(
     h: HandFilter, finger: int, t: float, dt: float, speed_change: float
 ) -> None:
-    """Measure the maximum torque of a freely moving joint; this torque is the joint friction.
+    """Measure the friction of a joint as the maximum torque during free motion.
 
-    Readings from the last `frame_age_max` are excluded, because the tip may already be in contact
-    although no frame has shown the contact yet.
+    Readings from the last `frame_age_max` seconds are excluded. During this time, the tip may
+    already be in contact although no frame shows the contact.
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
@@ -480,10 +489,9 @@ def _measure_free_torque(
 
 @inner_kernel
 def _check_current(h: HandFilter, finger: int, current: float, goal: float, dt: float) -> float:
-    """Return a joint's current [A]: its ``goal`` during a grip, otherwise the measured current.
+    """Return a joint's ``goal`` current during a grip, otherwise the measured ``current`` [A].
 
-    Also check how long the goal and the measured current have differed by more than a servo's
-    current controller allows.
+    If the measured current deviates from ``goal`` for too long, set `grasp.has_wrong_current`.
     """
     tip = h.tip[finger]
     is_off = goal > 0.0 and abs(current - goal) > _CURRENT_ERROR * goal + _CURRENT_NOISE
@@ -494,10 +502,10 @@ def _check_current(h: HandFilter, finger: int, current: float, goal: float, dt: 
 
 @inner_kernel
 def _relax(h: HandFilter, finger: int, dt: float) -> None:
-    """Advance a tip's relaxation (Prony series) by ``dt`` seconds and set its relaxation factor."""
+    """Advance a tip's Prony series by ``dt`` seconds, and compute the relaxation factor."""
     tip = h.tip[finger]
     lasting = h.grasp.force[finger] / tip.relaxation if tip.in_contact else 0.0
-    if not lasting < math.inf:  # The step lies outside the range of the tip's material law.
+    if not lasting < math.inf:  # The force is not finite outside the range of the material law.
         lasting = 0.0
     factor = 1.0
     for k in range(3):

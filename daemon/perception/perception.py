@@ -1,4 +1,4 @@
-"""Process the fingers' frames: calibrate, estimate the contact, and filter.
+"""Calibrate tactile frames, estimate the contact in each frame and filter the estimates.
 
 `FingerPerception` processes each frame once. `hand_estimator` filters the estimates and predicts
 the contacts on every tick.
@@ -26,7 +26,7 @@ from softfinger.kinematics.estimation.estimator import ContactEstimate
 _TARE_FRAME_COUNT = 16
 _ZERO_INTERVAL = 8  # number of frames between zero updates; thermal drift takes seconds
 _PRESSURE_STEPS = np.iinfo(np.uint16).max  # number of quantisation steps in a published pressure
-_STORED_TIME = 2.0  # storage time of frame digests [s]
+_STORED_TIME = 2.0  # time for which frame digests are stored [s]
 _CHANGED_CELLS_MIN = 4  # minimum number of changed cells; a few noisy cells may repeat by chance
 
 
@@ -39,8 +39,8 @@ class Perception:
         sensors: Mapping[int, TactileSensor],
         models: tuple[FingerModel, FingerModel],
     ) -> None:
-        """Create the perception; ``sensors`` maps finger indices to sensors and may be empty."""
-        self.events: list[Event] = []  # events for the loop, which publishes and removes them
+        """Create the perception; ``sensors`` maps finger indices to sensors."""
+        self.events: list[Event] = []  # events that the loop publishes and then removes
         self.fingers = [
             FingerPerception(sensor, models[finger], settings, self.events)
             for finger, sensor in sorted(sensors.items())
@@ -53,12 +53,12 @@ class Perception:
         )
 
     def tare(self) -> None:
-        """Start a tare: set each cell's zero offset to the mean of its next readings."""
+        """Start a tare, which sets each cell's zero offset to the mean of the next readings."""
         for each in self.fingers:
             each.tare()
 
     def update(self, state: State) -> None:
-        """Process new frames; write the contacts and the object pose for this tick."""
+        """Process new frames, then write the contacts and the object pose for the current tick."""
         if not self.fingers:
             return
         for each in self.fingers:
@@ -72,37 +72,38 @@ class Perception:
 
 
 class RepeatDetector:
-    """Detector for frame sequences that repeat in the same order.
+    """Detector for sequences of frames that arrive again in the same order.
 
-    A noisy sensor never repeats a frame. At standstill, a noise-free sensor may send the same frame
-    for a long time or alternate between two frames. Constant or alternating frames do not count as
-    a repetition; the frozen-sensor check handles constant frames.
+    A noisy sensor never repeats a frame. At standstill, a sensor without noise may send one frame
+    repeatedly or alternate between two similar frames. The detector ignores frames that differ from
+    the previous frame in fewer than four cells. Constant frames are handled by the frozen-sensor
+    check.
     """
 
     def __init__(self, rate: float, fault_count: float, enabled: bool = True) -> None:
-        """Create a detector for a frame ``rate`` [Hz].
+        """Create a detector for frames that arrive at ``rate`` [Hz].
 
-        If ``enabled``, ``fault_count`` repeated frames count as a fault.
+        ``fault_count`` is the number of consecutive repeated frames that counts as a fault.
         """
         self._enabled = enabled
         self.period = 0  # repetition period in frames, or 0 if frames do not repeat
-        self._repeated_count = 0  # number of consecutive frames that repeat with this period
+        self._repeated_count = 0  # number of consecutive frames that have repeated with `period`
         self._fault_count = fault_count
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
         self._last: NDArray[np.uint16] | None = None  # frame
 
     @property
     def is_repeating(self) -> bool:
-        """True if the last two frames have arrived before in the same order."""
+        """True if the last two frames arrived earlier in the same order."""
         return self._enabled and self._repeated_count > 1
 
     @property
     def is_fault(self) -> bool:
-        """True if the frames have repeated for too long to be a coincidence."""
+        """True if the number of consecutive repeated frames is too high for a coincidence."""
         return self.is_repeating and self._repeated_count >= self._fault_count
 
     def update(self, data: NDArray[np.uint16]) -> bool:
-        """Process a frame; return True if it differs from the previous frame."""
+        """Process a frame, and return True if the frame differs from the previous frame."""
         last, self._last = self._last, data.copy()
         changed = np.count_nonzero(data != last)
         if not changed:
@@ -118,12 +119,12 @@ class RepeatDetector:
 
 
 class FingerPerception:
-    """Sensor of one finger, its newest frame, and the contact estimated from that frame alone."""
+    """Sensor of one finger. The contact is estimated from each frame alone, without filtering."""
 
     def __init__(
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
-        """Create the perception for one finger; each tare appends an event to ``events``."""
+        """Create the perception for one finger. Each tare appends an event to ``events``."""
         # Some recordings specify the count at which their cells saturated.
         full = getattr(sensor, "full_count", None)
         if full is not None and full < settings.tactile.full_count:
@@ -136,9 +137,9 @@ class FingerPerception:
         self.sensor = sensor
         self.frame: Frame | None = None
         self.frame_count = 0  # number of received frames
-        self.has_changed = True  # True if the newest frame is not a repetition
-        self.changed_time = 0.0  # arrival time of the last frame that changed [s]
-        # A recording that plays in a loop repeats its frames.
+        self.has_changed = True  # False if the newest frame repeats an earlier frame
+        self.changed_time = 0.0  # arrival time of the last frame with new data [s]
+        # Disable the detector for recordings, because a looped recording repeats its frames.
         self.repeats = RepeatDetector(
             tactile.rate, settings.safety.frame_age_fault, tactile.backend != "replay"
         )
@@ -182,13 +183,13 @@ class FingerPerception:
         return self._tare_remaining_count > 0
 
     def tare(self) -> None:
-        """Start a tare: set each cell's zero offset to the mean of its next readings."""
+        """Start a tare, which sets each cell's zero offset to the mean of the next readings."""
         self._tare_sum = 0
         self._tare_remaining_count = _TARE_FRAME_COUNT
         self._unloaded.reset_zero()
 
     def update(self) -> Frame | None:
-        """Process a new frame and return its estimate, or None if no new frame has arrived."""
+        """Process and return a new frame, or return None if no new frame has arrived."""
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
@@ -218,14 +219,15 @@ class FingerPerception:
         return frame
 
     def published(self) -> NDArray[np.uint16]:
-        """Return the newest frame [rows, cols] for subscribers in the unit of ``info``."""
+        """Return the newest frame [rows, cols] in the unit that ``info`` specifies."""
         assert self.frame is not None
         assert self._readings is not None
         if not self._publishes_pressure:
             return self.frame.data
         if self._converter is None:
             return self._readings
-        # If the zero offset is below its calibrated value, a reading may exceed the scale.
+        # If a tare has reduced the zero offset, a reading may exceed the largest published
+        # pressure.
         steps = np.minimum(self._readings * (1.0 / self.info.scale), _PRESSURE_STEPS)
         return np.rint(steps).astype(np.uint16)
 
@@ -255,7 +257,7 @@ class FingerPerception:
             return
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
-        if not np.median(ends) > 0.0:  # The zero offset leaves most cells without a range.
+        if not np.median(ends) > 0.0:  # Most cells are saturated at their zero offset.
             text = f"the {side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))
             return

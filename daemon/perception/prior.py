@@ -9,7 +9,7 @@ CALIBRATED_ERROR = 0.05  # relative modulus error after `softfinger calibrate mo
 
 
 class Prior(NamedTuple):
-    """One finger's calibration factors as (mean, relative standard deviation).
+    """Priors of one finger's calibration factors, each as (mean, relative standard deviation).
 
     Remounting a sensor changes its gain by 5 to 32 % (DTIC ADP011007). A torque constant is known
     to within 10 %.

@@ -1,10 +1,10 @@
-"""Zero shift and noise of a sensor, measured with the cells beyond the tip.
+"""Use the cells outside the tip to measure the zero shift and the noise of a sensor.
 
-An unloaded cell reads its zero offset plus noise. With a 20 mm tip, about 60 % of a 58 mm grid lies
-beyond the tip. These cells show the zero offset and noise even while the tip is in contact. A
-second contact on a few of the cells beyond the tip does not change the median. Readings are clipped
-at 0, so a zero offset below 0 cannot be detected here. A negative offset is detected from the joint
-motion during closing (`perception.frame_channels`).
+An unloaded cell reads its zero offset plus noise. With a tip radius of 20 mm, about 60 % of a 58 mm
+grid lies outside the tip. The outer cells show the zero offset and the noise even while the tip is
+in contact. A second contact that loads only a few outer cells does not change the median reading.
+Readings are clipped at 0, so unloaded cells cannot show a zero offset below 0.
+`perception.frame_channels` detects a negative offset from the joint motion while the fingers close.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_RIM_DISTANCE = 2.0  # distance from the tip rim beyond which a cell is unloaded, in pitches
+_RIM_DISTANCE = 2.0  # minimum distance of an unloaded cell from the tip rim, in cell pitches
 _CELL_COUNT_MIN = 50  # number of cells required to estimate the zero shift and the noise
 _AVERAGED_FRAME_COUNT = 8  # time constant of the noise average, in calls of `update`
-_CLIPPED_FRACTION = 0.25  # minimum fraction of cells reading 0 that indicates clipped noise
+_CLIPPED_FRACTION = 0.25  # minimum fraction of cells that read 0 if the noise is clipped
 _CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping at 0
 
 
@@ -45,15 +45,15 @@ class UnloadedCells:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a cell [counts]; 0 if unknown."""
+        """Standard deviation of an unloaded cell's reading [counts]; 0 if unknown."""
         return 0.0 if self._variance is None else math.sqrt(self._variance)
 
     @property
     def scatter(self) -> float:
         """Cell noise [counts]; 0 if unknown.
 
-        If no cells lie beyond the tip, the noise is computed from the changes between frames. The
-        changes show the noise, because most cells are constant except while a tip moves.
+        If no cells lie outside the tip, the noise is computed from the changes between frames. Most
+        changes are noise, because the loads change only while a tip moves.
         """
         if self._squared_changes is None:
             return self.noise
@@ -98,7 +98,7 @@ class UnloadedCells:
         self._zero_fraction = 1.0 - np.count_nonzero(read) / read.size
 
     def corrected(self, counts: NDArray[np.uint16], full: int) -> NDArray[np.uint16]:
-        """Return the counts minus the zero shift; counts at ``full`` are not changed."""
+        """Return the counts minus the zero shift. Saturated counts (``full``) are not changed."""
         if self.zero_shift == 0:
             return counts
         moved = np.clip(counts.astype(np.int32) - self.zero_shift, 0, full)

@@ -24,7 +24,7 @@ def make_tip(settings: Settings) -> Fingertip:
 
 
 def law_problem(material: Material, limit: float) -> str:
-    """Describe the law's fit error if it exceeds ``limit`` relative to F; otherwise, return ""."""
+    """Describe the fit error of a law if the force error exceeds ``limit``, otherwise return ""."""
     found = material.worst_force_error
     if found <= limit:
         return ""
@@ -50,7 +50,7 @@ def make_material(law: MaterialSettings) -> Material:
 def make_table(
     settings: Settings, material: Material, tip: Fingertip | None = None
 ) -> ContactTable:
-    """Create the contact table for ``tip``, by default the tip in the settings.
+    """Create the contact table for ``tip``. The default is the tip in the settings.
 
     Raises SettingsError if the tolerance cannot be reached with this material.
     """
@@ -78,7 +78,7 @@ def make_grid(
 ) -> SensorGrid:
     """Create the sensor grid for one finger.
 
-    ``centre`` [m] and ``rotation`` [rad] are measured values that replace those in the settings.
+    Measured values of ``centre`` [m] and ``rotation`` [rad] replace the values in the settings.
     """
     tactile = settings.tactile
     return SensorGrid(

@@ -1,4 +1,4 @@
-"""Define the number types for settings, with their bounds, and the base class for sections."""
+"""Define bounded number types for settings, and the base class for settings sections."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from softfinger.daemon.errors import PluginError
 
 __all__ = ["Section", "setting"]
 
-# Every number has a lower and an upper bound, because implausible values are typing errors and must
-# not be used in an integral. Some bounds are inclusive and others are exclusive.
+# Every number has a lower and an upper bound, so that a typing error cannot enter an integral.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
@@ -38,8 +37,8 @@ Processor = Annotated[int, Field(ge=0, le=1023)]
 def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
     """Declare one setting in a section class.
 
-    The profile reference, the documentation and the JSON schema are generated from all declared
-    settings.
+    The profile reference, the documentation and the JSON schema are generated from the
+    declarations.
 
     Parameters
     ----------
@@ -58,7 +57,7 @@ def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
 
 
 class Section(BaseModel):
-    """Base class of all settings sections, which are immutable and strictly typed.
+    """Base class of all settings sections. Sections are immutable and strictly typed.
 
     Unknown keys are errors. Integers are accepted for floats, but strings are never converted to
     numbers.
@@ -68,7 +67,7 @@ class Section(BaseModel):
 
 
 def names_backend(kind: Kind) -> AfterValidator:
-    """Return a backend name validator whose error messages are worded like those of a Literal."""
+    """Return a validator for backend names. Error messages are worded like those of a Literal."""
 
     def check(name: str) -> str:
         try:

@@ -1,4 +1,4 @@
-"""Load a profile from TOML into validated `Settings`, or report all of its errors at once.
+"""Load a TOML profile, validate it as `Settings`, and report all of its errors at once.
 
 `profile.settings` defines the allowed values of each key. `profile.validation` checks combinations
 of keys.
@@ -25,7 +25,7 @@ from softfinger.daemon.profile.validation import plausibility_warnings, problems
 __all__ = ["load"]
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-# Maximum file size [bytes]; the reference profile with all keys takes 21 kB.
+# Maximum file size [bytes]. The reference profile with all keys has 21 kB.
 _FILE_SIZE_MAX = 256 << 10
 _DEPTH_MAX = 8  # maximum nesting depth of tables and arrays
 _ERROR_COUNT_MAX = 20  # maximum number of errors reported per load
@@ -70,9 +70,12 @@ def load(
 
     Parameters
     ----------
-    path : file, or one of `names`; None for the built-in simulated hand directory : replacement for
-    ``{dir}`` in the port names changes : settings such as ``loop.rate=1000``, which override the
-    file
+    path
+        File or one of `names`; None selects the built-in simulated hand.
+    directory
+        Replacement for ``{dir}`` in the port names.
+    changes
+        Settings such as ``loop.rate=1000``, which override the file.
 
     Raises
     ------
@@ -138,7 +141,7 @@ def _without_words(lines: Iterable[str], words: set[str]) -> list[str]:
 
 
 def _without(data: dict[str, Any], wrong: Sequence[ErrorDetails]) -> dict[str, Any]:
-    """Return the sections without the invalid keys and without entirely invalid sections."""
+    """Return a copy of ``data`` without invalid keys and invalid sections."""
     kept: dict[Any, Any] = {
         name: dict(keys) if isinstance(keys, dict) else keys for name, keys in data.items()
     }
@@ -156,9 +159,10 @@ def names() -> list[str]:
 
 
 def find(path: Path) -> Path:
-    """Return the path of a profile's file; a bare name may refer to a packaged profile.
+    """Return the path of a profile. ``path`` is a file or the name of a packaged profile.
 
-    Raises SettingsError for a bare name that is neither in `names` nor an existing file.
+    Raises SettingsError if a name without folder and suffix is neither a packaged profile nor a
+    file.
     """
     if path.suffix or path.parent != Path() or (path.exists() and not path.is_dir()):
         return path
@@ -173,8 +177,8 @@ def find(path: Path) -> Path:
 def profile_text(path: Path) -> str:
     """Return a profile's text.
 
-    Raises OSError like `read_file`, UnicodeDecodeError if the file is not UTF-8, and RecursionError
-    if a key has too many parts.
+    Raises the same errors as `read_file`. Raises UnicodeDecodeError if the file is not UTF-8 text.
+    Raises RecursionError if a key has too many parts.
     """
     text = read_file(path, _FILE_SIZE_MAX).decode("utf-8-sig")
     if _DEEP_KEY.search(text):
@@ -216,7 +220,7 @@ def _read(path: Path, name: str) -> dict[str, Any]:
 
 
 def _change(data: dict[str, Any], change: str) -> str:
-    """Apply one ``section.key=value`` change and return its key. Raises SettingsError."""
+    """Apply one ``section.key=value`` change and return the changed key. Raises SettingsError."""
     key, equals, text = change.partition("=")
     *sections, inner = key.strip().split(".")
     if not (equals and sections and all(sections) and inner):
@@ -224,7 +228,7 @@ def _change(data: dict[str, Any], change: str) -> str:
     try:
         value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
-        value = text.strip()  # The shell has removed the string's quotes.
+        value = text.strip()  # The shell removes the quotes around a string.
     held = data
     for section in sections:
         held = held.setdefault(section, {})
@@ -238,8 +242,8 @@ def _change(data: dict[str, Any], change: str) -> str:
 def _tuples(value: Any, depth: int = 0) -> Any:
     """Convert lists to tuples in nested tables and lists.
 
-    Raises RecursionError if the nesting is deeper than `_DEPTH_MAX`, and ValueError for integers
-    outside TOML's range.
+    Raises RecursionError if the nesting is deeper than `_DEPTH_MAX`. Raises ValueError if an
+    integer is outside TOML's range.
     """
     if depth > _DEPTH_MAX:
         raise RecursionError
@@ -282,7 +286,7 @@ def _plugin_problems(settings: Settings) -> Iterator[str]:
 def _line(
     details: ErrorDetails, above: Sequence[str] = (), model: type[BaseModel] | None = Settings
 ) -> str:
-    """Format one error; ``above`` is the path of ``model``'s table in the profile."""
+    """Format one error. ``above`` is the path of the table that ``model`` describes."""
     inside = [str(part) for part in details["loc"]]
     location = [*above, *inside]
     key = shown(".".join(location))[1:-1]

@@ -1,8 +1,8 @@
-"""Generate the settings reference from the declarations.
+"""Generate the settings reference from the declared settings.
 
-``python -m softfinger.daemon.profile.reference`` writes ``config/sim.toml``, which describes every
-key with its value for the built-in simulated hand, and ``config/schema.json``, the JSON schema for
-editors.
+``python -m softfinger.daemon.profile.reference`` writes two files. ``config/sim.toml`` describes
+every key and contains the values for the built-in simulated hand. ``config/schema.json`` is the
+JSON schema for editors.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 
 _WIDTH = 100  # maximum line length in sim.toml
-_NO_BOUND = 1e9  # magnitude of bounds that only catch typing errors and are therefore not shown
+_NO_BOUND = 1e9  # Bounds of this magnitude only catch typing errors and are not shown.
 _HEAD = """\
 #:schema ./schema.json
 # The built-in simulated hand, with every setting at its default. `softfinger run` without a profile
@@ -41,21 +41,21 @@ class Key(NamedTuple):
     meaning: str
 
     def lines(self, prefix: str = "") -> Iterator[str]:
-        """Yield the TOML lines: a comment with the meaning, then the key with its default."""
+        """Yield the TOML lines of a setting: its meaning as a comment, then its default value."""
         yield from _comment(self.meaning)
         limits = ", ".join(filter(None, (self.unit, self.allowed)))
         yield f"{prefix}{self.name} = {self.default}{f' # {limits}' * bool(limits)}"
 
 
 class _WithoutTitles(GenerateJsonSchema):
-    """Schema generator without titles, which would only repeat the key names."""
+    """JSON schema generator that omits titles, because titles would only repeat the key names."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
 
 
 def schema_text() -> str:
-    """Return the JSON schema for profiles on a single line, because it is read only by programs."""
+    """Return the JSON schema for profiles as a single line of text."""
     schema = {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "softfinger profile",
@@ -75,12 +75,12 @@ def sections() -> dict[str, type[Section]]:
 
 
 def about(section: type[Section]) -> str:
-    """Return a section's purpose as Markdown."""
+    """Return the description of a section as Markdown."""
     return inspect.cleandoc(section.__doc__ or "").replace("``", "`")
 
 
 def every_key() -> list[Key]:
-    """Return all settings in profile order."""
+    """Return all settings in the order of the profile."""
     return [
         Key(
             name,
@@ -117,7 +117,7 @@ def _comment(text: str) -> Iterator[str]:
 
 
 def _allowed(declared: dict[str, Any]) -> str:
-    """Describe the values that are allowed for a key or each of its elements."""
+    """Describe the values allowed for a key, or for each element of an array."""
     if "prefixItems" in declared:
         return _allowed(declared["prefixItems"][0])
     if "items" in declared:

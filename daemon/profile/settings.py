@@ -1,4 +1,4 @@
-"""Define the profile sections, with defaults, bounds, units and meanings.
+"""Define the sections of a profile, and the default, bounds, unit and meaning of each setting.
 
 The defaults describe the built-in simulated hand. `profile.load` reads and validates a file.
 `profile.reference` generates ``config/sim.toml`` and the JSON schema from the declarations in this

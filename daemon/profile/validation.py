@@ -1,7 +1,7 @@
 """Check a profile for settings that contradict each other.
 
-Each check is a function that yields one line per problem, with the key, the value found and the
-value expected.
+Each check yields one line per problem. A line contains the key, the value found and the expected
+value.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def problems(settings: Settings) -> list[str]:
 def plausibility_warnings(settings: Settings) -> list[str]:
     """Return warnings about settings that are allowed but probably wrong, one per line.
 
-    ``run``, ``doctor`` and ``config check`` report them.
+    The commands ``run``, ``doctor`` and ``config check`` report these warnings.
     """
     grip = [warning for check in (_deep_grip, _strong_grip) for warning in check(settings)]
     return sensor_warnings(settings) + grip
@@ -58,7 +58,7 @@ def _wide_sensor(settings: Settings) -> Iterator[str]:
 def _small_sensor(settings: Settings) -> Iterator[str]:
     """Compare the sensor size with the contact area of a tip.
 
-    A solid tip loads the sensor with its whole base, a spring tip only with the footprint.
+    A solid tip loads the sensor with its whole base. A spring tip loads only the footprint.
     """
     tip, tactile = settings.tip, settings.tactile
     if tactile.backend == "none":
@@ -97,7 +97,7 @@ def _deep_grip(settings: Settings) -> Iterator[str]:
 
 
 def _strong_grip(settings: Settings) -> Iterator[str]:
-    """Compare forces with the servo torque divided by the finger length."""
+    """Compare the configured forces with the fingertip force that the servo torque can produce."""
     servos, lever = settings.servos, settings.hand.finger_length
     if servos.backend == "none" or backend("servos", servos.backend).source:
         return
@@ -119,7 +119,7 @@ def _strong_grip(settings: Settings) -> Iterator[str]:
 
 
 def _set_forces(settings: Settings) -> list[tuple[str, float]]:
-    """Return key and value [N] of the grip forces used by commands that do not specify a force."""
+    """Return the keys and values [N] of the default grip forces."""
     forces = [("control.force_default", settings.control.force_default)]
     if settings.task.name != "none":
         forces.append(("task.force", settings.task.force))
@@ -127,9 +127,10 @@ def _set_forces(settings: Settings) -> list[tuple[str, float]]:
 
 
 def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
-    """Yield key, force [N] and displacement [m] of an upright spring tip at the configured forces.
+    """Yield the key, force [N] and displacement [m] of a spring tip for each configured force.
 
-    The force is computed as in `Material.force_error`, by summing over strain steps.
+    The tip is upright. The force is computed as in `Material.force_error`, by summing over strain
+    steps.
     """
     if settings.tip.physics != "springs":
         return
@@ -146,7 +147,7 @@ def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
 
 
 def _sides(settings: Settings) -> tuple[float, float]:
-    """Return width and height of the sensor [m]."""
+    """Return the width and the height of the sensor [m]."""
     tactile = settings.tactile
     return tactile.cols * tactile.pitch, tactile.rows * (tactile.pitch_y or tactile.pitch)
 
@@ -157,7 +158,7 @@ def _size(settings: Settings) -> str:
 
 
 def shown(value: Any) -> str:
-    """Format a value in TOML syntax, shortened to fit a line and without control characters."""
+    """Format a value in TOML syntax, shorten the text and replace control characters."""
     if isinstance(value, tuple):
         text = "[" + ", ".join(shown(item) for item in value[:20]) + "]"
     elif isinstance(value, dict):
@@ -253,7 +254,7 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
 
 
 def _missing(settings: Settings, key: str, expected: str) -> Iterator[str]:
-    """Check a tactile setting for which a string must be given for each finger in the scene."""
+    """Check that a tactile setting contains a string for each finger in the scene."""
     for name in settings.scene.fingers:
         if not getattr(settings.tactile, key)[FINGERS.index(name)]:
             yield f'tactile.{key}: found "" for {name}, expected {expected}'
@@ -288,7 +289,7 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
 
 
 def _cells_under(settings: Settings) -> Iterator[str]:
-    """Check that a solid tip's base, which transmits the contact pressure, covers enough cells."""
+    """Check that the base of a solid tip covers enough cells."""
     from softfinger.daemon.profile.factory import make_grid, make_tip
     from softfinger.kinematics.estimation.error_budget import Uncertainty
     from softfinger.kinematics.estimation.estimator import CELLS_MIN, cells_within_rim
@@ -403,10 +404,10 @@ def _forces(settings: Settings) -> Iterator[str]:
 
 
 def address_problem(address: str, lacking: str) -> str:
-    """Return the reason why ``address`` must not be bound, or an empty string if it is allowed.
+    """Return the reason why binding ``address`` is not allowed, or "" if the address is allowed.
 
-    Without keys, only this machine's addresses are allowed. ``lacking`` is the name of the missing
-    key setting, or empty if keys are configured.
+    Without keys, only this machine's addresses are allowed. ``lacking`` is the name of the setting
+    that must specify keys, or "" if keys are configured.
     """
     here = _TCP if lacking else _ANY_TCP
     tcp = here.fullmatch(address)

@@ -1,5 +1,5 @@
-"""Safety limits of the hand, their checks on each tick, and the torque state.
+"""Define the safety limits of the hand, check them on each tick, and track the torque state.
 
-To add a limit, place its row for `safety.limits.LIMITS` above its check function. This package does
-not plan the hand's motion.
+To add a limit, write a check function in `safety.limits` and decorate it with a `Limit`. This
+package does not plan the hand's motion.
 """

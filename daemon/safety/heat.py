@@ -1,11 +1,12 @@
 """Predict when servos will overheat, and reduce the grip force to a sustainable value in time.
 
-If a servo is predicted to reach ``safety.temperature_max`` within ``heat_warn``, `safety.limits`
-issues a warning, and the grip force is reduced to the maximum force that the servo can sustain
-indefinitely. The force is not reduced below the value required for the load, including the slip
-margin. If the force reduction is insufficient, an error is reported _ERROR_TIME seconds before the
-temperature limit is reached. ``heat_action`` is performed _ACTION_TIME seconds before the limit.
-The reduction lasts until the grip ends, even if another force is commanded.
+The module predicts when a servo will reach ``safety.temperature_max``. If the remaining time is
+less than ``heat_warn``, `safety.limits` issues a warning. The grip force is then reduced to the
+highest force that the servo can sustain indefinitely. The grip force is never reduced below the
+force required for the load, including the slip margin. If the load does not allow a sufficient
+reduction, an error is reported _ERROR_TIME seconds before the servo reaches the limit.
+``heat_action`` is performed _ACTION_TIME seconds before the limit. The reduced force applies until
+the grip ends, even if a client commands another force.
 """
 
 from __future__ import annotations
@@ -31,20 +32,21 @@ from softfinger.kinematics.hand.servo_heat import (
 
 _UPDATE_INTERVAL = 0.5  # time between thermal model updates [s]
 _AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
-# Half the thermometer's resolution [°C]. The thermometer rounds its readings, so a reading may
-# reach the limit while the actual temperature is lower by half the resolution.
+# Half the thermometer's resolution [°C]. A rounded reading may reach the limit while the actual
+# temperature is lower by half the resolution.
 _HALF_STEP = 0.5
-_TARGET_MARGIN = 3.0  # margin below the limit for the target temperature after a reduction [°C]
+_TARGET_MARGIN = 3.0  # margin between the temperature limit and the target temperature [°C]
 _FRACTION_MAX = 0.97  # maximum ratio of new to old force; a smaller reduction is not worthwhile
 _FRACTION_MIN = 0.6  # minimum ratio of new to old force, because the first estimate is uncertain
-_SETTLING_TIME = 10.0  # time from a reduction to the next evaluation [s]
+_SETTLING_TIME = 10.0  # time between a force reduction and the next evaluation [s]
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
-# Fractions of the total heat capacity and thermal resistance that belong to the winding.
+# Fraction of the total heat capacity in the winding, and fraction of the total thermal resistance
+# between winding and case.
 _WINDING_SHARE, _COUPLING_SHARE = 0.04, 0.4
 
 
 def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
-    """Set the thermal parameters from the servo model or its calibration.
+    """Set the thermal parameters from the settings or, by default, from the servo model.
 
     Returns
     -------
@@ -62,10 +64,10 @@ def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
 
 
 class HeatWatch:
-    """Temperature monitor for a scene's servos. Only the loop thread may use this class."""
+    """Temperature monitor for the servos of a hand. Only the loop thread may use this class."""
 
     def __init__(self, settings: Settings, state: State) -> None:
-        """Create the monitor; it reads ``state.reading`` and updates ``state.heat``."""
+        """Create a monitor that reads ``state.reading`` and updates ``state.heat``."""
         self._limits = settings.safety
         self._state = state
         self._fingers = [FINGERS.index(name) for name in sorted(settings.scene.fingers)]
@@ -82,7 +84,7 @@ class HeatWatch:
         self.due = False  # True if the model was updated on this tick
 
     def update(self) -> None:
-        """Add this tick's reading; update the model if an update is due."""
+        """Add the newest servo reading, and update the thermal model if an update is due."""
         reading = self._state.reading
         dt = reading.t - self._t
         self._t = reading.t
@@ -103,8 +105,8 @@ class HeatWatch:
             self._square[i] += (square - self._square[i]) * min(passed / _AVERAGING_TIME, 1.0)
             if not self._state.reading.temperature[i]:
                 continue  # No temperature has been read yet.
-            # Limit the step to suit the winding's time constant, even after a long gap between
-            # readings.
+            # After a long gap between readings, use several steps that are short enough for the
+            # winding's time constant.
             for _ in range(max(round(passed / _UPDATE_INTERVAL), 1)):
                 step = min(passed, _UPDATE_INTERVAL)
                 follow(self._states[i].array, square, step, self._state.reading.temperature[i])
@@ -117,9 +119,9 @@ class HeatWatch:
             estimate.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
     def act(self, control: Control, events: list[Event]) -> str:
-        """Reduce the grip force if a servo gets too hot.
+        """Reduce the grip force if a servo is about to overheat.
 
-        Return the ``heat_action`` if it is due, or "".
+        Return ``heat_action`` if the action is due, otherwise "".
         """
         state = self._state
         if state.mode not in GRIPPING_MODES:

@@ -1,14 +1,14 @@
-"""Define all limits of the hand, with their checks and consequences, in the ``LIMITS`` table.
+"""Define the ``LIMITS`` table with the check and the consequence of each limit.
 
-- ``warn``: reported once on ``hand/event``, and again only after the problem has been absent for a
-  while.
+- ``warn``: a warning is sent on ``hand/event``. It is repeated only after a second without the
+  violation.
 - ``limit``: the goal is modified before it is sent; ``status`` counts the affected ticks.
-- ``fault``: torque off, latched until ``clear``, which is refused while the cause persists.
+- ``fault``: torque is turned off until ``clear``. ``clear`` is refused while the cause persists.
 
-Each row is placed above its check function, and the table follows the order of this file. If
-several faults are present, the first one is reported. ``softfinger limits`` prints the table with a
-profile's values. The limit name is used as ``kind`` in events and as ``fault_name`` in
-``hand/state``. `safety.safety` defines when each row is checked.
+Each row decorates its check function, so the rows are in the order of this file. If several fault
+limits are violated, the first row in the table determines the reported fault. ``softfinger limits``
+prints the table with a profile's values. The limit name is used as ``kind`` in events and as
+``fault_name`` in ``hand/state``. `safety.safety` defines when each row is checked.
 """
 
 from __future__ import annotations
@@ -30,20 +30,21 @@ from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardwa
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 from softfinger.kinematics.hand.geometry import tip_position
 
-_NOISE_RATIO = 1.5  # multiple of ``tactile.noise`` above which messages mention the noise
+_NOISE_RATIO = 1.5  # messages mention noise that exceeds ``tactile.noise`` by this factor
 _WARNING_FRACTION = 0.9  # fraction of a fault limit above which a warning is issued
-# Minimum ratio of current to position error [A/rad]; every servo's position loop exceeds it.
+# Minimum ratio of current to position error [A/rad]. The position loops of all servos exceed this
+# ratio.
 _CURRENT_PER_ERROR = 2.0
 _STANDSTILL_SPEED = 0.05  # maximum speed of a joint at standstill [rad/s]
-# Minimum relative increase in commanded force, and the fraction of the increase that the tips must
-# measure.
+# Smallest relative increase in commanded force that is checked. The tips must measure at least this
+# fraction of the increase.
 _FORCE_RISE_MIN = 0.2
-_RESPONSE_TIME = 0.3  # time within which the measured force must follow [s]
-_STEP_TOLERANCE = 0.02  # step tolerance beyond the distance travelled at maximum velocity [rad]
+_RESPONSE_TIME = 0.3  # time within which the measured force must respond [s]
+_STEP_TOLERANCE = 0.02  # tolerance added to the largest step possible at maximum velocity [rad]
 _DRIFT_MAX = 0.1  # allowed difference between the angle and the integrated velocity [rad]
 _DRIFT_TIME = 0.1  # time window of the drift check [s], which allows for velocity lag
-# Interval between readings above which the drift window restarts [s]. The interval must also exceed
-# 3 ticks.
+# The drift window restarts if the interval between readings exceeds both this time [s] and three
+# ticks.
 _LATE_TIME = 0.02
 _FAILURE_TIME = 0.72  # time constant for averaging the fraction of failed readings [s]
 _FAILED_FRACTION_MAX = 0.75  # maximum failed fraction, reached after 1 s without a valid reading
@@ -51,15 +52,15 @@ _GAP_TIME = 0.1  # interval between readings above which position steps are not 
 
 
 class JointMotion:
-    """Consistency check between joint angles, measured velocities and the maximum velocity.
+    """Check of joint angles against the measured velocities and the maximum velocity.
 
     An encoder may jump, freeze while the joint rotates, or drift while the joint is at standstill.
-    A faulty encoder's angles are inconsistent with its velocity, and the finger's bit is then set
-    in ``jumped``.
+    The angles of a faulty encoder are inconsistent with the measured velocity. If an encoder is
+    faulty, the bit of its finger is set in ``jumped``.
     """
 
     def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:
-        """Create the check for a tick ``period`` [s]."""
+        """Create the check; ``period`` is the duration of a tick [s]."""
         self.jumped = 0
         self._fingers = tuple(fingers)
         self._velocity_max = velocity_max
@@ -71,7 +72,7 @@ class JointMotion:
         self._drift = [0.0, 0.0]  # angle minus integrated velocity [rad]
 
     def restart(self) -> None:
-        """Discard all readings; the next reading is not compared with an earlier reading."""
+        """Discard all readings. The next reading is not compared with an earlier reading."""
         self.jumped = 0
         self._request_time = self._t = -math.inf
 
@@ -101,7 +102,7 @@ class JointMotion:
 
 
 class View:
-    """Scene whose limits are checked, and the history that some checks require."""
+    """Data for the checks: settings, grasp, sensors, and a history of earlier states."""
 
     def __init__(
         self,
@@ -123,10 +124,10 @@ class View:
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
             self.pull = min(self.pull, 0.5 * servos.stiffness)
-        self.bad_goal = False  # True if a goal since the previous check was not finite
+        self.bad_goal = False  # True if a goal was not finite since the previous check
         self.grip_width = math.nan  # object width at the start of the grip [m]
         self._target = math.nan  # commanded grip force on the previous tick [N]
-        self.rise_t = math.inf  # time of a commanded increase that the tips have not measured [s]
+        self.rise_t = math.inf  # time of a commanded force increase that is not yet measured [s]
         self.rise_felt = 0.0  # measured force at `rise_t` [N]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":
@@ -136,10 +137,10 @@ class View:
         self.voltage = (low, high)
 
     def update(self, state: State) -> None:
-        """Store the parts of this tick's state that later checks need for comparison."""
-        # A jump is a fault only while torque is on. Readings without torque are not compared,
-        # because the clock of an emulated hand does not wait for the daemon then, and its joints
-        # may move further than the time between two readings allows.
+        """Update the history with the state of the current tick."""
+        # A jump is a fault only while torque is on. Without torque, the clock of an emulated hand
+        # does not wait for the daemon. The emulated joints may then move further than the time
+        # between two readings allows, so the readings are not compared.
         if self._torque:
             self.motion.update(state.t, state.reading)
         else:
@@ -173,7 +174,7 @@ class View:
         return state.object.valid and _touches(left) and _touches(right)
 
     def holds(self, state: State) -> bool:
-        """Return True if `touched` returns True and the grip has settled."""
+        """Return True if the grip has settled and `touched` is true."""
         return state.mode in HOLDING_MODES and self.touched(state)
 
 
@@ -181,9 +182,9 @@ def _touches(contact: Contact) -> bool:
     return contact.valid and contact.contact
 
 
-# The float argument of a check is the fraction of the bound to apply. A check returns a description
-# of the violation, or "" if the state is within the bound. Checks do not modify the state. NaN
-# violates every bound.
+# The float argument of a check is the fraction of the bound at which a violation is reported. A
+# check returns a description of the violation, or "" if the state is within the bound. Checks do
+# not modify the state. NaN violates every bound.
 Check = Callable[[View, State, float], str]
 FingerCheck = Callable[[View, State, float, int], str]
 
@@ -192,7 +193,7 @@ FingerCheck = Callable[[View, State, float, int], str]
 class Limit:
     """One row of the limit table. As a decorator, `Limit` adds the row with the decorated check.
 
-    A row without a check is added directly, because its limit is applied elsewhere: in
+    A row without a check is appended to `LIMITS` directly. A limit without a check is applied in
     `Safety.write`, on the bus or in the gateway.
     """
 
@@ -203,20 +204,20 @@ class Limit:
     needs: Literal["", "servos", "sensors"] = ""
     check: Check | None = None
     lasts: float | str = 0.0  # minimum duration of a violation [s], or the name of a setting
-    fraction: float = 1.0  # fraction of the bound to apply
-    in_turn: bool = False  # True for rows of which only one is checked per tick, in rotation
+    fraction: float = 1.0  # fraction of the bound at which a violation is reported
+    in_turn: bool = False  # True if the check takes turns with others, one check per tick
     gripping: bool = False  # True if the limit applies only while gripping
 
     def __call__(self, check: Check) -> Check:
-        """Add the row with its check.
+        """Add the row with its check to `LIMITS`.
 
-        If several rows decorate the same check, the one closest to the function is added first.
+        If several rows decorate one check, the row closest to the function is added first.
         """
         LIMITS.append(replace(self, check=check))
         return check
 
     def each(self, check: FingerCheck) -> FingerCheck:
-        """Add the row with a check that runs once per finger; the first violation is reported."""
+        """Add the row with a check that runs for each finger and reports the first violation."""
 
         def judge(view: View, state: State, fraction: float) -> str:
             for i in view.fingers:
@@ -366,10 +367,10 @@ _CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
 @Limit("joint.dead", "joint that is at least 0.05 rad from its goal, but neither moves nor draws "
     "current for 0.05 s", "fault", needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
-    """Report a joint that is stationary away from its goal without drawing current.
+    """Report a joint that is away from its goal, but neither moves nor draws current.
 
-    A joint held back by a load draws current. In position mode, the expected current is unknown, so
-    the check is skipped.
+    A joint that is blocked by a load draws current. In position mode, the expected current is
+    unknown, so the check is skipped.
     """
     goal, reading = state.goal, state.reading
     if not (state.torque and goal.valid) or view.settings.servos.mode == "position":
@@ -442,7 +443,8 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     )
 
 
-# Minimum overlap in tip radii. Offset errors and frame latency cause smaller overlaps.
+# Smallest reported overlap of the tips, in tip radii. Offset errors and frame latency cause smaller
+# overlaps.
 _OVERLAP_RATIO = 0.5
 
 
@@ -452,9 +454,9 @@ _OVERLAP_RATIO = 0.5
 def _joint_opens(view: View, state: State, _: float) -> str:
     """Report fingers that open instead of closing.
 
-    If the configured direction is wrong, goal, angle and current all change sign, so the servos'
-    readings look like those of a closing finger. The first visible difference is that contact is
-    missing when the tips should meet.
+    If ``servos.direction`` is wrong, the goal, the angle and the current have the wrong sign. The
+    servo readings of an opening finger are then the same as those of a closing finger. The error
+    becomes visible only when the tips should meet but no contact is detected.
     """
     felt = [contact.contact for contact in state.contacts]
     if state.mode != Mode.GRASPING or len(view.sensors) < len(FINGERS) or all(felt):
@@ -559,8 +561,8 @@ _TILT_TEXT = "|θ|; the limit is asin(1 − d/a) minus a margin"
 def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
     """Check that |θ| ≤ fraction·(asin(1 − d/a) − margin).
 
-    At asin(1 − d/a), the object plane reaches the rim of the tip's backing plate. The check uses
-    the sine, which is defined for every finite angle.
+    At a tilt of asin(1 − d/a), the object plane reaches the rim of the tip's backing plate. The
+    check compares sines, because the sine is defined for every finite angle.
     """
     radius, margin = view.settings.tip.radius, view.limits.theta_margin
     contact = state.contacts[i]
@@ -615,7 +617,7 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
 
 
 def _sensor_fault(view: View, state: State, finger: int) -> str:
-    """Explain why a sensor's frames are rejected; return "" if they are accepted."""
+    """Describe the fault of a sensor; return "" if the sensor has no fault."""
     side, found = FINGERS[finger], view.grasp
     if found.rejects_frames[finger]:
         turned, deeper = found.angle_jump[finger], found.d_jump[finger]
@@ -649,7 +651,7 @@ _GAIN_SIGMA = 1.5  # number of prior standard deviations above which a gain erro
 
 
 def _gain_fault(view: View, finger: int) -> str:
-    """Describe an unusually large gain error; return "" if there is none."""
+    """Describe an unusually large error of a sensor's gain; return "" if the gain is plausible."""
     grasp = view.grasp
     off, unsure = grasp.gain_change[finger], grasp.gain_std[finger]
     if not abs(off) - unsure > _GAIN_SIGMA * grasp.gain_prior_std[finger]:
@@ -668,7 +670,7 @@ def _add_consistency_checks(finger: int, side: str) -> None:
         if finger not in view.fingers:
             return ""
         # Check the gain only during a grip. After a release, the sensor cells may relax more slowly
-        # than the tip's shape.
+        # than the tip.
         return _sensor_fault(view, state, finger) or (
             _gain_fault(view, finger) if view.holds(state) else ""
         )
@@ -741,7 +743,7 @@ def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
 
 # --- the hand and its grip ------------------------------------------------------------------------
 
-_ANGLE_SIGMA = 4.0  # minimum significant difference, in standard deviations of the summed tilt
+_ANGLE_SIGMA = 4.0  # smallest significant difference between the angles, in standard deviations
 _ANGLE_TEXT = "difference between the two fingers' estimates of the object's angle"
 _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
@@ -753,7 +755,7 @@ _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
-    # Use only estimates from the newest frames.
+    # Compare the unfiltered estimates from the newest frames.
     left, right = (sensor.estimate for sensor in view.sensors)
     if not (left.contact and right.contact):
         return ""

@@ -1,8 +1,8 @@
 """Check every state, limit every goal, and send the goals to the servos.
 
-Goals reach the bus only through `Safety.write`, which limits them. The `safety.limits.LIMITS` table
-defines the checks. This module schedules the checks, reports each warning once, and raises a fault
-only after a violation has lasted long enough.
+Goals reach the bus only through `Safety.write`, which applies the goal limits. The
+`safety.limits.LIMITS` table defines the checks. This module schedules the checks, reports each
+warning once, and raises a fault only after a violation has lasted long enough.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _REPEAT_TIME = 1.0  # time without a violation after which a warning may be repe
 _HYSTERESIS = 0.95  # fraction of the bound below which a reported warning clears
 
 BUS = "servos.bus"  # name of the limit for errors of the servo backend
-TORQUE_OFF = "torque.off"  # limit name for a torque off that the servos have not confirmed
+TORQUE_OFF = "torque.off"  # name of the limit for servos that have not confirmed torque off
 
 
 class Breach(NamedTuple):
@@ -49,7 +49,7 @@ class _Watch:
     def check_limit(
         self, view: View, state: State, faults: dict[_Watch, str], warnings: list[Breach]
     ) -> None:
-        """Run the check; record a violation if it has lasted long enough."""
+        """Run the check, and record a violation that has lasted long enough."""
         limit = self.limit
         found = self.check(view, state, limit.fraction * (_HYSTERESIS if self.reported else 1.0))
         if not found:
@@ -81,7 +81,7 @@ class Safety:
         grasp: GraspState | None = None,
         sensors: Sequence[FingerPerception] = (),
     ) -> None:
-        """Create the checks; ``grasp`` and ``sensors`` belong to the loop and are only read."""
+        """Create the checks, which read ``grasp`` and ``sensors`` but never modify them."""
         view = self._view = View(settings, grasp, sensors)
         limits, hand = settings.safety, settings.hand
         self._limits = limits
@@ -94,17 +94,17 @@ class Safety:
         ]
         self._each_tick = [watch for watch in watches if not watch.limit.in_turn]
         self._in_turn = [watch for watch in watches if watch.limit.in_turn]
-        # Keep the table order: the first violation gives the fault its name.
+        # Keep the order of the table, because the first violation determines the name of the fault.
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
         self._found: dict[_Watch, str] = {}  # current violations of fault limits
-        self.must_hold = False  # True if late frames require holding the goal during a grip
+        self.must_hold = False  # True if the goal of a grip must be held because frames are late
         self.warnings: list[Breach] = []  # new warnings, which the loop reports and removes
         self.limited: Counter[str] = Counter()  # number of ticks with a modified goal, per limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
         dt = 1.0 / settings.loop.rate
         self._step = limits.goal_speed * dt
-        # In position mode, no current limit restricts the effect of a goal jump.
+        # In position mode, the current limit does not reduce the effect of a goal jump.
         self._travel = 0.0 if settings.servos.mode == "position" else limits.goal_reach
         self._rise = limits.current_rate * dt
         self._ends = [(i, hand.q_min[i], hand.q_max[i]) for i in view.fingers]
@@ -115,7 +115,7 @@ class Safety:
     # Checks of the state
 
     def judge(self, state: State) -> Breach | None:
-        """Check this tick's state; return the first fault, or None.
+        """Check the state of the current tick, and return the first fault or None.
 
         New warnings are appended to ``warnings``.
         """
@@ -140,10 +140,10 @@ class Safety:
         return None
 
     def cause(self, state: State, gripping: bool = False) -> str:
-        """Return the first fault that would block a command in this state, or "".
+        """Return the first fault that would block a command in ``state``, or "" without a fault.
 
-        If ``gripping`` is True, the limits for a grip are checked in every mode. The state is not
-        modified.
+        If ``gripping`` is True, the limits that apply during a grip are checked in every mode. The
+        state is not modified.
         """
         gripping = gripping or state.mode in GRIPPING_MODES
         view = self._view
@@ -163,7 +163,9 @@ class Safety:
     # Goals
 
     def write(self, servos: Servos, state: State) -> None:
-        """Limit the goal in place and send it; a goal that is not finite is marked invalid instead.
+        """Limit the goal in place and send the goal to the servos.
+
+        A goal that is not finite is marked as invalid and is not sent.
 
         Raises ServoError like `Servos.write`.
         """

@@ -1,9 +1,10 @@
-"""Track the torque state: on as soon as torque is requested, off only after confirmation.
+"""Track the torque state. Torque counts as on when requested, but as off only when confirmed.
 
-Torque off is sent on every tick until the servo registers confirm it. If the servos do not confirm
-within half the bus watchdog time, the bus stays silent until the watchdog has stopped the motors.
-If the bus were not silent, a servo that receives read requests but loses all writes would keep
-driving its motor. The daemon then tries to switch torque off again.
+The torque-off request is repeated on every tick until the servo registers confirm that torque is
+off. If the confirmation does not arrive within half the watchdog time, the daemon keeps the bus
+silent until the watchdogs stop the motors. If the bus were not silent, a servo that receives read
+requests but no write requests would keep driving its motor. After the silence, the daemon requests
+torque off again.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from softfinger.daemon.types import Reading, State
 # Duration of repeated torque-off attempts, as a fraction of the watchdog time. After the attempts,
 # the bus is kept silent.
 _TRY_FRACTION = 0.5
-_TRY_TIME_UNGUARDED = 0.05  # time for attempts before a failure report if servos.watchdog is 0 [s]
+_TRY_TIME_UNGUARDED = 0.05  # duration of the attempts if servos.watchdog is 0 [s]
 _CLOSING_TRY_COUNT = 15  # number of torque-off attempts at shutdown
 
 
 class TorqueState:
-    """Torque controller that writes ``torque``, ``torque_off`` and ``write_error`` in the state."""
+    """Torque controller that sets ``torque``, ``torque_off`` and ``write_error`` in the state."""
 
     def __init__(
         self,
@@ -39,7 +40,7 @@ class TorqueState:
     ) -> None:
         """Create the controller.
 
-        ``fail(reason, name)`` latches a fault with the limit's name; ``emit`` sends an event.
+        ``fail(reason, name)`` latches a fault under the name of a limit. ``emit`` sends an event.
         """
         self.servos = servos
         self._state = state
@@ -48,7 +49,7 @@ class TorqueState:
         self._emit = emit
         watchdog = settings.watchdog
         self._try_time = _TRY_FRACTION * watchdog or _TRY_TIME_UNGUARDED
-        # The servo's watchdog counts whole units and may act one unit late.
+        # A servo's watchdog counts whole units of time and may trip one unit late.
         units = math.ceil(watchdog / WATCHDOG_UNIT - 1e-9) + 1 if watchdog else 0
         self._silence = units * WATCHDOG_UNIT
         self._tried_since = math.inf  # start of the current series of attempts [s]
@@ -56,7 +57,7 @@ class TorqueState:
         self._first = math.inf  # time of the first request to turn torque off [s]
         self._reported = False
         self._port_gone = False  # True if the port is lost and the daemon cannot send anything
-        self._last_try = -1  # seq of the tick with the last attempt
+        self._last_try = -1  # sequence number of the tick with the last attempt
         self._unused = Reading()  # buffer for readings that are discarded
 
     @property
@@ -65,7 +66,7 @@ class TorqueState:
         return self._tried_since < math.inf
 
     def read(self, reading: Reading) -> None:
-        """Read the servos, repeating a pending torque-off request in the same exchange.
+        """Read the servos. A pending torque-off request is repeated in the same bus exchange.
 
         Raises ServoError like `Servos.read`.
         """
@@ -81,7 +82,7 @@ class TorqueState:
             self._try(servos, reading)
 
     def write(self, requested: bool, now: float) -> None:
-        """Switch torque as ``requested`` on this tick; send the goal while torque is on."""
+        """Switch torque on or off as ``requested``. While torque is on, send the goal."""
         state, servos = self._state, self.servos
         if servos is None:
             return
@@ -122,7 +123,7 @@ class TorqueState:
     def end(self) -> None:
         """Turn torque off if it may be on.
 
-        If torque cannot be turned off, the bus stays silent, which trips the watchdogs.
+        If torque cannot be turned off, the silent bus trips the servo watchdogs.
         """
         for _ in range(_CLOSING_TRY_COUNT):
             if not self._state.torque:
@@ -185,7 +186,7 @@ class TorqueState:
         return silence > 0.0
 
     def _report(self) -> None:
-        """Report once that torque off is unconfirmed; latch a fault if none is latched yet."""
+        """Report once that torque off is unconfirmed, and latch a fault if none is latched."""
         if self._reported:
             return
         self._reported = True

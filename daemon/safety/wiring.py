@@ -1,10 +1,10 @@
 """Detect swapped servo IDs, which send each finger's commands to the other finger.
 
 Joint angles and currents remain consistent, because each servo reports its own values. Only the
-tactile sensors show the error. A tip tilts by about the angle through which its finger rotates, so
-the tilt shows which joint's reported angle belongs to this finger. If the object does not yield,
-the tip force rises although the finger's joint is reported as stationary. Later, the object rotates
-opposite to the command.
+tactile sensors show the error. A tip in contact tilts by about the angle through which its finger
+rotates. The tilt therefore shows which of the two reported joint angles belongs to the finger. If
+the object does not yield, the tip force rises although the servo reports a stationary joint. During
+a commanded rotation, the object rotates in the wrong direction.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _TILT_SIGNS = (1.0, -1.0)  # sign of the tip tilt while the finger closes
 
 
 class WiringWatch:
-    """Check, during approach and rotation, that the moving joint and the responding tip match."""
+    """Check during approach and rotation that the moving joint drives the responding tip."""
 
     def __init__(self, fingers: Sequence[int]) -> None:
         self.swapped = ""  # description of a detected swap, or an empty string
         self._has_two_fingers = len(fingers) == len(FINGERS)
-        self._touching = -1  # finger that touched the object alone, or -1
-        self._since = 0.0  # start of the single-finger contact [s]
+        self._touching = -1  # index of the only finger that touches the object, or -1
+        self._since = 0.0  # time at which the contact with one finger began [s]
         self._q = [0.0, 0.0]  # joint angles after the touch [rad]
         self._tilt = math.nan  # tilt after the touch [rad]
         self._force = 0.0  # force after the touch [N]
@@ -59,7 +59,7 @@ class WiringWatch:
     def _check_approach(self, state: State) -> None:
         left, right = (each.valid and each.contact for each in state.contacts)
         if not (left or right):
-            return  # A light contact may be lost for a few frames; its reference is kept.
+            return  # A light contact may be lost for a few frames, so its reference is kept.
         finger = -1 if left and right else 0 if left else 1
         if finger != self._touching or finger < 0:
             self._touching, self._since, self._tilt = finger, state.t, math.nan
@@ -71,7 +71,7 @@ class WiringWatch:
         other = 1 - finger
         closed, other_closed = q[finger] - self._q[finger], q[other] - self._q[other]
         tilted = _TILT_SIGNS[finger] * (contact.theta - self._tilt)
-        # Beyond the threshold, the tilt matches the other joint's motion better than this joint's.
+        # A tilt above the threshold matches the motion of the other joint better.
         threshold = 0.5 * (closed + other_closed) + _TILT_SIGMA * contact.theta_std
         follows_other = other_closed - closed > _CLOSING_MIN and tilted > threshold
         pressed = contact.force - self._force > _FORCE_RISE_MIN

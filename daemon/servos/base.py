@@ -1,4 +1,4 @@
-"""Define the interface between servo backends and the loop; create the selected backend."""
+"""Define the interface between the servo backends and the loop, and create the selected backend."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Status = Literal["pass", "note", "fixed", "warn", "FAIL"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of checking one device or the machine, and how to fix any problem.
+    """Result of one check of a device or of the machine, with a fix if needed.
 
     ``FAIL`` means that the daemon cannot run, and ``warn`` means that the daemon runs with
     restrictions. Findings with any other status require no action.
@@ -29,7 +29,7 @@ class Finding:
 
     status: Status
     subject: str  # for example ``servo 1 (left)``
-    text: str  # description of the actual value and of the expected value
+    text: str  # found value and expected value
     fix: str = ""  # command or action, empty if none is needed
 
     def __str__(self) -> str:
@@ -42,18 +42,19 @@ class Servos(Protocol):
 
     In each mode, ``goal.q`` is the goal angle of a joint:
 
-    - *current-based position* (5): the servo's own position loop with the motor current limited to
+    - *current-based position* (5): the servo controls its position and limits the motor current to
       ± ``goal.current``.
-    - *current* (0): the daemon computes the position loop once per tick from the newest reading,
-      with ``servos.stiffness`` and ``servos.damping``, limited to ± ``goal.current``. Without
-      readings, the current stays constant until the servo's bus watchdog stops the servo.
-    - *position* (3): the servo's own position loop without a current limit. ``goal.current`` is
-      ignored, and switching torque on holds the joint immediately. Position mode is suitable for
+    - *current* (0): the daemon computes the position loop once per tick from the newest reading.
+      The loop uses ``servos.stiffness`` and ``servos.damping``, and limits the current to
+      ± ``goal.current``. Without readings, the current stays constant until the servo's bus
+      watchdog stops the servo.
+    - *position* (3): the servo controls its position without a current limit, and ignores
+      ``goal.current``. The joint is held as soon as torque is on. Position mode is suitable for
       moving but not for grasping.
 
-    ``connect`` checks the servos and never switches torque on or moves the hand. ``read`` and
-    ``write`` are called once per tick. A failed exchange is reported by ``valid`` and the counters.
-    `read` and `write` raise an error only if the port itself is lost.
+    ``connect`` checks the servos, but never switches torque on. ``read`` and ``write`` are called
+    once per tick. A failed exchange sets ``valid`` to False and increments a counter. `read` and
+    `write` raise an error only if the port is lost or a watchdog has stopped a servo.
     """
 
     def connect(self) -> None:
@@ -62,38 +63,37 @@ class Servos(Protocol):
     def read(self, reading: Reading) -> None:
         """Update ``reading`` in place.
 
-        After a failed exchange, ``valid`` is False and all other fields except ``seq`` keep their
-        values, so ``reading.t`` is the time of the last valid reading. Temperature and voltage may
-        be up to one second old.
+        A failed exchange changes only ``valid`` and ``seq``. ``reading.t`` therefore remains the
+        time of the last valid reading. Temperature and voltage may be up to one second old.
         """
 
     def torque_on(self) -> None:
-        """Set the goal to the current angle, switch torque on and verify it.
+        """Set the goal to the current angle, switch torque on and verify that torque is on.
 
-        Raises ServoError if switching on fails or cannot be verified; torque may then be on.
+        Raises ServoError if torque cannot be switched on or verified. Torque may then be on.
         """
 
     def torque_off(self, reading: Reading) -> bool:
-        """Request torque off once, then read like `read`; return True once all servos confirm.
+        """Request torque off and read the servos; return True if all servos confirm torque off.
 
-        This method takes no longer than `read`, so the loop can call it on every tick until it
-        returns True. Raises ServoError if the port is lost.
+        The call takes no longer than `read`, so the loop can repeat the call on every tick. Raises
+        ServoError if the port is lost.
         """
 
     def write(self, goal: Goal) -> None:
         """Send each joint's goal angle and current limit."""
 
     def counters(self) -> dict[str, int]:
-        """Count the failed exchanges since `connect` by type: ``timeouts``, ``crc``, …"""
+        """Return the number of failed exchanges since `connect` by type, such as ``timeouts``."""
 
     def close(self) -> None:
         """Try to switch torque off and close the port. Never raises."""
 
 
 class JointPlant(Protocol):
-    """Simulated joints and motors, as used by simulated and emulated servos.
+    """Simulated joints and motors for simulated and emulated servos.
 
-    Index 0 is the left finger's joint. Positive values close the finger.
+    Index 0 is the left finger's joint. Positive velocities and currents close the finger.
     """
 
     q: FloatArray  # true joint angles [rad] at the time of the last `advance`
@@ -104,16 +104,16 @@ class JointPlant(Protocol):
         """Return a joint's motor current [A] as measured by its servo."""
 
     def advance(self, t: float) -> None:
-        """Advance to time t [s]; do nothing if t is in the past."""
+        """Advance the simulation to time ``t`` [s]. A time in the past has no effect."""
 
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
     ) -> None:
-        """Set a servo's command; the command stays active until the next call.
+        """Set the command for a servo. The command stays active until the next call.
 
         ``mode`` is 5 (current-based position), 3 (position) or 0 (current). In mode 5,
-        ``goal_current`` limits the magnitude of the current. Mode 3 applies the servo model's own
-        limit instead. In mode 0, ``goal_current`` is the signed current.
+        ``goal_current`` limits the magnitude of the current. In mode 3, the current limit of the
+        servo model applies instead. In mode 0, ``goal_current`` is the signed current.
         """
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
@@ -121,9 +121,12 @@ class JointPlant(Protocol):
 
         Parameters
         ----------
-        stiffness : stiffness of the position loop relative to the factory value damping : damping
-        in addition to the factory value, per unit of ``stiffness`` [s] duty : maximum fraction of
-        the supply voltage applied to the motor
+        stiffness
+            Stiffness of the position loop relative to the factory value.
+        damping
+            Additional damping per unit of ``stiffness`` [s].
+        duty
+            Maximum fraction of the supply voltage applied to the motor.
         """
 
 
@@ -132,8 +135,8 @@ def make_servos(settings: Settings, clock: Clock, hand: object) -> Servos | None
 
     Returns None if the scene has no servos.
 
-    ``hand`` is the simulated hand, for backends that use it. Raises the same errors as the
-    backend's constructor.
+    ``hand`` is the simulated hand. Only backends that use the simulated hand receive ``hand``.
+    Raises the same errors as the backend's constructor.
     """
     found = backend("servos", settings.servos.backend)
     if settings.servos.backend == "none":

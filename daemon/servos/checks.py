@@ -1,7 +1,6 @@
-"""Check the servos before use: replies, registers and limits.
+"""Check the replies, registers and limits of the servos before use.
 
-The checks read registers but do not change them. The findings for all servos, with fixes, are
-collected in one list.
+The checks read registers but do not change them.
 """
 
 from __future__ import annotations
@@ -35,14 +34,14 @@ OLD_PROTOCOL = (
 _WATCHDOG_FIRMWARE = 38
 _FAULT_AFTER_LONG = 0.5  # value of servos.fault_after above which a notice is issued [s]
 _CONSTANT_RATIO_MAX = 1.3  # maximum ratio of a torque constant to its data sheet value
-_TEMPERATURE_MARGIN = 10  # margin below the temperature limit [°C]
-# Tolerance beyond the hand's limits [rad]. A larger angle is implausible. Either the zero offset is
-# wrong, or the servo lost its turn count while it was switched off.
+_TEMPERATURE_MARGIN = 10  # margin below the temperature limit at which a notice is issued [°C]
+# Tolerance beyond the joint limits [rad]. Outside this tolerance, the zero offset is wrong or the
+# servo has lost its turn count while switched off.
 ANGLE_MARGIN = 0.25
 
 
 class Registers(bytes):
-    """A servo's registers starting at address 0; empty if they could not be read."""
+    """Registers of a servo, starting at address 0. The object is empty after a failed read."""
 
     def word(self, address: int) -> int:
         """Return the unsigned 2-byte register at ``address``."""
@@ -72,7 +71,7 @@ class Examined:
 
 
 def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Examined]:
-    """Ping, read and check each servo in the scene, in scene order."""
+    """Ping, read and check each servo in the order of ``scene.fingers``."""
     found = []
     for finger in map(FINGERS.index, settings.scene.fingers):
         servo_id = settings.servos.ids[finger]
@@ -147,7 +146,7 @@ def check_servo(
     )
     if not low <= volts <= high:
         fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
-        # The supply voltage suits the model, so the servo's own limits are too narrow.
+        # If the supply voltage suits the model, the limits stored in the servo are too narrow.
         fix = FIX if fits else "check the power supply"
         wrong(f"supply voltage is {volts:.1f} V, expected {low:.1f} to {high:.1f} V", fix)
     firmware = table[reg.FIRMWARE_VERSION]
@@ -168,7 +167,7 @@ def check_servo(
 
 
 def other_model(number: int, model: ServoModel) -> tuple[str, str]:
-    """Describe a servo whose model differs from the settings, and how to fix the mismatch."""
+    """Describe a servo whose model differs from the settings; return the problem and the fix."""
     if reg.by_number(number) is not None:
         return f"is an {reg.name_of(number)}, expected an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
@@ -186,7 +185,7 @@ def check_registers(
     finger: int,
     status: Status,
 ) -> list[Finding]:
-    """Return a finding with this ``status`` for each register with a wrong value."""
+    """Return a finding for each wrong register whose requirement has this ``status``."""
     found = []
     for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
         wrong = row.wrong_in(table)
@@ -240,9 +239,9 @@ def notice_servo(
 
 
 def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Finding]:
-    """Return warnings if the torque constant or the friction does not match the servo model.
+    """Return warnings if the configured torque constant or friction does not match the servo model.
 
-    `profile.validation.plausibility_warnings` compares the forces with the model.
+    `profile.validation.plausibility_warnings` compares the configured forces with the model.
     """
     constant = settings.servos.gear_ratio * model.torque_constant
     found = []
@@ -273,9 +272,9 @@ def check_angle(
 ) -> Finding | None:
     """Return a finding if a joint is far outside the hand's limits, otherwise None.
 
-    Switching torque on would immediately move an out-of-range joint back. A reboot resets the
-    servo's turn count, which corrects a lost turn, unless the servo ``is_reversed``: it then counts
-    down from 0, even after a reboot.
+    If torque were switched on, a joint outside the limits would immediately move back. A reboot
+    resets the servo's turn count and thus corrects a lost turn. If ``is_reversed``, the servo
+    counts down from 0 even after a reboot, so a reboot does not help.
     """
     low, high = hand.q_min[finger], hand.q_max[finger]
 
@@ -305,7 +304,7 @@ def check_angle(
 def check_position(
     name: str, scale: JointScale, table: Registers, hand: GeometrySettings, finger: int
 ) -> Finding | None:
-    """Check the angle of a servo from its registers."""
+    """Check the joint angle in the registers of a servo."""
     counts = table.long(reg.PRESENT_POSITION)
     counts_down = bool(table[reg.DRIVE_MODE] & DRIVE_REVERSE)
     is_reversed = counts_down and -reg.COUNTS_PER_TURN < counts <= 0
@@ -313,10 +312,9 @@ def check_position(
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
-    """Compare a USB adapter's latency timer with the reply time [s]; return None without a timer.
+    """Compare a USB adapter's latency timer with the reply timeout; return None without a timer.
 
-    The adapter holds back a reply until the timer expires, so a value of 16 ms limits reads to 60
-    Hz.
+    The adapter delays a reply until the timer expires. A timer of 16 ms limits reads to 60 Hz.
     """
     place = latency_file(path, *sysfs)
     if place is None:

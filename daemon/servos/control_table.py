@@ -83,7 +83,7 @@ VOLTAGE_UNIT: Final = 0.1  # V per count
 RETURN_DELAY_UNIT: Final = 2e-6  # s per count
 WATCHDOG_UNIT: Final = 0.020  # s per count
 WATCHDOG_MAX: Final = 127
-WATCHDOG_ERROR: Final = 0xFF  # register 98 reads -1 and goals are rejected until 0 is written
+WATCHDOG_ERROR: Final = 0xFF  # value after a watchdog stop; goals are rejected until 0 is written
 
 # --- operating modes, register 11 ----------------------------------------------------------------
 
@@ -117,7 +117,7 @@ HARDWARE_ERRORS: Final = {
 
 
 def hardware_error_names(status: int) -> str:
-    """Return the names of the set hardware error bits, joined by commas."""
+    """Return the names of the hardware errors in ``status``, separated by commas."""
     names = [name for bit, name in HARDWARE_ERRORS.items() if status >> bit & 1]
     return ", ".join(names) or f"unknown error bits 0x{status:02X}"
 
@@ -126,7 +126,7 @@ def hardware_error_names(status: int) -> str:
 
 _SPECIFIC_HEAT = 0.9  # approximate specific heat of plastic, aluminium and steel [J/(g K)]
 _CONVECTION = 10.0  # convection coefficient of a small body in still air [W/(m² K)]
-SAG: Final = 0.35  # resistance of the simulated supply, including cable [Ω]
+SAG: Final = 0.35  # resistance of the simulated power supply and its cable [Ω]
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,13 +149,13 @@ class ServoModel:
     shutdown: int
     drive_mode_max: int
     fast_read_firmware: int  # first firmware version with fast sync read and fast bulk read
-    stall: tuple[float, float, float]  # stall torque [N·m] and current [A] at a voltage [V]
+    stall: tuple[float, float, float]  # stall torque [N·m], stall current [A], voltage [V]
     mass: float  # g
     size: tuple[float, float, float]  # mm
     modes: tuple[int, ...] = tuple(MODE_NAMES)
     pwm_slope: int | None = None  # default of register 62, or None if the model lacks this register
     is_x330: bool = False  # True for the X330 series, whose indirect addresses moved in firmware 53
-    gear_loss: float = 0.0  # published fraction of the gear torque lost to friction, or 0
+    gear_loss: float = 0.0  # published fraction of the torque that gear friction consumes, or 0
 
     @property
     def senses_current(self) -> bool:
@@ -205,7 +205,7 @@ class ServoModel:
         return 1.0 / (_CONVECTION * 2.0 * (a * b + b * c + c * a))
 
     def indirect_blocks(self, firmware: int) -> tuple[tuple[int, int, int], ...]:
-        """Return (first address register, first data register, entries) of each indirect block."""
+        """Return each indirect block as (first address register, first data register, length)."""
         if not self.is_x330:
             return ((INDIRECT_ADDRESS, 224, 28), (578, 634, 28))
         if firmware <= 52:
@@ -223,15 +223,15 @@ class ServoModel:
 
 _ALL = tuple(MODE_NAMES)
 _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MODE)
-# One row per model, in the order of the ServoModel fields. The source of each row is the model's
-# page in the ROBOTIS e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or …/mx/NAME-2/
-# (specifications and both areas of the control table). Where model numbers differ (XD430), the
-# source is control_table/dynamixel.model in dynamixel-sdk. The velocity limits of XH430-V,
-# XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's limits
-# apply to firmware before version 42. For the XW430-T200, the e-Manual lists the stall torque of
-# the XW540-T140, 6.9 N·m at 4.9 A. The row of the XW430-T200 therefore contains the data of the
-# XH430-W210, with the stall torque scaled by the gear ratio, 200 : 213. For the XW430-T333, the
-# same kind of scaling gives 3.2 N·m, close to the 3.1 N·m at 1.3 A in the e-Manual.
+# One row per model, in the order of the ServoModel fields. The data come from the specifications
+# and the control table on the model's page in the ROBOTIS e-Manual,
+# emanual.robotis.com/docs/en/dxl/x/NAME/ or …/mx/NAME-2/. The model numbers of the XD430 come from
+# control_table/dynamixel.model in dynamixel-sdk. For XH430-V, XH540-V270, XM540-W150, MX-64 and
+# MX-106, the velocity limit is the no-load speed, because the manual's limits apply to firmware
+# before version 42. For the XW430-T200, the e-Manual lists 6.9 N·m at 4.9 A, which is the stall
+# torque of the XW540-T140. The row of the XW430-T200 therefore contains the data of the XH430-W210,
+# with the stall torque multiplied by the gear ratio 200 : 213. For the XW430-T333, scaling by the
+# gear ratio gives 3.2 N·m. The e-Manual lists 3.1 N·m at 1.3 A.
 _430 = 82, (28.5, 46.5, 34.0)  # mass [g], size [mm]
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)
@@ -339,7 +339,7 @@ _CRCS: Final = [_crc_of(byte) for byte in range(256)]
 
 
 def crc16(data: bytes, crc: int = 0) -> int:
-    """Return the CRC-16 (polynomial 0x8005, initial value 0) that ends every packet."""
+    """Return the CRC-16 of a packet (polynomial 0x8005, initial value 0)."""
     for byte in data:
         crc = crc << 8 & 0xFF00 ^ _CRCS[crc >> 8 ^ byte]
     return crc

@@ -1,14 +1,13 @@
 """Drive the joints through dynamixel-sdk with one read and one write per tick.
 
-One fast sync read returns the current, velocity, position and alert bit of all servos; older
-firmware uses the normal sync read. Some reads cover additional registers without an extra exchange.
-Every 10 ms, a read includes the goals stored in the servo, its bus watchdog and its clock (28 more
-bytes per servo). Four times per second, a read includes supply voltage and temperature (11 more
-bytes).
+A fast sync read returns the current, velocity, position and alert bit of all servos. Servos with
+older firmware are read with the normal sync read. Every 10 ms, the read covers 28 more bytes per
+servo: the stored goals, the bus watchdog and the clock. Four times per second, the read covers 11
+more bytes per servo: supply voltage and temperature.
 
 One sync write sends goal current and goal position as adjacent registers (:mod:`servos.torque`).
-Current mode and position mode have a single goal, so they do not need indirect addresses. Required
-EEPROM values are checked but never changed.
+Current mode and position mode have a single goal, so they do not need indirect addresses. The
+backend checks the required EEPROM values but never changes them.
 """
 
 from __future__ import annotations
@@ -56,19 +55,19 @@ _HEALTH_INTERVAL = 0.25  # s
 _CHECK_INTERVAL = 0.01  # s
 _CHECK_FRACTION = 0.05  # maximum fraction of the line capacity that checks may use
 _RECENT_TIME = 0.035  # maximum age of a recent goal [s]
-_FROZEN_TIME = 0.1  # maximum time that a servo's 1 ms clock may stand still [s]
-_VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a reply is missing
+_FROZEN_TIME = 0.1  # maximum time for which a servo's 1 ms clock may stand still [s]
+_VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a missing reply
 _CHECK_TIMEOUT = 0.2  # reply timeout during the checks [s]; `clear` blocks the loop for this time
 # Reply timeout for an emulated hand [s]. The hand's clock pauses while the machine is late.
 _BUSY_TIME = 0.04
-_CLOSING_TRY_COUNT = 10  # number of torque-off attempts when closing
+_CLOSING_TRY_COUNT = 10  # number of torque-off attempts before the port is closed
 
 
 class DynamixelServos:
     """Servo backend over a serial port; see :class:`servos.base.Servos`.
 
-    Use an object from a single thread only. ``notices`` contains the findings of `connect` that are
-    not errors.
+    An instance must be used from a single thread. ``notices`` contains the findings of `connect`
+    that are not errors.
     """
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
@@ -84,7 +83,7 @@ class DynamixelServos:
         self._reads: TickReads | None = None
         self._waiting: SerialPort | None = None  # open port whose servos have not responded yet
         self._turn = 0  # index of the most recently used span length
-        self._varied_reads = 0  # number of remaining requests with ambiguous replies
+        self._varied_reads = 0  # remaining number of requests with varying span lengths
         self._next_health = self._next_check = -math.inf  # clock times of the next reads
         self._check_interval = _CHECK_INTERVAL
         self._retries = 0
@@ -135,7 +134,7 @@ class DynamixelServos:
         self._line, self._torque = line, torque
 
     def _check(self, line: ServoLine, model: ServoModel) -> TickReads:
-        """Check servos, adapter and group reads; store the joint limits and the notices."""
+        """Check the servos, the adapter and the group reads, and store joint limits and notices."""
         port = line.port
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _CHECK_TIMEOUT)
         try:
@@ -153,9 +152,9 @@ class DynamixelServos:
         return reads
 
     def _judge(self, found: list[Examined], port: SerialPort, allowed: float) -> None:
-        """Set limits and notices from the results; ``allowed`` is the maximum reply time [s].
+        """Set the joint limits and the notices from the results in ``found``.
 
-        Raises ServoError, which lists all problems.
+        ``allowed`` is the maximum reply time [s]. Raises ServoError, which lists all problems.
         """
         if not any(each.replies or each.errors for each in found):
             raise ServosSilent(
@@ -191,7 +190,7 @@ class DynamixelServos:
     # --- the tick --------------------------------------------------------------------------------
 
     def read(self, reading: Reading) -> None:
-        """Update ``reading`` from one group read, which is repeated once if its reply is corrupted.
+        """Update ``reading`` with one group read, and repeat the read once after a corrupted reply.
 
         Raises
         ------
@@ -224,7 +223,7 @@ class DynamixelServos:
         group = self._reads.spans[span][turn]
         result = group.exchange()
         if result == COMM_RX_CORRUPT:
-            # Repeat the read before the deadline of the first exchange.
+            # The repetition must finish before the deadline of the first exchange.
             deadline = group.port.deadline
             if time.monotonic() < deadline:
                 self._retries += 1
@@ -259,7 +258,7 @@ class DynamixelServos:
             reading.temperature[joint.finger] = float(temperature)
 
     def _check_torque(self, group: GroupRead, reading: Reading, now: float) -> None:
-        """Check that each servo's clock advances and that its goal is recent."""
+        """Check that the clock of each servo advances and that each servo has a recent goal."""
         start, torque = group.start, self._torque
         assert torque is not None
         reading.lost = reading.frozen = 0
@@ -282,7 +281,7 @@ class DynamixelServos:
                 reading.hardware[joint.finger] = errors.data[joint.id][0]
 
     def write(self, goal: Goal) -> None:
-        """Send goal angles and current limits, but only if this object switched torque on.
+        """Send the goal angles and current limits if this object has switched torque on.
 
         Raises
         ------
@@ -301,7 +300,7 @@ class DynamixelServos:
         torque.goals.send(values)
 
     def torque_on(self) -> None:
-        """Switch torque on at the current angle with zero motor current, and verify it.
+        """Switch torque on at the current angle with zero motor current, and verify the result.
 
         Raises
         ------
@@ -313,7 +312,7 @@ class DynamixelServos:
         self._torque.on()
 
     def torque_off(self, reading: Reading) -> bool:
-        """Request torque off and read the servos; return True if all registers confirm torque off.
+        """Request torque off and read the servos; return True if all servos confirm torque off.
 
         Raises
         ------
@@ -351,7 +350,7 @@ class DynamixelServos:
         }
 
     def close(self) -> None:
-        """Switch torque off, verify it if possible, and close. Never raises.
+        """Switch torque off, verify the result if possible, and close the port. Never raises.
 
         If another program switched torque on, the torque stays on.
         """

@@ -1,4 +1,4 @@
-"""Choose the type of a tick's group reads, perform the group reads, and measure their duration.
+"""Choose and perform the group reads of a tick, and measure the duration of exchanges.
 
 The daemon and `doctor` share this code, so `doctor` tests the exchanges that the daemon uses.
 """
@@ -20,27 +20,28 @@ from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.servos.protocol import TRY_COUNT, FastGroupRead, GroupRead, PacketHandler
 
 Span = tuple[int, int]  # first and last address
-# Register spans that are read in one exchange. Most ticks read PRESENT. CHECK also covers the goals
-# and the bus watchdog, HEALTH also covers supply voltage and temperature, and ENABLED begins at the
-# torque-enable register.
+# Register spans that are read in one exchange. Most ticks read PRESENT. CHECK adds the goals and
+# the bus watchdog. HEALTH adds supply voltage and temperature. ENABLED begins at the torque-enable
+# register.
 PRESENT: Span = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
 CHECK: Span = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
 HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
-# A late reply could be mistaken for the reply to the next request. After a missing reply, the next
-# requests therefore use spans of different lengths, so that their replies can be distinguished.
-LENGTH_COUNT = 11  # versions of each span, which include zero to ten preceding registers
+# A late reply could be mistaken for the reply to the next request. After a missing reply, each of
+# the next requests therefore has a different length, which identifies the reply.
+LENGTH_COUNT = 11  # number of versions of each span; a version adds zero to ten preceding bytes
 
 EXCHANGE_COUNT = 50  # number of exchanges that `doctor` times
 _TIMED_REPLY_TIMEOUT = 0.1  # minimum reply timeout for timed exchanges [s]
 _CONNECT_READ_COUNT = 9  # number of reads in `connect`; the fastest gives the minimum reply time
 _REPLY_FRACTION_MAX = 0.8  # maximum duration of a reply as a fraction of a tick
-# Fractions of failed exchanges that cause a warning and a failure.
+# Fraction of failed exchanges above which a warning is issued, and fraction above which the check
+# fails.
 _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2
 
 
 class TickReads:
-    """Group reads of a tick: one for each span length. All group reads are of the same type."""
+    """Group reads of a tick, one for each register span and length."""
 
     def __init__(
         self,
@@ -70,7 +71,7 @@ class TickReads:
 def choose_reads(
     port: SerialPort, handler: PacketHandler, ids: Sequence[int], claims_fast: bool
 ) -> tuple[TickReads, list[Finding]]:
-    """Return the fastest group reads supported by all servos, and notices.
+    """Return the fastest group reads that all servos support, and a list of notices.
 
     ``claims_fast`` is True if the firmware should support fast sync reads. If fast reads fail, the
     normal sync read is used and a notice is returned. Raises ServoError if the servos do not
@@ -108,11 +109,11 @@ def time_exchanges(
     write: Callable[[], None] | None = None,
     count: int = EXCHANGE_COUNT,
 ) -> ExchangeTimes:
-    """Time ``count`` exchanges without pauses, with the same reads and writes as in a tick.
+    """Measure the duration of ``count`` exchanges with the reads and writes of a tick.
 
-    A read has to wait until the preceding write has been transmitted, so the duration of a read
-    includes both transmissions. If ``write`` is None, only reads are timed. Each reply may take up
-    to 0.1 s.
+    The exchanges follow each other without pauses. A read has to wait until the preceding write has
+    been transmitted, so the duration of a read includes both transmissions. If ``write`` is None,
+    only reads are timed. The reply timeout is at least 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0
@@ -143,7 +144,7 @@ def judge_exchanges(
     """Compare exchange durations with the tick period and with ``servos.reply_timeout``.
 
     ``what`` is the name of the timed exchanges in the report. An ``emulated`` hand shares the
-    processors with its clients, so the fastest exchange is used instead of the 99th percentile.
+    processors with its clients, so the fastest exchange is compared instead of the 99th percentile.
     """
     decisive = times.least if emulated else times.p99
     rate, allowed = settings.loop.rate, settings.servos.reply_timeout
@@ -189,7 +190,7 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
 
 
 def _remedy(duration: float, settings: Settings) -> str:
-    """Name the settings to change so that replies of this duration [s] are not too late."""
+    """Suggest settings for replies that take ``duration`` seconds."""
     rate = _REPLY_FRACTION_MAX / duration
     digit = 10.0 ** max(len(str(int(rate))) - 2, 0)
     parts = []

@@ -32,9 +32,10 @@ def servo_name(servo_id: int, finger: int) -> str:
 def current_toward(
     servos: ServoSettings, goal_q: float, bound: float, q: float, dq: float
 ) -> float:
-    """Return the position-loop current [A] in current mode, positive when closing.
+    """Return the current that the position loop commands in current mode [A].
 
-    The current is stiffness · (goal_q − q) − damping · dq, limited to ± ``bound``.
+    The current is stiffness · (goal_q − q) − damping · dq, limited to ± ``bound``. A positive
+    current closes the joint.
     """
     bound = abs(bound)
     current = servos.stiffness * (goal_q - q) - servos.damping * dq
@@ -43,13 +44,13 @@ def current_toward(
 
 @dataclass(frozen=True, slots=True)
 class JointScale:
-    """Conversion between a joint's counts and rad, rad/s and A.
+    """Conversion between register counts and rad, rad/s and A.
 
     q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and similarly for velocity. Currents
-    are motor currents; only their sign is converted, so that positive currents close the joint.
+    are motor currents, without the gear ratio. A positive current closes the joint.
     """
 
-    direction: int  # +1 or -1, the sign of the counts when closing
+    direction: int  # +1 if the counts increase when the joint closes, otherwise -1
     zero: int  # position counts at q = 0
     radian: float  # joint rotation per position count [rad], always > 0
     velocity: float  # joint velocity per velocity count [rad/s], always > 0
@@ -57,7 +58,7 @@ class JointScale:
 
     @classmethod
     def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
-        """Return the scale for joint 0 (left) or 1 (right) according to the settings.
+        """Return the scale of joint 0 (left) or 1 (right) from the settings.
 
         Raises
         ------
@@ -115,7 +116,7 @@ class Joint:
     q: float = 0.0  # angle in the last valid reading [rad]
     dq: float = 0.0  # [rad/s]
     sent: deque[bytes] = field(default_factory=deque)  # recently sent goals as register bytes
-    ticks: int = -1  # servo clock reading at the last check
+    ticks: int = -1  # value of the servo clock at the last check
     ticked: float = math.inf  # time when the servo clock last advanced [s]
 
     @property
@@ -145,7 +146,7 @@ def pack_goal(mode: int, current: int, position: int) -> bytes:
 
 
 def goal_in(mode: int, table: bytes, start: int) -> bytes:
-    """Extract a servo's goal from ``table``, its registers from address ``start`` on."""
+    """Return the bytes of a servo's goal. ``table`` contains the registers from ``start`` on."""
     current = table[reg.GOAL_CURRENT - start : reg.GOAL_CURRENT - start + _CURRENT.size]
     position = table[reg.GOAL_POSITION - start : reg.GOAL_POSITION - start + _POSITION.size]
     if mode == reg.POSITION_MODE:

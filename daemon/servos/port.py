@@ -23,15 +23,15 @@ with contextlib.suppress(ModuleNotFoundError):  # On Windows, only simulated ser
     import termios
 
 BITS_PER_BYTE = 10
-# Reply timeout outside the loop, for setup and calibration [s]. The timeout is long enough for a
-# new servo with the factory return delay on a slow adapter and a busy machine.
+# Reply timeout for setup and calibration, which run outside the loop [s]. A new servo has the
+# factory return delay, and the adapter or the machine may be slow.
 UNPACED_TIMEOUT = 0.5
 _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")
 
 
 def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
-    """Return the kernel file for a USB adapter's latency timer [ms]; None if it does not exist."""
+    """Return the kernel file of a USB adapter's latency timer [ms], or None without a timer."""
     place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     return place if place.exists() else None
 
@@ -43,15 +43,15 @@ class PortLost(ServoError):
 class SerialPort(PortHandler):  # type: ignore[misc]
     """An exclusive serial port for one thread.
 
-    A reply may take ``reply_timeout`` seconds, or longer if the transmission of its bytes takes
-    longer. ``received`` holds bytes that have not been decoded yet. ``deadline`` is the
-    time.monotonic() value at which the current exchange ends.
+    The timeout of a reply is ``reply_timeout`` seconds, or more if the transmission takes longer.
+    ``received`` contains bytes that have not been decoded yet. ``deadline`` is the time at which
+    the current exchange times out [s, time.monotonic()].
     """
 
     def __init__(
         self, path: str, baud: int, reply_timeout: float, low_latency: bool = True
     ) -> None:
-        """Create a closed port; ``low_latency`` requests low-latency mode for the open port."""
+        """Create a closed port. ``low_latency`` selects the low-latency mode of the adapter."""
         super().__init__(path)
         self._low_latency = low_latency
         self.baudrate = baud
@@ -89,9 +89,9 @@ class SerialPort(PortHandler):  # type: ignore[misc]
     def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
         """Send a packet; return True if it was completely sent.
 
-        If ``reply`` bytes are expected, older input is first discarded so that it is not mistaken
-        for the reply. After sending, the reply deadline starts; the deadline is at most ``until``
-        [s, time.monotonic()].
+        ``reply`` is the expected length of the reply. If a reply is expected, older input is
+        discarded before sending. The deadline of the reply is at most ``until`` [s,
+        time.monotonic()].
         """
         remaining = packet
         try:
@@ -112,7 +112,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         return True
 
     def setPacketTimeout(self, packet_length: int) -> None:
-        """Start the deadline for a reply of ``packet_length`` bytes."""
+        """Set the deadline for a reply of ``packet_length`` bytes."""
         wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
         # At low baud rates, allow twice the transmission time plus the return delays.
         self.deadline = time.monotonic() + max(self.reply_timeout, 2.0 * wire + 0.001)

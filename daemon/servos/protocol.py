@@ -5,14 +5,15 @@ All other SDK functions are used unchanged.
 
 - ``txPacket`` discards the stuffed packet, so the sequence FF FF FD in a goal is sent without
   stuffing and is misinterpreted.
-- ``removeStuffing`` drops a byte of FF FF FD 12 FF FD FD; 3-8 % of group reads failed in tests.
+- ``removeStuffing`` drops a byte of the sequence FF FF FD 12 FF FD FD. In tests, 3 to 8 % of group
+  reads failed.
 - ``rxPacket`` polls with non-blocking reads, which keeps a processor busy during transmission.
 - ``txPacket`` leaves ``is_using`` set if the port raises, so all later calls return −1000.
 - ``readTxRx`` accepts replies with a wrong length, so the CRC of a late reply is returned as data.
 - ``GroupSyncRead`` discards the servos' error bytes and returns 0 after a failure. As a result,
   alerts are lost, and the joint appears to be at position 0.
 - ``broadcastPing`` always waits for 253 servos, which takes 0.8 s at 1 Mbaud.
-- ``PortHandler`` measures deadlines on the wall clock and adds 34 ms. A missing servo therefore
+- ``PortHandler`` measures deadlines with the wall clock and adds 34 ms. A missing servo therefore
   causes a delay of 35 ms, and adjusting the system clock changes the deadline. ``PortHandler`` also
   opens ports that are in use by another process.
 """
@@ -56,7 +57,7 @@ _FAST_SYNC_READ = 0x8A  # dynamixel-sdk 3 does not define this instruction
 _OLD_HEADER = b"\xff\xff"  # Protocol 1.0: header, ID, length, instruction or error, checksum
 _OLD_STATUS = 6  # length of a ping reply in Protocol 1.0 [bytes]
 _OLD_TIMEOUT = 0.5  # timeout [s]; on a busy machine, an emulated servo may take longer than 0.1 s
-_ERROR_MASK = 0x7F  # mask for the error code in the error byte, whose highest bit is the alert
+_ERROR_MASK = 0x7F  # mask of the error code in the error byte; the highest bit is the alert bit
 
 
 def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -96,8 +97,9 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     ) -> tuple[list[int], int, int]:
         """Read a register span; return (data, result code, error byte).
 
-        After an error, the data are 0. Replies of the wrong length are skipped: they are late
-        replies to an action instruction, for which the SDK does not wait.
+        If the servo replies with an error, the data are 0. Replies of the wrong length are skipped.
+        Such a reply belongs to an earlier action instruction, because the SDK does not wait for
+        replies to action instructions.
         """
         if dxl_id >= BROADCAST_ID:
             return [], int(COMM_NOT_AVAILABLE), 0
@@ -161,8 +163,9 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 class GroupRead:
     """Sync read of one register span from several servos.
 
-    After a successful :meth:`exchange`, ``data[id]`` contains the span's bytes and ``errors[id]``
-    the servo's error byte. After a failure, ``data`` and ``errors`` are undefined.
+    After a successful :meth:`exchange`, ``data[id]`` contains the register bytes of a servo, and
+    ``errors[id]`` contains the error byte of the servo. After a failure, ``data`` and ``errors``
+    are undefined.
     """
 
     instruction = INST_SYNC_READ
@@ -186,7 +189,7 @@ class GroupRead:
         self._reply = (_STATUS_SIZE + length) * len(ids)
 
     def exchange(self, until: float = math.inf) -> int:
-        """Finish the exchange before ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Perform the read before ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler = self._handler
@@ -208,12 +211,12 @@ class GroupRead:
 
 
 class FastGroupRead(GroupRead):
-    """Fast sync read: all servos share one reply; its last CRC covers the complete reply."""
+    """Fast sync read with one reply from all servos. The last CRC covers the complete reply."""
 
     instruction = _FAST_SYNC_READ
 
     def exchange(self, until: float = math.inf) -> int:
-        """Finish the exchange before ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Perform the read before ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler, length = self._handler, self._length
@@ -255,7 +258,7 @@ class GroupWrite:
 
 
 class ServoLine:
-    """Exchanges with single servos on an open port, each attempted up to `TRY_COUNT` times."""
+    """Exchanges with single servos on an open port, with up to `TRY_COUNT` attempts each."""
 
     def __init__(self, port: SerialPort, handler: PacketHandler | None = None) -> None:
         self.port = port
@@ -287,7 +290,8 @@ class ServoLine:
     def ping_all(self, wait: float) -> dict[int, tuple[int, int]]:
         """Return (model number, firmware) of each servo that replies to a ping within ``wait`` [s].
 
-        Servos reply one after the other in the order of their IDs; 253 replies take 0.8 s.
+        Servos reply one after the other in the order of their IDs. The replies of 253 servos take
+        0.8 s.
         """
         found: dict[int, tuple[int, int]] = {}
         port = self.port
@@ -308,7 +312,7 @@ class ServoLine:
         return None
 
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
-        """Write bytes of equal length to each servo without a reply or verification.
+        """Write bytes of equal length to each servo, without replies and without verification.
 
         The method uses a sync write, which works at every status return level.
         """
@@ -333,7 +337,7 @@ class ServoLine:
 
 @contextlib.contextmanager
 def open_line(path: str, baud: int, low_latency: bool = True) -> Iterator[ServoLine]:
-    """Open a port, yield a `ServoLine` on it, and close the port afterwards.
+    """Open a port, yield a `ServoLine` for the port, and close the port afterwards.
 
     Raises ServoError if the port can't be opened.
     """

@@ -1,8 +1,8 @@
-"""Find servos on a port and configure the hand's servos: ID, baud rate and registers.
+"""Find servos on a port, and set the IDs, baud rates and registers of the hand's servos.
 
 Only :func:`provision` writes a servo's EEPROM. `provision` runs only on request (`softfinger doctor
---fix`) and with torque off. IDs and baud rates are written only to servos that are identified
-unambiguously (:func:`plan`).
+--fix`) and with torque off. IDs and baud rates are written only to servos that :func:`plan`
+identifies unambiguously.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ class FoundServo:
         return self.describe(str(self.baud))
 
     def describe(self, rates: str) -> str:
-        """Return a line of text that names a servo and the baud rates at which it replies."""
+        """Describe a servo and the baud rates at which the servo replies, in one line of text."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
 
 @dataclass(frozen=True, slots=True)
 class Garbled:
-    """ID with corrupted replies: several servos share the ID, or the line is faulty."""
+    """ID whose replies are corrupted because several servos share the ID or the line is faulty."""
 
     id: int
     baud: int
@@ -82,7 +82,7 @@ class Garbled:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Search result. The ID of a servo in ``servos`` may also be in ``garbled``."""
+    """Result of a search. An ID can appear in both ``servos`` and ``garbled``."""
 
     servos: tuple[FoundServo, ...]
     garbled: tuple[Garbled, ...]
@@ -100,7 +100,7 @@ def search(
     wait: float = SEARCH_TIME,
     ids: Iterable[int] = (FACTORY_ID,),
 ) -> Found:
-    """Search the port for servos at each baud rate, waiting ``wait`` [s] for replies.
+    """Search a port for servos, and wait ``wait`` seconds for replies at each baud rate.
 
     Baud rates that the adapter does not support are skipped. If corrupted bytes arrive, each of the
     ``ids`` is probed individually.
@@ -136,8 +136,8 @@ def search(
 def is_garbled(line: ServoLine, servo_id: int) -> bool:
     """Return True if several servos with different register values reply to this ID.
 
-    Supply voltage, position and running time differ between servos, whereas their ping replies may
-    be identical.
+    Two servos with one ID may send identical ping replies. The replies to a read differ, for
+    example in supply voltage, position and running time, so the replies corrupt each other.
     """
     handler, damaged, silent = line.handler, 0, 0
     for _ in range(_READ_COUNT):
@@ -147,7 +147,7 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
         silent += result == COMM_RX_TIMEOUT
         if silent > 1 and not damaged:
             break  # The ID is unused.
-    return damaged > 1  # A single corrupted reply may be interference.
+    return damaged > 1  # A single corrupted reply may be due to interference.
 
 
 # --- identifying servos --------------------------------------------------------------------------
@@ -164,7 +164,7 @@ class Change:
 
     @property
     def name(self) -> str:
-        """Name used in reports after the change."""
+        """Name of the servo in reports, with the new ID."""
         return servo_name(self.id, self.finger)
 
     def __str__(self) -> str:
@@ -178,7 +178,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Unambiguous ``changes``, and the remaining differences from the settings."""
+    """Unambiguous ``changes``, and the servos that remain missing or unassigned."""
 
     changes: tuple[Change, ...]
     missing: tuple[int, ...]  # fingers whose servo could not be identified
@@ -186,17 +186,17 @@ class Plan:
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
-    """Assign the servos found at the baud ``rates`` to the joints.
+    """Assign the found servos to the joints. ``rates`` are the baud rates of the search.
 
-    If a servo of the configured model replies at another baud rate with the ID of a missing servo,
-    that servo is assumed to be the missing servo. Otherwise, if exactly one servo is unassigned and
-    exactly one servo is missing, the unassigned servo is assumed to be the missing servo. Servos
-    with corrupted replies are not changed.
+    A servo that replies with the ID of a missing servo at another baud rate counts as the missing
+    servo. If exactly one servo is missing and exactly one servo is unassigned, the unassigned servo
+    counts as the missing servo. In both cases, only servos of the configured model are considered.
+    Servos with corrupted replies are not changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
-    # An emulator that does not simulate line timing replies at every baud rate.
+    # Every baud rate gets a reply from an emulator that does not simulate line timing.
     anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
@@ -234,7 +234,7 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 
 
 def provision(settings: Settings) -> list[Finding]:
-    """Configure each servo in the scene: ID, baud rate, required registers and error state.
+    """Set the ID, baud rate and required registers of each servo in the scene, and clear errors.
 
     Returns
     -------
@@ -368,7 +368,7 @@ def _reboot_if_needed(
     model: ServoModel,
     result: list[Finding],
 ) -> None:
-    """Reboot a servo with a hardware error or a lost turn, after its limits have been corrected."""
+    """Reboot a servo that has a hardware error or has lost a turn."""
     servo_id = settings.servos.ids[finger]
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
     table = Registers(line.read(servo_id, 0, CHECKED) or b"")

@@ -1,12 +1,13 @@
 """List the servo registers that affect the hand, with their required values.
 
 :func:`required_registers` returns the table in the order of the e-Manual's control table. A servo
-retains its EEPROM permanently and its RAM until power is cut, so both may contain values from
-another program. The EEPROM is checked in `connect` and written only by `softfinger doctor --fix`.
-RAM registers marked ``armed`` are written by `arm`, so they are correct even after a reboot.
+keeps its EEPROM values permanently, and its RAM values until a reboot or a power failure. EEPROM
+and RAM may therefore contain values from another program. `connect` checks the EEPROM, and only
+`softfinger doctor --fix` writes the EEPROM. `arm` writes the RAM registers that are marked
+``armed``.
 
-The omitted registers do not affect goal tracking, limits or bus replies in the modes used by the
-hand. ID and baud rate are found by a search. The registers for moving threshold, LED and external
+Registers that do not affect goal tracking, limits or bus replies in the hand's operating modes are
+omitted. A search finds the ID and baud rate. The registers for moving threshold, LED and external
 ports have no effect on the motion. Velocity gains and goal velocity apply only to velocity mode.
 `servos.torque` writes goal current, goal position, bus watchdog and indirect addresses on each
 `arm`.
@@ -27,7 +28,7 @@ from softfinger.daemon.servos.joint import JointScale
 # The duration of a read includes the return delays of both servos. With delays above 50 µs, a read
 # would take longer than a tick at 500 Hz.
 RETURN_DELAY_MAX: Final = 25
-# Drive mode bits that must be clear, because they make a servo follow another servo, or switch
+# Drive mode bits that must be 0. One bit makes a servo follow another servo. The other bit switches
 # torque on when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
@@ -44,12 +45,12 @@ class Register(NamedTuple):
     signed: bool = False
 
     def value_in(self, table: bytes, start: int = 0) -> int:
-        """Return the register's value from ``table``, a register span beginning at ``start``."""
+        """Return the register's value. ``table`` contains the registers from ``start`` on."""
         at = self.address - start
         return int.from_bytes(table[at : at + self.size], "little", signed=self.signed)
 
     def packed(self, value: int) -> bytes:
-        """Convert a value to the register's bytes."""
+        """Convert a value to the bytes of the register."""
         return value.to_bytes(self.size, "little", signed=value < 0)
 
 
@@ -97,13 +98,13 @@ class Requirement(NamedTuple):
     mended: Callable[[int], int]  # function that maps a wrong value to the correct value
     told: Callable[[int], str]  # function that describes the wrong value and the expected value
     status: Status
-    armed: bool = False  # True for RAM that `arm` writes
+    armed: bool = False  # True for a RAM register that `arm` writes
     then: str = ""  # action required after the value is corrected
 
     def wrong_in(self, table: bytes, start: int = 0) -> int | None:
         """Return the value if it is wrong, otherwise None.
 
-        ``table`` contains the registers, beginning at address ``start``.
+        ``table`` contains the registers from address ``start`` on.
         """
         value = self.register.value_in(table, start)
         return None if self.holds(value) else value
@@ -124,7 +125,7 @@ def _exactly(
 
 
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
-    """Return the row for a limit at which the servo shuts down; ``high`` is the factory value."""
+    """Return the requirement for a shutdown limit of the servo. ``high`` is the factory value."""
     register = _AT[address]
     expected = f"{low}" if low == high else f"{low} to {high}"
     return Requirement(
@@ -249,7 +250,7 @@ def required_registers(
 
 
 def armed_registers(model: ServoModel) -> list[Requirement]:
-    """Return the rows for the RAM registers that `arm` writes."""
+    """Return the requirements for the RAM registers that `arm` writes."""
     why = "set by another program; `arm` corrects it"
     d, i, p = model.position_gains
     values = (
@@ -281,7 +282,7 @@ def _current_limit(model: ServoModel, current_max: float) -> Requirement:
 
 
 def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iterable[Requirement]:
-    """Return the rows for position mode, where servos silently reject goals beyond their limits."""
+    """Yield the requirements for the position limits. Servos silently reject goals outside them."""
     ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
     first, last = sorted(scale.position_counts(q) for q in ends)
     needed = f"the joint requires {first} to {last}"

@@ -1,4 +1,4 @@
-"""Simulate the hand's servos in this process with realistic resolution."""
+"""Simulate the servos of the hand in the daemon process, with the resolution of real servos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from softfinger.daemon.servos.joint import JointScale, current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
 _HEALTH_INTERVAL = 0.25  # time between temperature and supply voltage readings [s]
-_OVERLOAD_TIME = 2.0  # time at the current limit until an overload error occurs [s]
+_OVERLOAD_TIME = 2.0  # time at maximum current after which an overload error occurs [s]
 
 
 class MotorHeat(Protocol):
@@ -37,15 +37,15 @@ class HandPlant(JointPlant, Protocol):
         """Thermal model of each joint's motor."""
 
     def hold_torque_until(self, t: float) -> None:
-        """Switch torque off at time t [s]."""
+        """Switch torque off at time ``t`` [s], unless the method is called again before ``t``."""
 
 
 class SimulatedServos:
     """Servos of a simulated hand, with the resolution of the configured model.
 
-    Every exchange first advances the hand to the clock time. If a watchdog is set and no exchange
-    occurs within the watchdog time, torque is switched off, and only :meth:`torque_on` switches
-    torque on again.
+    Every exchange first advances the hand to the clock time. If no exchange occurs within the
+    watchdog time, the watchdog switches torque off. Only :meth:`torque_on` switches torque on
+    again.
     """
 
     def __init__(self, settings: Settings, hand: HandPlant, clock: Clock) -> None:
@@ -61,14 +61,14 @@ class SimulatedServos:
         self._torque = False
         self._tripped = False  # True if the watchdog has switched torque off
         self._trips = 0
-        self._last = -math.inf  # time of the last exchange
+        self._last = -math.inf  # time of the last exchange [s]
         self._goal_q = [0.0, 0.0]
         self._goal_current = [0.0, 0.0]
         self._q = [0.0, 0.0]  # last readings of angle [rad] and velocity [rad/s]
         self._dq = [0.0, 0.0]
         self._seq = 0
         self._errors = [0, 0]  # hardware error bits
-        self._pressed = [0.0, 0.0]  # time at the current limit [s]
+        self._pressed = [0.0, 0.0]  # time for which each motor has drawn its maximum current [s]
         self._health_read = -math.inf
 
     def connect(self) -> None:
@@ -86,7 +86,7 @@ class SimulatedServos:
             reading.valid = False
             return
         reading.t = self._exchange()
-        # Reading single elements is faster from Python floats than from an array.
+        # Convert the arrays to lists, because reading single elements of an array is slow.
         q, dq = self._hand.q.tolist(), self._hand.dq.tolist()
         for joint in self._joints:
             scale = self._scales[joint]
@@ -126,7 +126,7 @@ class SimulatedServos:
             self._drive()
 
     def torque_on(self) -> None:
-        """Switch torque on with the current position as the goal and zero motor current."""
+        """Switch torque on with zero motor current. The goal is the current position."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -137,7 +137,7 @@ class SimulatedServos:
         self._switch(True)
 
     def torque_off(self, reading: Reading) -> bool:
-        """Switch torque off and read. This always succeeds."""
+        """Switch torque off, read the servos and return True."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -170,7 +170,7 @@ class SimulatedServos:
         self._drive()
 
     def counters(self) -> dict[str, int]:
-        """Count the ``watchdog`` stops; ``timeouts`` and ``crc`` are always 0."""
+        """Return the counters. Only ``watchdog``, the number of watchdog stops, can exceed 0."""
         return {"timeouts": 0, "crc": 0, "watchdog": self._trips}
 
     def close(self) -> None:
@@ -181,7 +181,7 @@ class SimulatedServos:
             self._connected = False
 
     def _exchange(self) -> float:
-        """Advance the hand to the current time, and check and restart its watchdog."""
+        """Advance the hand to the current time, then check and restart the watchdog."""
         now = self._clock.now()
         if self._torque and now > self._last + self._watchdog:
             self._torque = False

@@ -1,8 +1,8 @@
-"""Switch torque on (verifying each step), switch torque off, and manage the bus watchdog.
+"""Switch torque on in verified steps, switch torque off, and manage the bus watchdog.
 
-Torque is switched on at the current angle with zero motor current. Indirect addresses make goal
-current and goal position adjacent. Indirect addresses are in RAM and are therefore set whenever
-torque is switched on.
+Torque is switched on at the current angle with zero motor current. Indirect addresses map goal
+current and goal position to adjacent registers. Indirect addresses are in RAM and are therefore set
+whenever torque is switched on.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _GOAL_BYTES = (
     *range(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 2),
     *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
-_PACKET_COUNT = 2  # number of copies of each torque-off packet, which has no reply
+_PACKET_COUNT = 2  # number of copies of each torque-off packet; servos do not reply to the packet
 # Time limit for switching on, as a multiple of the reply timeout. Switching on blocks the loop.
 _ON_TIMEOUTS = 50
 _MOTION_MAX = 8  # allowed motion of a limp joint before torque is on, in counts (0.7°)
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
-    """Return the address for writing goals, an indirect data address if there are two goals."""
+    """Return the address for writing goals. Two goals require an indirect data address."""
     if mode == reg.CURRENT_MODE:
         return reg.GOAL_CURRENT
     if mode == reg.POSITION_MODE:
@@ -44,8 +44,9 @@ def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
 class Torque:
     """Torque control for all joints on one line.
 
-    ``goals`` writes the goals while torque is on; otherwise it is None. ``may_be_on`` becomes True
-    before torque is switched on and stays True until the servos have confirmed torque off.
+    ``goals`` writes the goals while torque is on. While torque is off, ``goals`` is None.
+    ``may_be_on`` becomes True before torque is switched on and stays True until the servos have
+    confirmed torque off.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class Torque:
         """
         self._not_after = time.monotonic() + _ON_TIMEOUTS * self._line.port.reply_timeout
         self._refuse_hardware_errors()
-        # Writing 0 clears a watchdog stop; until then, goals are read-only.
+        # After a watchdog stop, goals are read-only until 0 is written to the watchdog.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
         self._write_registers()
         goals = self._choose_goals()
@@ -105,7 +106,7 @@ class Torque:
     def ask_off(self) -> None:
         """Request torque off with one packet for all servos and one packet for each servo.
 
-        The servos do not reply to the packets; the caller must read the registers.
+        The servos do not reply to the packets, so the caller must read the registers.
         """
         self.goals = None
         for _ in range(_PACKET_COUNT):
@@ -119,7 +120,7 @@ class Torque:
         self.may_be_on = False
 
     def _aim_here(self) -> dict[int, int]:
-        """Set goals to the current positions until the joints hold still, and return the goals."""
+        """Set the goals to the current positions until the joints are at rest; return the goals."""
         while True:
             positions = self._positions()
             strayed = [
@@ -137,7 +138,7 @@ class Torque:
                 return positions
 
     def _choose_goals(self) -> GroupWrite:
-        """Return a tick's sync write for goal current, goal position, or both as adjacent data."""
+        """Return the sync write that sends the goals of a tick (current, position or both)."""
         address = goal_address(self._mode, self._model, self._firmware())
         if self._mode == reg.CURRENT_BASED_POSITION_MODE:
             self._map_goals()
@@ -149,7 +150,7 @@ class Torque:
         self._store_all(reg.INDIRECT_ADDRESS, pointers, "indirect addresses")
 
     def _firmware(self) -> int:
-        """Return the servos' firmware version.
+        """Return the highest firmware version of the servos.
 
         All servos must use the same indirect data address.
         """
@@ -169,7 +170,7 @@ class Torque:
     def _write_registers(self) -> None:
         """Restore RAM registers that another program may have changed.
 
-        A servo retains gains, profiles and the PWM limit until it is rebooted or loses power.
+        A servo keeps gains, profiles and the PWM limit until a reboot or a power failure.
         """
         for servo_id, joint in self._joints.items():
             held = self._line.read(servo_id, reg.RAM, reg.GOAL_POSITION - reg.RAM)
@@ -210,7 +211,7 @@ class Torque:
     def holds_goal(self, joint: Joint, table: bytes, start: int) -> bool:
         """Return True if a servo's goal is recent, or if this object did not switch torque on.
 
-        ``table`` contains the servo's registers, beginning at ``start``.
+        ``table`` contains the servo's registers from address ``start`` on.
 
         Raises
         ------
