@@ -1,1 +1,1 @@
-"""Simulated hand: its physics, and emulated servos and tactile boards on pseudo-terminals."""
+"""Simulate the hand's physics, and emulate its servos and tactile boards on pseudo-terminals."""

@@ -1,4 +1,4 @@
-"""Define faults of the emulated hand: fault syntax, servo line faults and measurement faults.
+"""Define the faults of the emulated hand, and parse the words that start these faults.
 
 A fault is written as ``[PART:]KIND[=VALUE][@START[..END]]``. The fault begins suddenly at START, or
 increases linearly from START to END. Faults do not change the physics of the hand.
@@ -29,12 +29,12 @@ LATE_REPLY_DELAY = 0.010  # s
 
 @dataclass(slots=True)
 class LineFaults:
-    """Fault probabilities (0 to 1) per instruction or reply, and the delay of all replies."""
+    """Probabilities (0 to 1) of faults on the servo line, and the delay of all replies."""
 
     lose: float = 0.0  # probability that an instruction is lost
-    lose_writes: float = 0.0  # additional probability that an instruction other than a read is lost
+    lose_writes: float = 0.0  # additional probability of losing an instruction that is not a read
     drop: float = 0.0  # probability that a reply is lost
-    late: float = 0.0  # probability that a reply is late by LATE_REPLY_DELAY
+    late: float = 0.0  # probability that a reply is delayed by LATE_REPLY_DELAY
     truncate: float = 0.0  # probability that the end of a reply is missing
     corrupt: float = 0.0  # probability that one bit of a reply is flipped
     duplicate: float = 0.0  # probability that a reply is sent twice
@@ -44,7 +44,7 @@ class LineFaults:
 LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
 _SERVO_FAILURES = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
 SERVO_FAULTS = ("silent", "answer", "reboot", *_SERVO_FAILURES, "recover")
-BOARD_FAULTS = {  # default probability of each kind
+BOARD_FAULTS = {  # default probability of each fault
     "torn": 0.1,
     "noisy": 0.1,
     "silent": 1.0,
@@ -58,7 +58,7 @@ WELL = "well"
 
 
 class FaultSource:
-    """Random generator of :class:`LineFaults`, reproducible for a given seed."""
+    """Generator of random line faults that are reproducible for a given seed."""
 
     def __init__(self, seed: int = 1) -> None:
         self.rates = LineFaults()
@@ -79,7 +79,7 @@ class FaultSource:
         return bool(not reads and rates.lose_writes and self._random.random() < rates.lose_writes)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
-        """Apply faults to a reply; return the (extra delay [s], bytes) pairs to send, if any."""
+        """Apply faults to a reply and return the bytes to send, each with its extra delay [s]."""
         rates, chance = self.rates, self._random.random
         if chance() < rates.drop:
             return []
@@ -99,7 +99,7 @@ REPLAY_TIME_MAX = 3.0  # s
 
 
 class MeasurementFault(NamedTuple):
-    """Measurement fault type with its neutral value and limits."""
+    """Neutral value and limits of one type of measurement fault."""
 
     honest: float
     low: float
@@ -107,31 +107,31 @@ class MeasurementFault(NamedTuple):
 
 
 MEASUREMENT_FAULTS = {
-    "gain": MeasurementFault(1.0, 0.0, 100.0),  # factor for the pressure of all cells
-    # Shift of the image towards higher columns, in cells. The gap is filled with zeros.
+    "gain": MeasurementFault(1.0, 0.0, 100.0),  # factor applied to all pressures
+    # Shift of the image towards higher column numbers, in cells. The gap is filled with zeros.
     "shift-x": MeasurementFault(0.0, -255.0, 255.0),
-    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # shift towards higher rows, in cells
+    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # shift towards higher row numbers, in cells
     "mirror": MeasurementFault(0.0, 0.0, 1.0),  # A value of 1 reverses the column order.
-    # Offset of all cells, as a fraction of the maximum count.
+    # Offset added to all cells, as a fraction of the maximum count.
     "drift": MeasurementFault(0.0, -1.0, 1.0),
-    "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # duration of the repeated frames [s]
-    "current": MeasurementFault(1.0, -100.0, 100.0),  # factor for the measured current
+    "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # duration of the repeated sequence [s]
+    "current": MeasurementFault(1.0, -100.0, 100.0),  # factor applied to the measured current
 }
 SWITCHED_FAULTS = ("mirror", "replay")  # faults that are either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
-    """Invalid fault text. The message lists the allowed fault texts."""
+    """Invalid fault word. The message states the reason."""
 
 
 class FaultEvent(NamedTuple):
-    """Start of a device fault or object load."""
+    """Start of a fault or of a load on the object."""
 
     after: float  # s
-    part: str  # ``servos``, ``object``, ``all``, or the finger whose board or measurements fail
+    part: str  # ``servos``, ``object``, ``all`` or the name of a finger
     kind: str
     value: float = 1.0  # probability, servo ID, load, or value of a measurement fault
-    over: float = 0.0  # time over which the fault grows to its full value [s]
+    over: float = 0.0  # duration of the linear increase to the full value [s]
 
     def __str__(self) -> str:
         if self.kind == WELL:
@@ -146,11 +146,11 @@ class FaultEvent(NamedTuple):
 
 
 class _Form(NamedTuple):
-    """Fault types with the same syntax."""
+    """Group of fault types with the same syntax."""
 
     kinds: Collection[str]
-    value: str  # syntax of the value, in brackets if optional, empty if there is no value
-    parts: tuple[str, ...]  # parts that are affected if the word does not name a finger
+    value: str  # syntax of the value, in brackets if optional, or empty if not allowed
+    parts: tuple[str, ...]  # affected parts if the word does not name a finger
     sided: bool = False  # True if the word may name a finger
 
     def fits(self, side: str | None, kind: str, valued: bool) -> bool:
@@ -169,15 +169,15 @@ class _Form(NamedTuple):
         return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
 
 
-# The first matching type is used, so `silent=2` and `frozen=2` are servo faults, whereas
-# `left:silent` and `silent` are board faults.
+# The first matching group is used. Therefore, `silent=2` and `frozen=2` are servo faults, but
+# `silent` and `left:silent` are board faults.
 _ID = "=ID"
 _FORMS = (
     _Form(SERVO_FAULTS, _ID, (SERVOS,)),
     _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True),
     _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
-    # Forces along the faces and away from the palm [N], and torque [N·m].
+    # `push` is a force along the faces, away from the palm [N]. `twist` is a torque [N·m].
     _Form(("push", "twist"), "=NUMBER", (OBJECT,)),
     _Form(_PORT_FAULTS, "", (SERVOS,), sided=True),
     _Form((WELL,), "", (ALL,), sided=True),
@@ -186,20 +186,20 @@ _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?
 
 
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
-    """Parse fault words; return the faults in order of time; simultaneous faults keep their order.
+    """Parse fault words and return the faults in order of time.
 
     - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated`` and ``zero`` affect
-      both boards, or one board if prefixed with ``left:`` or ``right:``; see :class:`TactileBoard`.
+      both boards. The prefix ``left:`` or ``right:`` selects one board; see :class:`TactileBoard`.
     - ``drop=0.01``, ``silent=2`` etc. affect the servos; see :meth:`ServoBus.fault`.
     - ``gain=0.5``, ``left:current=2`` etc. affect the measurements of one or both fingers; see
       MEASUREMENT_FAULTS.
     - ``unplug`` and ``plug`` affect the servo port, and ``left:unplug`` affects a board's port.
-    - ``push=15`` and ``twist=0.3`` apply a permanent load to the object; 0 removes it.
+    - ``push=15`` and ``twist=0.3`` apply a permanent load to the object. 0 removes the load.
     - ``well`` ends all faults; ``left:well`` ends the faults of one finger's board and
-      measurements. Loads on the object are not removed.
+      measurements. Loads on the object remain.
 
-    The suffix ``@START`` is the start time [s]. With ``@START..END``, a measurement fault increases
-    linearly from START to END.
+    The suffix ``@START`` sets the start time [s]. With ``@START..END``, a measurement fault
+    increases linearly from START to END. Simultaneous faults keep their order.
 
     Parameters
     ----------
@@ -289,10 +289,10 @@ class MeasurementFaults:
         self._ramps: dict[str, _Ramp] = {}
 
     def begin(self, kind: str, value: float, t: float, over: float = 0.0) -> None:
-        """Change one of MEASUREMENT_FAULTS linearly to ``value``, from ``t`` to ``t + over`` [s].
+        """Change a measurement fault linearly to ``value`` between ``t`` and ``t + over`` [s].
 
-        The change starts from the value at ``t`` and replaces an unfinished change. Raises KeyError
-        if ``kind`` is unknown.
+        The change starts at the fault's value at ``t`` and replaces an unfinished change. Raises
+        KeyError if ``kind`` is unknown.
         """
         self._ramps[kind] = _Ramp(self(kind, t), value, t, over)
 
@@ -306,9 +306,9 @@ class MeasurementFaults:
         return MEASUREMENT_FAULTS[kind].honest if ramp is None else ramp(t)
 
     def apply(self, signal: FloatArray, full_count: int, t: float) -> None:
-        """Apply the faults at time ``t`` [s] to the sensor counts ``signal`` [rows, cols] in place.
+        """Apply the faults active at time ``t`` [s] to the sensor signal [rows, cols] in place.
 
-        A shift by a fraction of a cell is interpolated.
+        Shifts by a fraction of a cell are interpolated linearly.
         """
         if not self._ramps:
             return
@@ -322,7 +322,7 @@ class MeasurementFaults:
 
 
 def _shift(count: int, cells: float) -> FloatArray:
-    """Return the [count, count] matrix that shifts a signal by ``cells``, interpolated linearly."""
+    """Return the [count, count] matrix that shifts a signal by ``cells``, with interpolation."""
     places = np.arange(count)
     weights: FloatArray = np.maximum(1.0 - np.abs(places[:, None] - places - cells), 0.0)
     return weights

@@ -1,11 +1,10 @@
-"""Emulate a hand in real time: simulate its physics, and serve its servos and boards on ptys.
+"""Emulate a hand in real time, with servos and tactile boards on pseudo-terminals.
 
-On a busy machine, the emulator and the daemon wait for each other, unless the daemon's
-``loop.clock`` is ``real``; see `EmulatorClock`.
+On a busy machine, the emulator and the daemon wait for each other (see `EmulatorClock`). If the
+daemon's ``loop.clock`` is ``real``, neither process waits.
 
-One thread runs one event loop, which waits for bytes on the servo pty or for the next event. The
-loop serves the servos first, then does at most one slower task (a physics step or a frame) before
-it checks for bytes again.
+The event loop runs in a single thread and waits for incoming bytes or the next event. Each pass of
+the loop serves the servos first and then computes at most one physics step or frame.
 """
 
 from __future__ import annotations
@@ -49,10 +48,10 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # maximum interval between physics updates [s]
-_REQUESTS = ("report", "forget", "place")  # words on the control socket that do not start a fault
+_REQUESTS = ("report", "forget", "place")  # words that are requests instead of faults
 # Joint goals [rad]. A goal of 6 rad lies beyond the joint stops.
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
-_TURN_CURRENT = 0.3  # motor current equivalent to turning a joint by hand [A]
+_TURN_CURRENT = 0.3  # motor current that simulates a hand turning a joint [A]
 _TURN_TIME = 1.0  # s
 _STALL_TIME = 0.05  # maximum time that one call adds to the hand's clock [s]
 # Maximum lead of the hand's clock over the daemon's clock [s].
@@ -70,31 +69,31 @@ DEFAULT_BOARD = {
 
 
 class EmulatorError(SoftfingerError):
-    """Failure to set up the emulated hand. The message gives the reason and a fix."""
+    """Failure to set up the emulated hand. The message states the reason and a remedy."""
 
 
 class EmulatorClock:
-    """Clock of the emulated hand: real time since the start, excluding emulator interruptions.
+    """Clock that measures real time but excludes interruptions of the emulator process.
 
-    If interruptions were included, a process that was stopped for a minute would have to simulate
-    that minute and could not reply in the meantime. A daemon sets deadlines if its own clock pauses
-    while the machine is busy. While such a daemon uses the ``servos`` with torque on, the emulator
-    clock stays within `_AHEAD_TIME` of the daemon clock: both advance by the same amount from one
-    deadline to the next.
+    If the clock counted interruptions, the emulator would have to simulate the missed time before
+    its next reply. A daemon whose clock can pause on a busy machine writes deadlines for the
+    emulator. While torque is on, the emulator clock and the daemon clock advance by the same amount
+    from one deadline to the next. The emulator clock leads the daemon clock by at most
+    `_AHEAD_TIME`.
     """
 
     pauses_when_late = False
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
-        self.held = False  # True if the deadline limited the most recently returned time
+        self.held = False  # True if the deadline limited the last returned time
         self._deadline = deadline
         self._seen = 0.0
-        self._bound = math.inf  # time after which the clock waits for the next deadline
+        self._bound = math.inf  # time at which the clock stops until the next deadline
         self._origin = self._last = time.monotonic()
 
     def now(self) -> float:
-        """Return the hand's time [s]; at most `_STALL_TIME` per call is counted."""
+        """Return the hand's time [s], which increases by at most `_STALL_TIME` per call."""
         now = time.monotonic()
         self._origin += max(now - self._last - _STALL_TIME, 0.0)
         self._last = now
@@ -118,7 +117,7 @@ class EmulatorClock:
         return time.time()
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until ``t`` on the hand's clock; return the wake-up delay [s]."""
+        """Sleep until the hand's time is ``t``, and return the wake-up delay [s]."""
         while (delay := t - self.now()) > 0.0:
             time.sleep(min(delay, 0.5 * _STALL_TIME))
         return -delay
@@ -126,15 +125,15 @@ class EmulatorClock:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedServos:
-    """Options of the emulated servos that are not part of the settings."""
+    """Servo options that are not part of the settings."""
 
-    baud: int = 0  # 0 for an immediate reply at any baud rate
-    factory: bool = False  # factory defaults except for IDs and baud rate
-    ids: tuple[int, ...] | None = None  # replacements for the configured IDs; may be duplicates
+    baud: int = 0  # 0 to reply immediately at any baud rate
+    factory: bool = False  # True for factory defaults, except for IDs and baud rate
+    ids: tuple[int, ...] | None = None  # IDs that replace the configured IDs; duplicates allowed
 
 
 class Emulator:
-    """Emulated hand on ptys that are linked in ``folder``; :meth:`run` serves the ptys.
+    """Emulated hand whose ports are linked in ``folder``. :meth:`run` serves the ports.
 
     A finger that is not in the scene has no board. The ``none`` backend has no port.
     """
@@ -150,8 +149,7 @@ class Emulator:
     ) -> None:
         """Create the hand. The hand does not respond until :meth:`run` is called.
 
-        Signal handlers must not raise exceptions during this call; otherwise, files are left
-        behind.
+        An exception that a signal handler raises during this call can leave files behind.
 
         Parameters
         ----------
@@ -160,7 +158,7 @@ class Emulator:
         faults
             Faults; see :func:`parse_faults`.
         tell
-            Called with log lines when a fault begins or a plate reaches its position.
+            Function that receives a log line when a fault begins or a plate reaches its position.
 
         Raises
         ------
@@ -173,14 +171,14 @@ class Emulator:
         self._wake = os.pipe()
         self._closers.append(self._close_wake)
         self._stopping = False
-        # poll and epoll only have millisecond resolution.
+        # `poll` and `epoll` have a resolution of only 1 ms.
         self._selector = selectors.SelectSelector()
         self._selector.register(self._wake[0], selectors.EVENT_READ)
         self._servos: PtyServoBus | None = None
         self._boards: dict[str, TactileBoard] = {}
         self._sources: dict[str, SimulatedTactile] = {}
         self._plates: dict[str, Plate] = {}
-        self._turned = 0.0  # end time of the last joint rotation by hand
+        self._turned = 0.0  # time at which the last joint rotation by hand ends
         self._tell = tell
         self._advance_due = 0.0
         try:
@@ -241,7 +239,10 @@ class Emulator:
         self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Serve the ports until :meth:`end` is called; call ``on_ready`` once all parts respond."""
+        """Serve the ports until :meth:`end` is called.
+
+        Call ``on_ready`` as soon as each sensor has a frame.
+        """
         ready = False
         while not self._stopping:
             self._turn()
@@ -273,13 +274,14 @@ class Emulator:
     # --- the event loop --------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Wait for bytes or the next event; serve the servos, then do at most one slower task."""
+        """Wait for bytes or the next event, and then run one pass of the event loop."""
         servos, boards = self._servos, self._boards.values()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
         start = self.clock.now()
         if servos is not None:
             due = min(due, servos.next_event())
-        # Avoid a busy loop, because no event becomes due while the hand's clock is paused.
+        # While the hand's clock is paused, no event becomes due, so wait briefly to avoid a busy
+        # loop.
         wait = max(due - start, _POLL_INTERVAL if self.clock.held else 0.0)
         ready = [key for key, _ in self._selector.select(wait)]
         t = self.clock.now()
@@ -313,19 +315,18 @@ class Emulator:
     # --- requests and faults ---------------------------------------------------------------------
 
     def request(self, text: str) -> str:
-        """Handle words from the control socket; return ``ok``, or ``error: `` and the reason.
+        """Handle a message from the control socket and return ``ok``, a report or an error.
 
-        Each word is either a fault or a request. Fault times are relative to the current time.
-        These requests exist:
+        Each word of the message is either a fault or a request. Fault times are relative to the
+        current time. These requests exist:
 
-        - ``report``: the reply is :meth:`report` as JSON.
+        - ``report``: reply with the result of :meth:`report` as JSON.
         - ``forget``: clear the bus record.
-        - ``place``: move the object back to its start pose, at rest and without load, and remove
-          plates.
+        - ``place``: reset the object's pose, velocity and load, and remove all plates.
         - ``press …`` (first word): see :meth:`press`.
         - ``turn …`` (first word): see :meth:`turn`.
 
-        If any word is invalid, all words are ignored.
+        If any word is invalid, all words are ignored and the reply is ``error: `` and the reason.
         """
         words = text.split()
         if words[:1] == ["turn"]:
@@ -351,10 +352,10 @@ class Emulator:
         return reply
 
     def press(self, text: str) -> str:
-        """Start the presses in ``text``; return their state as JSON, or ``error: `` and a reason.
+        """Start the presses in ``text`` and return the reply.
 
-        The JSON object contains ``wait``, the time [s] until the plate reaches the last press. If
-        the text is empty, the state is returned without starting a press.
+        The reply is JSON, or ``error: `` and the reason. The JSON field ``wait`` is the time [s]
+        until the plates reach their last presses. If the text is empty, no press is started.
         """
         now = self.clock.now()
         if text.strip():
@@ -377,11 +378,11 @@ class Emulator:
         self._sources[finger].stage = None
 
     def turn(self, words: Sequence[str]) -> str:
-        """Turn joints as if by hand: ``left=closed`` (to its stop), ``open`` or ``zero``.
+        """Turn joints as if by hand, as requested by ``words`` such as ``left=closed``.
 
-        The joints are held until a client writes to the servos. The reply is ``error: `` and a
-        reason, or JSON that contains the remaining time, as in :meth:`press`. If no words are
-        given, no joint is turned.
+        The poses are ``closed``, ``open`` and ``zero``; the first two are the joint stops. The
+        emulator holds the joints until a client writes to the servos. The reply has the same form
+        as that of :meth:`press`. If ``words`` is empty, no joint is turned.
         """
         now = self.clock.now()
         turns = [word.partition("=") for word in words]
@@ -402,7 +403,7 @@ class Emulator:
         return json.dumps({"wait": max(0.0, self._turned - now)})
 
     def _answer(self, text: str) -> str:
-        """Handle a :meth:`request`; before replying, apply the faults that are already due."""
+        """Handle a request, apply the faults that are already due, and return the reply."""
         reply = self.request(text)
         self._advance(self.clock.now())
         return reply
@@ -410,8 +411,8 @@ class Emulator:
     def report(self, t: float) -> dict[str, Any]:
         """Return the servo bus traffic and the true state of the hand.
 
-        Times are on the hand's clock [s]. ``monotonic`` is time.monotonic() at ``t``, for
-        comparison with other processes.
+        Times are measured by the hand's clock [s]. ``monotonic`` is the machine's monotonic time at
+        ``t``, which other processes can compare with their own.
         """
         servos = self._servos.bus.report(t) if self._servos is not None else []
         held = {"pose": self.hand.object_pose.tolist()}
@@ -439,7 +440,7 @@ class Emulator:
 
 
 def with_board(settings: Settings) -> Settings:
-    """Return ``settings``, but with the default board if the tactile backend has no framing."""
+    """Return settings that use `DEFAULT_BOARD` if the configured board has no encoder."""
     if settings.tactile.backend in (*ENCODERS, "none"):
         return settings
     tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})

@@ -1,7 +1,7 @@
-"""Manage an emulator's folder, which contains links to the ports and a control socket.
+"""Manage an emulator's folder, which contains a control socket and links to the ports.
 
-Only one emulator may use a folder at a time. The socket replies to each text message with one line.
-The emulator's event loop serves the socket; `send_words` is the client.
+Only one emulator may use a folder at a time. The emulator's event loop replies with one line to
+each message that `send_words` sends.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ _LOCK = ".emulator.lock"
 _CONTROL = "control"
 _MESSAGE_SIZE_MAX = 4096  # bytes per message
 _REPLY_SIZE_MAX = 1 << 17
-_CLIENT_COUNT_MAX = 8  # maximum number of clients at a time
+_CLIENT_COUNT_MAX = 8  # maximum number of connected clients
 _CLIENT_TIMEOUT = 10.0  # client timeout [s], long enough for a busy machine
 _MOTIONS = ("press", "turn")
-_QUERY_INTERVAL = 0.1  # interval between queries about the motion of a plate or joint [s]
+_QUERY_INTERVAL = 0.1  # interval at which a client asks for the remaining time of a motion [s]
 
 
 class FolderError(SoftfingerError):
-    """Unusable folder. The message gives the reason and a fix."""
+    """Unusable folder. The message states the reason and a remedy."""
 
 
 class LinkFolder:
-    """Folder with links to the ptys, locked by one emulator.
+    """Folder that an emulator locks and fills with links to its ptys.
 
-    The user must own the folder, and other users must not have write access. Links that a killed
-    emulator left behind are replaced, but other files are not.
+    The user must own the folder, and other users must not have write access. Links from a killed
+    emulator are replaced. Other files are never replaced.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,7 +72,7 @@ class LinkFolder:
                     f"{self.path}: in use by another emulator (process {holder or 'unknown'}); "
                     "stop that emulator or choose a different --dir"
                 ) from None
-            # The previous holder may have removed the lock file between open and lock.
+            # The previous emulator may have removed the lock file after this process opened it.
             with contextlib.suppress(FileNotFoundError):
                 if path.stat().st_ino == os.fstat(lock).st_ino:
                     os.ftruncate(lock, 0)
@@ -107,7 +107,7 @@ class LinkFolder:
 
 
 def find_ports(folder: Path) -> dict[str, Path]:
-    """Return the port links in ``folder`` by name."""
+    """Return the names and paths of the port links in ``folder``."""
     return {name: folder / name for name in LINKS if (folder / name).is_symlink()}
 
 
@@ -116,9 +116,9 @@ class NoEmulator(SoftfingerError):
 
 
 class ControlPort:
-    """Control socket ``folder``/control; ``handle`` returns the reply to each message.
+    """Control socket ``folder``/control. The function ``handle`` returns the reply to a message.
 
-    The owner of ``selector`` must call the ``data`` of each readable key.
+    For each readable key, the owner of ``selector`` must call the function ``key.data``.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class ControlPort:
     ) -> None:
         """Bind the socket.
 
-        Raises FolderError if a file that is not a socket has the socket's name.
+        Raises FolderError if ``folder``/control exists but is not a socket.
         """
         self._handle = handle
         self._selector = selector
@@ -135,7 +135,7 @@ class ControlPort:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with contextlib.suppress(FileNotFoundError):
-                # This process holds the folder lock, so the socket was left behind by a killed
+                # This process holds the folder lock, so any existing socket is from a killed
                 # emulator.
                 if not stat.S_ISSOCK(os.stat(_CONTROL, dir_fd=self._folder).st_mode):
                     raise FolderError(f"{folder / _CONTROL}: already exists; move it elsewhere")
@@ -187,7 +187,7 @@ class ControlPort:
 def carry_out(folder: Path, text: str) -> str:
     """Send ``text`` to the emulator in ``folder``, wait until motions end, and return the reply.
 
-    The reply is empty unless a report was requested.
+    The result is empty unless the text requests a report.
 
     Raises
     ------
@@ -197,8 +197,8 @@ def carry_out(folder: Path, text: str) -> str:
         If the emulator rejects the text; the message lists the expected words.
     """
     reply = send_words(folder, text)
-    # Query the remaining time again after each wait, because the emulated hand's clock stops while
-    # the emulator is suspended.
+    # The hand's clock stops while the emulator is suspended, so query the remaining time again
+    # after each wait.
     kind = text.partition(" ")[0]
     while kind in _MOTIONS and reply.startswith("{"):
         left = json.loads(reply)["wait"]
@@ -244,8 +244,8 @@ def _directory(folder: Path) -> Iterator[int]:
 
 
 def _address(folder: int) -> str:
-    """Return a short socket address based on the folder's descriptor.
+    """Return a socket address that contains the folder's descriptor instead of its path.
 
-    The length of socket paths is limited.
+    The path of the folder could exceed the maximum length of a socket address.
     """
     return f"/proc/self/fd/{folder}/{_CONTROL}"

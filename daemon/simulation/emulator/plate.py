@@ -1,8 +1,8 @@
-"""Simulate a plate that a stage presses against a tip with a given depth, tilt and speed.
+"""Simulate a plate that a stage presses against a tip at a given depth, tilt and speed.
 
-With the plate, users can try calibration without hardware: the sensor measures the plate instead of
-the object, and the true contact is known. The plate is frictionless and does not load the finger
-joint, as if the finger were clamped.
+The tip's sensor measures the plate instead of the object. The true contact is known, so users can
+try calibration without hardware. The plate is frictionless and does not load the finger joint, as
+if the finger were clamped.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from softfinger.kinematics.contact.table import ContactTable
 
 _CLEARANCE = 1e-3  # distance from the tip at which the plate tilts and waits [m]
 _LIFT_SPEED = 0.02  # m/s
-_FILL_TIME = 0.1  # inflation time of a bladder [s]
+_FILL_TIME = 0.1  # time to inflate a bladder [s]
 _PAUSE = 1.0  # pause without contact between presses [s]
 
 _UNITS = {
@@ -38,15 +38,16 @@ _NUMBER = re.compile(r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)(.*)")
 
 
 class PlateError(SoftfingerError, ValueError):
-    """Invalid or impossible press. The message gives the expected format or range."""
+    """Invalid or impossible press. The message states the expected format or range."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlatePress:
-    """Press to ``d`` [m] at ``theta`` [rad], or with uniform ``pressure`` [Pa] on all cells.
+    """One press of the plate, to the depth ``d`` [m] at the tilt ``theta`` [rad].
 
-    ``force`` [N] is the resulting force on the tip base. The press is held for ``hold`` [s], or
-    until the next command if ``hold`` is inf.
+    A ``pressure`` [Pa] above 0 replaces the contact by a uniform pressure on all cells. ``force``
+    [N] is the resulting force on the tip base. The press is held for ``hold`` [s]. If ``hold`` is
+    infinite, the press lasts until the next command.
     """
 
     d: float
@@ -70,12 +71,12 @@ class PlatePress:
 
 
 def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, list[PlatePress]]:
-    """Parse ``[tip=left] depth=4mm [tilt=10deg] …, …`` and return each finger's presses.
+    """Parse comma-separated presses such as ``tip=left depth=4mm tilt=10deg`` for each finger.
 
-    Each press has either a depth (0 lifts off), a force or a pressure (uniform, like a bladder).
-    The optional words are tilt, speed, hold and tip. The tip is left, right or both (default). If
-    ``hold`` is not given, the last press is held indefinitely, and every earlier press lasts one
-    second. Forces are ``scale`` times the ``table`` forces. Raises PlateError.
+    Each press specifies a depth, a force, or a uniform pressure like that of a bladder. A depth of
+    0 lifts the plate off. The optional words are tilt, speed, hold and tip. The tip is left, right
+    or both (default). By default, the last press is held indefinitely, and each earlier press is
+    held for one second. The forces in ``table`` are multiplied by ``scale``. Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
     each = [part.split() for part in text.split(",")]
@@ -135,19 +136,19 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
 
 
 class Plate:
-    """Plate above one tip. The plate position is piecewise linear in the hand's time [s]."""
+    """Plate whose position above one tip is a piecewise linear function of the hand's time."""
 
     def __init__(self) -> None:
         self._t = [0.0]
         self._d = [-_CLEARANCE]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
-        ]  # for each interval between knots: the press, and True if the plate stands still
+        ]  # press of each interval, and True if the plate is stationary
         self._reported = -1
-        self.arrives = 0.0  # arrival time of the last press in the sequence
+        self.arrives = 0.0  # time at which the plate reaches the last press
 
     def go(self, presses: Sequence[PlatePress], t: float) -> None:
-        """Lift off, then perform ``presses``, starting at ``t``."""
+        """Lift the plate off and then perform ``presses``, starting at time ``t``."""
         d, (press, _) = max(self(t).d, -_CLEARANCE), self._doing[self._leg(t)]
         self._t, self._d, self._doing, self._reported = [t], [d], [], -1
         self._add((d + _CLEARANCE) / _LIFT_SPEED, -_CLEARANCE, press)
@@ -171,7 +172,7 @@ class Plate:
         self._doing.append((press, rests))
 
     def __call__(self, t: float) -> StageTouch:
-        """Return the tip's contact at ``t``."""
+        """Return the contact between the plate and the tip at time ``t``."""
         press, rests = self._doing[self._leg(t)]
         d = float(np.interp(t, self._t, self._d))
         if press is None:
@@ -179,7 +180,7 @@ class Plate:
         return StageTouch(d, press.theta, press.pressure if rests else 0.0)
 
     def reached(self, t: float) -> PlatePress | None:
-        """Return the press that has been reached since the last call, or None."""
+        """Return the press that the plate has reached since the last call, or None."""
         leg = self._leg(t)
         press, rests = self._doing[leg]
         fresh = rests and leg != self._reported

@@ -1,9 +1,9 @@
-"""Provide a servo bus on a pseudo-terminal, served by the caller's event loop.
+"""Provide an emulated servo bus on a pseudo-terminal.
 
-This module manages the terminal and the transmission times. A paced reply is sent at the time when
-its last byte would arrive at the client's baud rate, including the return delay. Unpaced replies
-are sent immediately. Transmission times are absolute, so interruptions of this process do not
-accumulate.
+This module manages the terminal and the transmission times. A paced bus sends each reply when a
+real bus would deliver the reply's last byte. The delivery time includes the return delay and the
+transmission time at the client's baud rate. An unpaced bus replies immediately. Transmission times
+are absolute, so delays of this process do not add up.
 """
 
 from __future__ import annotations
@@ -21,27 +21,26 @@ from collections.abc import Callable
 from softfinger.daemon.simulation.faults import WELL
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 
-_TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control characters, two speeds
+_TCGETS2 = 0x802C542A  # termios2 fields: four flag words, line, 19 control characters, two speeds
 _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # one start bit, eight data bits and one stop bit
 _READ_SIZE = 4096
-_READS_PER_TURN = 4  # maximum number of reads per turn; the limit leaves time for other tasks
-# Duration of silence that ends a packet [s]. The duration is longer than 1.5 ms because this
-# process may be delayed.
+_READS_PER_TURN = 4  # maximum number of reads per turn, to leave time for other tasks
+# Duration of silence that ends a packet [s]. The parser's default of 1.5 ms would be too short
+# because this process may be delayed.
 _GAP_TIME = 0.02
-# Typical pseudo-terminal latency from a write to the reader's wake-up [s]. A paced bus subtracts
-# the latency in both directions, because the simulated wire has its own transmission time.
+# Typical latency from a write to a pseudo-terminal until the reader wakes up [s]. A paced bus
+# simulates transmission times, so it subtracts this latency in both directions.
 PASSAGE_TIME = 15e-6
-# Maximum age of a reading when its reply is sent [s], which allows computing the physics outside
-# the exchange. Real servos also measure at their own intervals.
+# Maximum age of a reading when its reply is sent [s]. If slightly older readings are accepted, the
+# physics can be computed between exchanges. Real servos also measure at their own intervals.
 _LAG_TIME = 0.0005
 
 
 def open_pty() -> tuple[int, int, str]:
-    """Open a pty; return its non-blocking master, the raw slave for clients, and the slave path.
+    """Open a pty and return its non-blocking master, its raw slave, and the path of the slave.
 
-    The slave stays open in this process, so that clients can connect and disconnect without an
-    error.
+    The slave stays open in this process, so clients can connect and disconnect without errors.
     """
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -52,8 +51,8 @@ def open_pty() -> tuple[int, int, str]:
 class PtyServoBus:
     """Servo bus on a new pseudo-terminal at ``path``.
 
-    The caller's event loop waits until :meth:`fileno` is readable or the :meth:`next_event` time is
-    reached, and then calls :meth:`service`.
+    The caller must call :meth:`service` when :meth:`fileno` is readable, and at the time that
+    :meth:`next_event` returns.
 
     Parameters
     ----------
@@ -82,7 +81,7 @@ class PtyServoBus:
         self._baud = baud
         self._spin = spin
         self._clock = clock
-        self._free_at = -math.inf  # time until which the wire is busy
+        self._free_at = -math.inf  # time at which the wire becomes free
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
         self._arrives = -math.inf  # arrival time of the last reply
@@ -102,7 +101,7 @@ class PtyServoBus:
         self._master, self._slave, self.path = open_pty()
 
     def unplug(self) -> None:
-        """Remove the terminal, as if an adapter were unplugged; the servos keep running."""
+        """Remove the terminal, as if an adapter were unplugged, but keep the servos running."""
         self._due.clear()
         self.bus.parser.reset()
         if self.plugged:
@@ -111,7 +110,7 @@ class PtyServoBus:
         self._master = self._slave = -1
 
     def apply_fault(self, kind: str, value: float, t: float) -> None:
-        """Begin a fault of the port, the line or a servo; ``plug`` and ``well`` end faults."""
+        """Begin a fault of the port, line or servos; the kinds ``plug`` and ``well`` end faults."""
         if kind == "unplug":
             self.unplug()
         elif kind in ("plug", WELL) and not self.plugged:
@@ -128,7 +127,7 @@ class PtyServoBus:
         return int(_TERMIOS2.unpack(raw)[-1])
 
     def next_event(self) -> float:
-        """Return the time [s] at which :meth:`service` must be called if no bytes arrive first."""
+        """Return the latest time [s] at which :meth:`service` must be called."""
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 
@@ -158,7 +157,7 @@ class PtyServoBus:
                     break
                 if self._receive(data, t):
                     break  # The client needs time to read the reply.
-                # The next request often arrives while a write is being processed.
+                # The next request often arrives while the servos process a write.
                 t = max(t, self._clock())
         self.bus.advance(t)
         self._send()

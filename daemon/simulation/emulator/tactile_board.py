@@ -1,7 +1,6 @@
 """Emulate a tactile board that sends the simulated sensor's frames over a pty.
 
-The encoders (`ENCODERS`) are pure functions that convert counts to a board's framing. This module
-also applies board faults.
+The functions in `ENCODERS` convert counts to the wire format of a board.
 """
 
 from __future__ import annotations
@@ -25,15 +24,16 @@ from softfinger.daemon.simulation.faults import BOARD_FAULTS, WELL
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
-# Maximum number of unread bytes. A tty reports at most 4095 bytes, so the limit must be lower.
+# Maximum number of unread bytes. A tty reports at most 4095 unread bytes, so this limit must be
+# lower.
 _TTY_SIZE_MAX = 2048
 _DRAIN = 4096
-_RETRY_TIME = 5e-4  # interval between polls of the source for a late frame [s]
-_NOISE_LENGTH = 64  # length of the longest noise burst between frames [bytes]
+_RETRY_TIME = 5e-4  # interval between checks for a late frame [s]
+_NOISE_LENGTH = 64  # maximum length of a noise burst between frames [bytes]
 
 
 class FrameSource(Protocol):
-    """Frame source for a board, such as the simulated sensor."""
+    """Source of a board's frames, for example the simulated sensor."""
 
     def latest(self) -> Frame | None:
         """Return the newest frame that is due, or None before the first frame."""
@@ -42,15 +42,14 @@ class FrameSource(Protocol):
 class FrameWriter:
     """Board end of a pty. Frames are sent completely or not at all.
 
-    A pty buffers tens of kilobytes. If there is no reader, frames are dropped early so that the
-    next client does not receive old frames. A real board whose port is closed behaves in the same
-    way.
+    A pty buffers tens of kilobytes. If no client reads, frames are dropped long before this buffer
+    is full, so the next client receives no old frames.
     """
 
     def __init__(self) -> None:
         self._master, self._slave, self.path = open_pty()
         self.dropped = 0  # frames
-        self._remaining = b""  # part of a frame that has not been sent yet
+        self._remaining = b""  # unsent part of the last frame
         self._unread = array.array("i", [0])
 
     def fileno(self) -> int:
@@ -67,7 +66,7 @@ class FrameWriter:
         return True
 
     def flush(self) -> bool:
-        """Write the unsent part of a frame; return True if nothing remains."""
+        """Write the unsent part of the last frame and return True if nothing remains."""
         if self._remaining:
             with contextlib.suppress(BlockingIOError):
                 self._remaining = self._remaining[os.write(self._master, self._remaining) :]
@@ -81,7 +80,7 @@ class FrameWriter:
             return b""
 
     def close(self) -> None:
-        """Close both ends; a client's next read then fails."""
+        """Close both ends of the pty; a client's next read then fails."""
         for end in (self._master, self._slave):
             with contextlib.suppress(OSError):
                 os.close(end)
@@ -92,7 +91,7 @@ class FrameWriter:
 
 
 class TactileBoard:
-    """Emulated board that sends each new frame from ``source`` on a pty, with optional faults.
+    """Emulated board that sends each new frame from ``source`` over a pty.
 
     A board that waits for requests sends one frame per request. ``faults`` maps each active fault
     to its probability:
@@ -102,9 +101,10 @@ class TactileBoard:
     - ``silent``: the board sends no frames.
     - ``frozen``: the board repeats its last frame.
     - ``wrong-size``: the grid has half as many rows and columns.
-    - ``saturated``, ``zero``: all cells read the maximum count, or 0.
+    - ``saturated``: all cells read the maximum count.
+    - ``zero``: all cells read 0.
 
-    All faults except ``torn`` and ``noisy`` ignore the probability and affect every frame.
+    Only ``torn`` and ``noisy`` use the probability. The other faults affect every frame.
     """
 
     def __init__(
@@ -136,13 +136,13 @@ class TactileBoard:
         self.plugged = True
 
     def unplug(self) -> None:
-        """Remove the port, so that a client's reads fail; the board continues running."""
+        """Remove the port, which makes a client's reads fail, but keep the board running."""
         if self.plugged:
             self._writer.close()
         self.plugged = False
 
     def apply_fault(self, kind: str, value: float, _t: float = 0.0) -> None:
-        """Begin a fault of the port or the board; ``plug`` and ``well`` end faults."""
+        """Begin a fault of the port or the board; the kinds ``plug`` and ``well`` end faults."""
         if kind == "unplug":
             self.unplug()
         elif kind in ("plug", WELL) and not self.plugged:
@@ -158,11 +158,11 @@ class TactileBoard:
         return self._writer.dropped
 
     def fileno(self) -> int:
-        """Return a file descriptor. When it is readable, the caller must call :meth:`hear`."""
+        """Return a file descriptor that becomes readable when :meth:`hear` must be called."""
         return self._writer.fileno()
 
     def hear(self) -> None:
-        """Read the client's bytes, which may contain a frame request."""
+        """Read the bytes from the client, which may request a frame."""
         written = self._writer.drain() if self.plugged else b""
         if self._encoder.request and self._encoder.request in written:
             self._requested = True
@@ -175,7 +175,7 @@ class TactileBoard:
         """Send the newest frame if a new frame is due at time t [s]."""
         if self.plugged:
             self._writer.flush()
-        # Rounding may shift the due time in either direction.
+        # Adding 1e-6 prevents rounding errors from making the same frame due twice.
         self._due = (math.floor((t - self._delay) * self._rate + 1e-6) + 1) / self._rate
         self._due += self._delay
         frame = self._source.latest()
@@ -225,24 +225,25 @@ Encode = Callable[[NDArray[np.uint16], int, float], bytes]
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """Board framing, and the byte that requests a frame (empty if the board needs no requests)."""
+    """Encoder of a board's frames, and the byte that requests a frame, if any."""
 
     encode: Encode
     request: bytes = b""
 
 
 def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.0) -> bytes:
-    """Encode ``AA 55`` and one byte per cell, row-major; counts above 255 saturate."""
+    """Encode a frame as ``AA 55`` and one byte per cell, row by row; counts above 255 saturate."""
     return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
 
 
 def encode_glove(
     counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0, values: int = 32
 ) -> bytes:
-    """Encode a frame for a glove-style board: number + 11, count halves + 11, and a newline.
+    """Encode a frame of a glove-style board as a scan number, the counts and a newline.
 
-    Each count is split into a high half and a low half. Each half can take ``values`` different
-    values: 32, or 64 with a 12-bit converter. Counts that are too large saturate.
+    Each count is split into a high half and a low half. A half ranges from 0 to ``values`` − 1,
+    where ``values`` is 32, or 64 with a 12-bit converter. The scan number and the halves are offset
+    by 11. Counts that are too large saturate.
     """
     counts = np.minimum(counts, values * values - 1)
     halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)
@@ -250,7 +251,7 @@ def encode_glove(
 
 
 def encoder_for(backend: str, full_count: int) -> Encoder:
-    """Return the framing of a backend's board; ``full_count`` is the board's maximum count."""
+    """Return the encoder of a backend's board, whose maximum count is ``full_count``."""
     if backend == "glove" and 1023 < full_count <= 4095:
         return Encoder(partial(encode_glove, values=64), b"a")
     return ENCODERS[backend]

@@ -1,5 +1,5 @@
-"""Simulate the hand's mechanics: `simulated_hand` is the interface, `plant` is the integrator.
+"""Simulate the mechanics of the hand.
 
-The other modules contain kernels on the `plant_state` records: contacts, forces, equations of
-motion and energy guard.
+The module `simulated_hand` is the interface, and `plant` is the integrator. The other modules
+contain kernels that operate on the records in `plant_state`.
 """

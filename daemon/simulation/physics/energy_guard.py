@@ -1,11 +1,11 @@
-"""Compute the plant energy, and prevent integration steps from creating energy.
+"""Compute the plant's energy, and prevent integration steps from creating energy.
 
-With smooth forces, the integration error is small, and shorter steps reduce it. If forces are not
-smooth (for example, when a light object hits the stiff rim of the backing plate) or a step is too
-long, the energy could increase by more than the work of the motors and loads. The guard removes any
-excess energy from the kinetic energy. If the kinetic energy is smaller than the excess, the motion
-stops at an earlier point in the step. Without damping, the energy should stay constant. In smooth
-steps, the guard tolerates the small energy drift of the integration method.
+If the forces are smooth, the integration error is small and decreases with the step size. Without
+the guard, long steps or non-smooth forces could add more energy than the motors and loads supply.
+For example, the forces are not smooth when a light object hits the stiff rim of the backing plate.
+The guard subtracts the excess energy from the kinetic energy. If the kinetic energy is too small,
+the guard stops the motion and shortens the step. For undamped tips, the guard tolerates the
+integrator's small energy drift in smooth steps.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Pla
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth undamped steps
-# Relative rounding error of the energy. The rounding error is large because d is a small difference
-# of lengths.
+# Relative rounding error of the energy. The error is large because d is a small difference between
+# two lengths.
 _ROUNDING = 3e-13
 HALVINGS = 12  # maximum number of times that a step is halved
 
 
 @inner_kernel
 def kinetic_energy(plant: Plant) -> float:
-    """Return the kinetic energy of joints and object [J]."""
+    """Return the kinetic energy of the joints and the object [J]."""
     p, v = plant.parameters, plant.state.velocity
     joints = v[0] ** 2 + v[1] ** 2
     moving = v[2] ** 2 + v[3] ** 2
@@ -42,7 +42,7 @@ def weight_energy(plant: Plant) -> float:
 
 @inner_kernel
 def elastic_energy(plant: Plant) -> float:
-    """Return the elastic energy [J] of end stops, bristles and first-stage contacts."""
+    """Return the elastic energy [J] stored in end stops, bristles and first-stage contacts."""
     p, stage = plant.parameters, plant.stages[0]
     energy: float = plant.palm_energy
     for finger in range(2):
@@ -70,7 +70,7 @@ def is_on_rim(plant: Plant) -> bool:
 
 @inner_kernel
 def open_guard(plant: Plant) -> None:
-    """Accept the current energy if the state has been changed externally since the last step."""
+    """Accept the current energy if code outside the integrator has changed the state."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy
@@ -79,7 +79,7 @@ def open_guard(plant: Plant) -> None:
 
 @inner_kernel
 def work_done(plant: Plant) -> float:
-    """Return an upper bound for the work [J] done by motors and loads since the previous state."""
+    """Return an upper bound for the work [J] done by motors and loads in the current step."""
     before, now = plant.last_state, plant.state
     work = 0.0
     for j in range(5):
@@ -96,7 +96,8 @@ def work_done(plant: Plant) -> float:
 def guard_step(plant: Plant, was_on_rim: bool) -> int:
     """Remove a step's excess energy by reducing the velocities.
 
-    After a change, the caller must evaluate the state again and call :func:`allow_changed_energy`.
+    If the function changes the state, the caller must evaluate the state again and call
+    :func:`allow_changed_energy`.
 
     Returns
     -------
@@ -128,7 +129,7 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
 
 @inner_kernel
 def shorten(plant: Plant, scale: float) -> None:
-    """Scale this step's changes in positions, shears and bristles by ``scale``."""
+    """Multiply this step's changes in position, shear and bristle deflection by ``scale``."""
     before, now = plant.last_state, plant.state
     for j in range(5):
         now.position[j] = before.position[j] + scale * (now.position[j] - before.position[j])
@@ -138,7 +139,7 @@ def shorten(plant: Plant, scale: float) -> None:
         now.bristles[j] = before.bristles[j] + scale * bent
         layers, earlier = plant.layers[j], plant.last_layers[j]
         mean = square = 0.0
-        for k in range(LAYERS):  # Array expressions would load Numba's ufuncs on each startup.
+        for k in range(LAYERS):  # Array expressions would load Numba's ufuncs at each startup.
             layers[k] = earlier[k] + scale * (layers[k] - earlier[k])
             mean += layers[k] / LAYERS
         for k in range(LAYERS):
@@ -151,14 +152,14 @@ def shorten(plant: Plant, scale: float) -> None:
 
 @inner_kernel
 def is_within_limit(plant: Plant) -> bool:
-    """Return True if the energy of a state at rest is within the limit."""
+    """Return True if the elastic and gravitational energy is within the limit."""
     energy = elastic_energy(plant) + weight_energy(plant)
     return bool(energy <= plant.energy_limit + work_done(plant))
 
 
 @inner_kernel
 def allow_changed_energy(plant: Plant) -> None:
-    """Update the energies after :func:`guard_step` has changed the state."""
+    """Update the energy and its limit after :func:`guard_step` has changed the state."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.energy = energy
     plant.energy_limit = min(energy, plant.energy_limit + work_done(plant))
@@ -166,7 +167,7 @@ def allow_changed_energy(plant: Plant) -> None:
 
 @inner_kernel
 def allow_relaxed_energy(plant: Plant) -> None:
-    """Update the energies after tip relaxation; change the limit by the change in energy."""
+    """Update the energy after tip relaxation, and change the energy limit by the same amount."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.energy_limit += energy - plant.energy
     plant.energy = energy

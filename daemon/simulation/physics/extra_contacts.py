@@ -1,20 +1,21 @@
-"""Evaluate contacts that occur only in some scenes: object to palm, and tip to tip.
+"""Evaluate object-to-palm and tip-to-tip contacts, which occur only in some scenes.
 
-The rows of the palm and tip-to-tip contacts are added to the step matrix (`solver`).
+Palm contacts and tip-to-tip contacts add rows to the step matrix (see `solver`).
 
 The palm is a plane parallel to the x axis. Each corner of the object, or the lowest point of a
-disc, has two springs. The first spring pushes up a corner that is below the palm. The viscous
-damping of the first spring never pulls the corner down. The second spring acts along the palm and
-models Coulomb friction: it sticks until its force would exceed the friction coefficient times the
-normal force, and then slips. Therefore, a resting object does not creep.
+disc, has two springs. The first spring pushes a corner up if the corner is below the palm's
+surface. The damping of the first spring never pulls the corner down. The second spring models
+Coulomb friction along the palm. The corner slips when the force of the second spring reaches the
+friction coefficient times the normal force. Because of the second spring, a resting object does not
+creep.
 
-Two equal hemispheres meet on the plane midway between their centres. Each tip is compressed by d =
-a − D/2, as if by a rigid plane, where D is the distance between the centres. The total energy of
-both tips is U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With
-different tilts, a real contact surface would bulge towards the softer tip, so the modelled energy
-is slightly too high (second order in the difference of cos² θ). The plane sticks equally to both
-tips: each tip's shear rate is half the relative sliding velocity of the two surfaces, minus the
-tip's tan θ ḋ.
+The tips are equal hemispheres and meet in the plane midway between their centres. Each tip is
+compressed as if by a rigid plane. If the centres are a distance D apart, the compression is d = a −
+D/2. The total energy of both tips is U(d, θ1, d_t1) + U(d, θ2, d_t2), which equals 2 U(d, θ) for
+symmetric fingers. If the tilts differ, a real contact surface bulges towards the softer tip. The
+modelled energy is then too high by a term of second order in the difference of cos² θ. Both tips
+stick equally to the contact plane. Each tip's shear rate is half the sliding velocity between the
+two surfaces, minus the tip's tan θ ḋ.
 """
 
 from __future__ import annotations
@@ -47,8 +48,7 @@ from softfinger.kinematics.contact.table_record import Table
 
 STIFFNESS = 1e5  # normal and tangential contact stiffness of a corner on the palm [N/m]
 LOSS = 1e-3  # ratio of damping to stiffness [s]
-# Maximum distance for evaluating the tip-to-tip contact: half the distance between the tip centres,
-# in tip radii.
+# Maximum distance between the tip centres at which the contact is evaluated, in tip diameters.
 _DISTANCE_MAX = 1.5
 
 
@@ -69,7 +69,7 @@ def touch_palm(
     """Add the forces that the palm exerts on the object; (nx, ny) is the object's face normal n.
 
     In the first stage, this function also applies the friction limit to the shears and sets the
-    rows of the full matrix.
+    palm rows of the step matrix.
     """
     if palm_is_far(plant, now):
         for corner in range(CORNERS):
@@ -135,7 +135,7 @@ def touch_palm(
 
 @inner_kernel
 def tips_are_far(plant: Plant) -> bool:
-    """Return True if the tips are too far apart for their contact to be evaluated."""
+    """Return True if the tips are so far apart that their contact is not evaluated."""
     left, right = plant.fingers[0], plant.fingers[1]
     apart_x = right.x - left.x
     apart_y = right.y - left.y
@@ -155,7 +155,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
     d = p.radius - half
     ex = apart_x / apart
     ey = apart_y / apart
-    # Components of v along e, and along e rotated by 90°.
+    # Tip velocities per unit of joint velocity, along e and along e rotated by 90°.
     m1 = left.x_q * ex + left.y_q * ey
     m2 = right.x_q * ex + right.y_q * ey
     t1 = left.y_q * ex - left.x_q * ey
@@ -217,7 +217,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
 def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
     """Add the tip-to-tip torques if the tips are close or there is no object.
 
-    In the first stage, this function also sets the rows for the tips in the full matrix.
+    In the first stage, this function also sets the tip-to-tip rows in the step matrix.
     """
     near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
     touching = near and tip_on_tip(plant, table, now, stage)
@@ -245,7 +245,7 @@ def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_f
 
 @inner_kernel
 def clear_extra(plant: Plant) -> None:
-    """Clear the extra rows of the matrix."""
+    """Clear the extra rows of the step matrix."""
     for number in range(EXTRA_ROWS):
         plant.extra[number].stiffness = 0.0
         plant.extra[number].damping = 0.0

@@ -1,6 +1,6 @@
-"""Compute the forces for a state: motors, weight, loads, friction and end stops.
+"""Compute the forces of motors, weight, loads, friction and end stops.
 
-This module calls `tip` and `extra_contacts`, which evaluate the contacts and their forces.
+The modules `tip` and `extra_contacts` compute the contact forces.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from softfinger.kinematics.contact.table_record import Table
 
 @inner_kernel
 def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
-    """Return a servo's motor current command [A] after applying all of the servo's limits.
+    """Return the motor current [A] that a servo commands after all limits have been applied.
 
-    The voltage limit decreases linearly from the stall current at standstill to 0 at no-load speed.
-    The PWM limit scales the supply voltage.
+    The voltage-limited current decreases linearly from the stall current at standstill to 0 at
+    no-load speed. The PWM limit scales the supply voltage.
     """
     p, goals = plant.parameters, plant.goals
     if goals.torque_on[joint] == 0:
@@ -52,10 +52,11 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 
 @inner_kernel
 def set_motor_slopes(plant: Plant, g: float) -> None:
-    """Set the motor torque derivatives with respect to angle and velocity, divided by (τ + g).
+    """Set the derivatives of the motor torques with respect to joint angle and velocity.
 
-    The derivatives are 0 unless the motors are stiff at the step size ``g``. The derivatives are
-    upper bounds, because the current may enter or leave its limits within the step.
+    The derivatives are divided by τ + g, where τ is the time constant of the current. A derivative
+    is 0 unless the motor is stiff at the step size ``g``. The derivatives are upper bounds, because
+    the current may enter or leave its limits within the step.
     """
     p, goals = plant.parameters, plant.goals
     constant = p.torque_constant
@@ -76,7 +77,7 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def joint_stiffness(plant: Plant, joint: int) -> float:
-    """Return the total stiffness [N·m/rad] of a joint's bristles and any end stop within reach."""
+    """Return the stiffness [N·m/rad] of a joint's bristles and of an end stop within reach."""
     p = plant.parameters
     stiffness: float = plant.gears[joint].stiffness
     q = plant.state.position[joint]
@@ -88,7 +89,7 @@ def joint_stiffness(plant: Plant, joint: int) -> float:
 
 @inner_kernel
 def free_object(plant: Plant, now: Motion) -> None:
-    """Set the object's forces: weight, loads and table friction."""
+    """Set the forces on the object that result from weight, loads and table friction."""
     p, load = plant.parameters, plant.goals.load
     vx = now.velocity[2]
     vy = now.velocity[3]
@@ -105,10 +106,11 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 @inner_kernel
 def friction_level(plant: Plant, finger: int, rate: float, current: float) -> float:
-    """Return the friction torque [N·m] at which a joint slips for a motor ``current`` and load.
+    """Return the friction torque [N·m] at which a joint slips.
 
-    The base, Stribeck and load terms follow Rhoban's model M4, which was identified for servos of
-    this type (arXiv 2410.08650). The gear torque is |external − motor|.
+    The base, Stribeck and load terms are those of Rhoban's model M4, which was identified for
+    similar servos (arXiv 2410.08650). The load term is proportional to the gear torque, |external −
+    motor|.
     """
     p = plant.parameters
     still = math.exp(-abs(rate) / p.stribeck_speed)
@@ -120,20 +122,20 @@ def friction_level(plant: Plant, finger: int, rate: float, current: float) -> fl
 
 @inner_kernel
 def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
-    """Return a joint's bristle torque [N·m] and set the bristle damping as the joint's drag.
+    """Return the torque [N·m] of a joint's bristles, and store their damping as the joint's drag.
 
     Elastic bristles with deflection z connect the gears and slip at the friction level f. The
-    bristles follow the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE
-    Transactions on Automatic Control 47(5), 2002), with the same deflection z_p = ``presliding``
-    for break-away and steady slip:
+    elasto-plastic friction model is by Dupont, Hayward, Armstrong and Altpeter (IEEE Transactions
+    on Automatic Control 47(5), 2002). Break-away and steady slip occur at the same deflection z_p =
+    ``presliding``:
 
         torque = f z/z_p    ż = q̇ while |z| ≤ z_p
 
-    Below f, the bristles are elastic, so a constant or oscillating load below f does not cause
-    drift. The number of bristles is proportional to f. New bristles are undeflected; on average,
-    they are added halfway through the step. The energy of removed bristles is lost. Therefore, a
-    change in f never adds energy. The damping of a stuck joint is half the critical damping, and
-    the sum of bristle torque and damping is limited to f.
+    A load below f deforms the bristles only elastically and therefore never causes drift, even if
+    it oscillates. The number of bristles is proportional to f. New bristles are undeflected, and
+    the energy of removed bristles is lost, so a change in f never adds energy. On average, new
+    bristles are added halfway through the step. A stuck joint has half the critical damping. The
+    sum of bristle torque and damping torque is limited to f.
     """
     p, gears = plant.parameters, plant.gears[finger]
     rate = now.velocity[finger]
@@ -159,7 +161,7 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
 
 @inner_kernel
 def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
-    """Return the torque [N·m] due to a joint's friction and end stops; set the joint's drag."""
+    """Return the torque [N·m] due to a joint's friction and end stops, and set the joint's drag."""
     p = plant.parameters
     q = now.position[finger]
     torque = -bend_bristles(plant, finger, now, is_first)
@@ -173,12 +175,11 @@ def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
 
 @inner_kernel
 def place_finger(plant: Plant, finger: int, q: float) -> None:
-    """Set the position of a finger from its joint angle ``q``."""
+    """Compute a finger's position from its joint angle ``q``."""
     p, its = plant.parameters, plant.fingers[finger]
     cosine = math.cos(q)
     sine = math.sin(q)
-    # Position of the tip centre relative to its pivot, inwards and away from the palm
-    # (hand.geometry).
+    # Position of the tip centre relative to the finger's pivot, as in `hand.geometry`.
     inward = p.length * sine + p.offset * cosine
     ahead = p.length * cosine - p.offset * sine
     side = 1.0 - 2.0 * finger
@@ -192,9 +193,10 @@ def place_finger(plant: Plant, finger: int, q: float) -> None:
 
 @inner_kernel
 def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
-    """Evaluate all contacts and forces, except the motor forces, in state ``now``; fill ``stage``.
+    """Compute all contacts and forces for the state ``now``, except for the motor forces.
 
-    The drag is viscous friction divided by velocity. The forces already include viscous friction.
+    The contacts are stored in ``stage``. The drag is viscous friction divided by velocity. The
+    forces already include viscous friction.
     """
     p, forces = plant.parameters, plant.forces
     nx = math.cos(now.position[4])

@@ -1,4 +1,4 @@
-"""Compute the contact geometry between the object outline and a tip or its backing plate rim.
+"""Compute where a tip, or the rim of its backing plate, touches the object.
 
 The object is a rigid convex polygon or a disc.
 """
@@ -10,7 +10,7 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import DISC, Parameters, TipContact
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-FACE = -1.0  # code that marks a plane face instead of a radius of curvature
+FACE = -1.0  # value that marks a plane face in place of a curvature radius
 _DISTANCE_MIN = 1e-12  # m
 
 
@@ -18,10 +18,10 @@ _DISTANCE_MIN = 1e-12  # m
 def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
     """Return the direction, distance and curvature radius of the outline point nearest to (u, v).
 
-    (u, v) is in the object's frame. For an outside point, the direction points to the nearest point
-    of the outline. For an inside point, the distance is the negative distance to the nearest face,
-    and the direction is the inward normal of that face. The curvature radius is 0 at a corner,
-    ``FACE`` on a face, or the radius of a disc.
+    The point (u, v) is given in the object's frame. For an outside point, the direction points to
+    the nearest point of the outline. For an inside point, the distance to the nearest face is
+    negative, and the direction is the inward normal of that face. The curvature radius is 0 at a
+    corner, ``FACE`` on a face, and the disc radius on a disc.
     """
     if p.shape == DISC:
         away = max(math.sqrt(u * u + v * v), _DISTANCE_MIN)
@@ -63,11 +63,11 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
 
 @inner_kernel
 def rim_on_plane(p: Parameters, tip: TipContact) -> float:
-    """Evaluate both rim ends on a plane; return the larger depth [m]. A gap has a negative depth.
+    """Evaluate both ends of the rim on a plane and return the larger depth [m].
 
-    The depths are d − a(1 ∓ sin θ). Each end has its own spring, so that energy and forces are
-    smooth even if the plate lies flat on the face. If the rim is in contact, this function sets the
-    rim energy and its derivatives.
+    The depths of the two ends are d − a(1 ∓ sin θ). A gap has a negative depth. Each end has its
+    own spring, so energy and forces are smooth even if the plate lies flat on the face. If the rim
+    is in contact, this function sets the rim energy and its derivatives.
     """
     d = tip.d
     sine = tip.sine
@@ -85,10 +85,10 @@ def rim_on_plane(p: Parameters, tip: TipContact) -> float:
 
 @inner_kernel
 def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
-    """Evaluate the rim on a disc like :func:`rim_on_plane`, but with one spring for the chord.
+    """Evaluate the rim on a disc as in :func:`rim_on_plane`, but with a single spring.
 
-    ``away`` is the distance between the disc centre and the tip centre. The depth is a smooth
-    function: the disc radius minus the distance between disc centre and chord.
+    ``away`` is the distance between the disc centre and the tip centre. The depth is the disc
+    radius minus the distance from the disc centre to the rim's chord, and varies smoothly.
     """
     across = away * tip.sine
     up = away * tip.cosine

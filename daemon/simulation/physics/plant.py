@@ -1,16 +1,17 @@
 """Integrate the simulated hand: two joints, two soft tips and one rigid object.
 
-A two-stage Rosenbrock method (ROS2, γ = 1 − 1/√2) with fixed sub-steps advances the coordinates
-(q1, q2, x, y, φ), their velocities, the contact shears and the motor currents:
+The integrator is the two-stage Rosenbrock method ROS2 with γ = 1 − 1/√2 and fixed sub-steps h. The
+integrator advances the coordinates (q1, q2, x, y, φ), their velocities, the contact shears and the
+motor currents:
 
     (1 − γhA) k1 = f(y)    (1 − γhA) k2 = f(y + h k1) − 2 k1    y ← y + h (3 k1 + k2)/2
 
 The method is of second order for any matrix A, and L-stable if A is the Jacobian. Here, A contains
-the stiff parts: normal, rotational and shear stiffness of the contacts with their damping, end
-stops, gear bristles, the secant of table friction, motor lag and servo loops. Only the five
-accelerations are coupled, so a step requires only two evaluations of the tips and one 5 × 5
-factorisation. To model Coulomb slip, shears and bristles are limited at the start of each step.
-Finally, the energy guard checks the step.
+only the stiff terms: contacts with their damping, end stops, gear bristles, table friction (as a
+secant), motor lag and servo loops. Only the five accelerations are coupled, so a step requires one
+5 × 5 factorisation. The tips are evaluated twice per step. To model Coulomb slip, shears and
+bristles are limited at the start of each step. At the end of each step, the energy guard checks the
+energy.
 """
 
 from __future__ import annotations
@@ -69,11 +70,11 @@ def bounded(value: float, limit: float) -> float:
 
 @inner_kernel
 def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
-    """Add the motor torques to the load; set the rates of the currents in ``k``.
+    """Add the motor torques to the load and set the rates of the currents in ``k``.
 
-    The rates are those at zero acceleration. A current lags behind its reference: i' = (r(q, ω) −
-    i)/τ. The current's rate ``k`` decreases by (r_q g + r_ω) g/(τ + g) per unit of acceleration;
-    the step matrix contains this term.
+    The rates are valid at zero acceleration. A current i lags behind its reference r according to
+    i' = (r(q, ω) − i)/τ. Per unit of acceleration, the rate of the current decreases by (r_q g +
+    r_ω) g/(τ + g). The step matrix contains this decrease.
     """
     p = plant.parameters
     lag = p.electric_time
@@ -90,7 +91,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
 
 @inner_kernel
 def finish_stage(plant: Plant, k: Motion, g: float) -> None:
-    """Solve for the velocities in ``k`` and add the effect of the velocities to the other rates."""
+    """Solve for the velocities in ``k``, and update the other rates with these velocities."""
     solve(plant, k)
     if plant.has_extra_rows:
         add_extra_shears(plant, k, g)
@@ -126,7 +127,7 @@ def first_stage(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def begin_second_stage(plant: Plant, h: float) -> None:
-    """Set the state of the second stage, y + h k1."""
+    """Set the state of the second stage to y + h k1."""
     state, k, later = plant.state, plant.first, plant.stage_state
     for j in range(5):
         later.position[j] = state.position[j] + h * k.position[j]
@@ -175,8 +176,8 @@ def advance_state(plant: Plant, h: float) -> None:
             continue
         displacement = h * (1.5 * first.position[j] + 0.5 * second.position[j])
         change = h * (1.5 * first.velocity[j] + 0.5 * second.velocity[j])
-        # A step is too long if it would move a tip by more than a quarter of the tip radius.
-        # Limiting the displacement can only remove energy.
+        # Limit each displacement to a quarter of the tip radius per step. The limit can only remove
+        # energy.
         limit = 0.25 * p.radius
         if j < 2:
             limit /= p.length + abs(p.offset)
@@ -191,7 +192,7 @@ def advance_state(plant: Plant, h: float) -> None:
 
 @inner_kernel
 def limit_energy(plant: Plant, table: Table) -> None:
-    """Shorten a step until its energy is within the limit, or undo it after HALVINGS attempts."""
+    """Halve a step until the energy is within the limit; undo the step after HALVINGS attempts."""
     for _ in range(HALVINGS):
         shorten(plant, 0.5)
         evaluate_state(plant, table)
@@ -203,7 +204,7 @@ def limit_energy(plant: Plant, table: Table) -> None:
 
 @inner_kernel
 def store_bristles(plant: Plant) -> None:
-    """Limit the bristle deflections and store the friction level for the next step."""
+    """Store the limited bristle deflections and the friction level for the next step."""
     for joint in range(2):
         gears = plant.gears[joint]
         gears.level = gears.friction
@@ -211,7 +212,7 @@ def store_bristles(plant: Plant) -> None:
         plant.state.bristles[joint] = gears.limited_deflection
 
 
-# --- contacts of the tips at the times of the sensor frames --------------------------------------
+# --- sampled tip contacts ------------------------------------------------------------------------
 
 
 @inner_kernel
@@ -234,7 +235,7 @@ def sensed_contact_of(plant: Plant, finger: int) -> TipContact:
 
 @inner_kernel
 def take_sample(plant: Plant, ring: Records[Sample]) -> None:
-    """Write the due sample to ``ring``, interpolated between the previous and present contacts."""
+    """Interpolate between the previous and present contacts; write the sample to ``ring``."""
     p = plant.parameters
     due = plant.sample_count * p.sample_period
     back = min((plant.step_count * p.step - due) / p.step, 1.0)
@@ -282,8 +283,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
-    # From here on, pass a single record, because each array argument costs a reference count update
-    # per call.
+    # An array argument costs a reference count update per call, so the other kernels receive a
+    # single record.
     data = tables[0]
     h = p.step
     g = _GAMMA * h
@@ -311,8 +312,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             state.position[2] = script_x(plant, plant.step_count * h)
         if relaxing:
             relax_shears(plant)
-        # The evaluation models slip by limiting the shears. `settle` then stores the limited
-        # values.
+        # The evaluation limits the shears to model slip. `settle` stores the limited values.
         evaluate_state(plant, data)
         if scripted:
             open_guard(plant)
@@ -321,8 +321,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             if changed == 2:
                 limit_energy(plant, data)
             elif changed == 1:
-                # Slowing the gears increases their friction and therefore adds bristles. New
-                # bristles are undeflected.
+                # Slower gears have more friction and therefore more bristles. New bristles are
+                # undeflected.
                 store_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:
@@ -331,7 +331,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
         settle(plant, ring)
         if p.tips_relax:
             # The relaxation factor is constant within a step. Between steps, relaxation changes the
-            # energy of the tip itself, so the guard accepts the change.
+            # energy of the tip, and the guard accepts this change.
             relax_tips(plant)
             evaluate_state(plant, data)
             allow_relaxed_energy(plant)

@@ -1,6 +1,6 @@
-"""Define the plant record shared by all kernels: state, parameters, goals and work data.
+"""Define the record that all plant kernels share.
 
-Pairs are (left, right). Coordinates are the joint angles q1, q2 and the object pose x, y, φ.
+Pairs are (left, right). The coordinates are the joint angles q1 and q2 and the object pose x, y, φ.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ ALONG_D = 0
 ALONG_THETA = 1
 ALONG_SHEAR = 2
 
-LAYERS = 8  # number of footprint layers that slip successively from the edge inwards
+LAYERS = 8  # number of footprint layers, which slip one after another from the edge inwards
 CORNERS = 8  # maximum number of corners of an object
-SHEARS = CORNERS + 2  # palm shear at each corner, followed by the tip-on-tip shear of each tip
-PALM_ROWS = 2 * CORNERS  # height and slip of each corner
-EXTRA_ROWS = PALM_ROWS + 6  # adds d, θ and d_t of each tip's contact with the other tip
+SHEARS = CORNERS + 2  # palm shear of each corner, then tip-to-tip shear of each tip
+PALM_ROWS = 2 * CORNERS  # two rows for each corner: height and slip
+EXTRA_ROWS = PALM_ROWS + 6  # palm rows, plus tip-to-tip rows d, θ and d_t of each tip
 
 Shears = Annotated[FloatArray, SHEARS]
 
@@ -40,7 +40,7 @@ Shears = Annotated[FloatArray, SHEARS]
 class Motion(Record):
     """Coordinates, velocities, shears and currents, or their rates of change.
 
-    The bristle deflections change at the joint velocities.
+    The bristle deflections change at the same rates as the joint angles.
     """
 
     position: FloatFive  # joint angles [rad], object x and y [m], object angle [rad]
@@ -52,7 +52,7 @@ class Motion(Record):
 
 
 class Sample(Record):
-    """Tip contacts at a frame's sample time; fields as in :class:`TipContact`."""
+    """Tip contacts at the time when a frame is sampled; see :class:`TipContact`."""
 
     number: int  # -1 for an empty entry
     t: float  # time since the start [s]
@@ -75,26 +75,26 @@ class Edge(Record):
 
 
 class Parameters(Record):
-    """Parameters that the settings define."""
+    """Plant parameters computed from the settings."""
 
     step: float  # sub-step [s]
     sample_period: float  # [s]
-    modulus: float  # zero-strain modulus of the real tip [Pa]
+    modulus: float  # modulus of the real tip at zero strain [Pa]
     radius: float  # tip radius [m]
-    deepest: float  # maximum d for which the contact law is valid [m]
-    scale: float  # ratio of the real modulus to the table modulus
+    deepest: float  # maximum d at which the contact law is valid [m]
+    scale: float  # ratio of the real modulus to the modulus of the contact table
     friction: float
     loss: float  # ratio of damping to stiffness [s]
-    shear_stiffness: float  # ratio of shear stiffness to that of the spring model
-    shear_coupling: float  # coupling of d_t with d and θ: 1 for springs, 0 for bristles
-    creep: float  # fraction of a sticking shear that relaxes per sub-step
+    shear_stiffness: float  # ratio of the shear stiffness to that in the spring model
+    shear_coupling: float  # 1 if d_t is coupled with d and θ (springs), else 0 (bristles)
+    creep: float  # fraction of the shear that relaxes per sub-step while the tip sticks
     micro_slip: bool  # True if the edge of the footprint slips first
     tips_relax: bool
-    relaxation: FloatTriple  # Prony term stiffnesses relative to the long-term stiffness
+    relaxation: FloatTriple  # stiffness of each Prony term relative to the long-term stiffness
     relaxation_step: FloatTriple  # fraction of each Prony term that relaxes per sub-step
     rim_stiffness: float  # [N/m]
-    tolerance: float  # relative energy gain that is allowed in smooth steps
-    half_separation: float  # half the pivot separation [m]
+    tolerance: float  # relative energy gain allowed in smooth steps
+    half_separation: float  # half the distance between the pivots [m]
     length: float  # finger length [m]
     offset: float  # tip offset from the finger axis [m]
     finger_present: Flags  # True if the finger is in the scene
@@ -102,12 +102,12 @@ class Parameters(Record):
     half_width: float  # [m]
     half_height: float  # [m]
     roundness: float  # radius of a disc [m]
-    factor: float  # ratio of tip stiffness on the object to tip stiffness on a plane
-    extent: float  # maximum distance of an outline point from the object centre [m]
-    corners: int  # used entries of the outline
+    factor: float  # stiffness of a tip on the object relative to that on a plane
+    extent: float  # maximum distance from the object centre to the outline [m]
+    corners: int  # number of corners in ``outline``
     outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
     mass: float  # object mass [kg]
-    inertia: float  # object moment of inertia [kg·m²]
+    inertia: float  # moment of inertia of the object [kg·m²]
     gravity: Pair  # x, y [m/s²]
     table_force: float  # Coulomb friction between table and object [N]
     table_torque: float  # Coulomb friction torque between table and object [N·m]
@@ -119,7 +119,7 @@ class Parameters(Record):
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
     stribeck: float  # additional friction at standstill [N·m]
-    load_friction: Pair  # ratio of friction to gear torque, and the additional ratio at standstill
+    load_friction: Pair  # ratio of friction to gear torque, and its increase at standstill
     stribeck_speed: float  # speed at which the additional friction has decreased to 1/e [rad/s]
     presliding: float  # bristle deflection at which the gears slip [rad]
     torque_constant: float  # [N·m/A]
@@ -134,7 +134,7 @@ class Parameters(Record):
     stop_stiffness: float  # [N·m/rad]
     joints_held: bool
     object_held: bool
-    script_speed: float  # speed of a held object that moves back and forth [m/s]
+    script_speed: float  # speed at which a held object moves back and forth [m/s]
     script_travel: Pair  # travel to the left and to the right [m]
     script_x: float  # start position [m]
 
@@ -153,13 +153,13 @@ class Goals(Record):
 
 
 class Finger(Record):
-    """Finger position: tip centre in the hand frame."""
+    """Position of a finger's tip centre in the hand frame."""
 
     cosine: float  # cosine of the joint angle
     sine: float
     x: float  # [m]
     y: float
-    x_q: float  # derivative with respect to the joint angle [m/rad]
+    x_q: float  # derivative of ``x`` with respect to the joint angle [m/rad]
     y_q: float
 
 
@@ -168,7 +168,7 @@ class Gears(Record):
 
     deflection: float  # bristle deflection at the start of the step [rad]
     level: float  # friction level at the start of the step [N·m]
-    limited_deflection: float  # deflection in the last evaluation, after it was limited [rad]
+    limited_deflection: float  # limited deflection in the last evaluation [rad]
     friction: float  # friction level in the last evaluation [N·m]
     stiffness: float  # bristle stiffness in the step matrix [N·m/rad]
 
@@ -176,7 +176,8 @@ class Gears(Record):
 class TipContact(Record):
     """Contact of one tip with the object or the other tip.
 
-    The rows are d, θ, d_t. The columns are q, x, y, φ, or q1, q2 for a tip-to-tip contact.
+    The rows of the matrices are d, θ and d_t. The columns are q, x, y and φ. For a tip-to-tip
+    contact, the columns are q1 and q2.
     """
 
     d: float  # normal displacement, negative for a gap [m]
@@ -184,49 +185,49 @@ class TipContact(Record):
     sine: float  # sin θ
     cosine: float
     tangent: float  # tan θ, or 0 for bristles and beyond the soft hemisphere
-    gain: float  # force divided by the force on a plane; includes w(θ) and face curvature
+    gain: float  # ratio of the force to the force on a plane, due to w(θ) and curvature
     curvature: float  # curvature of the touched surface [1/m]
     travel: float  # largest possible increase in d during this step [m]
     rate_d: float  # [m/s]
     rate_theta: float  # [rad/s]
     slip_rate: float  # tangential velocity of the surface relative to the tip [m/s]
-    shear: float  # d_t after it was limited [m]
-    shear_variance: float  # shear variance of the layers [m²]
+    shear: float  # d_t, limited by friction [m]
+    shear_variance: float  # variance of the layer shears [m²]
     shear_rate: float  # rate of d_t without slip [m/s]
-    force: float  # total force on the tip base, equal to the sum over a pressure grid [N]
+    force: float  # force on the tip base, equal to the sum over a pressure grid [N]
     energy: float  # elastic energy [J]
     normal: float  # N [N]
     tangential: float  # T [N]
     rim: float  # rim penetration depth, or 0 without contact [m]
-    rim_energy: float  # rim energy [J], which is valid only if ``rim`` is above 0
+    rim_energy: float  # rim energy [J], valid only if ``rim`` is above 0
     rim_d: float  # derivatives of the rim energy with respect to d [N] and θ [N·m]
     rim_theta: float
     rows: Annotated[FloatArray, 3, 4]  # derivatives of d, θ and d_t with respect to the coordinates
     stiffness: FloatTriple  # stiffness along each row
     damping: FloatTriple
-    along: FloatTriple  # forces along the rows, including damping
+    along: FloatTriple  # forces along d, θ and d_t, including damping
     forces: Annotated[FloatArray, 4]  # generalised forces on the coordinates
 
 
 class Stage(Record):
-    """All contacts for one of the two evaluations in a step."""
+    """All contacts in one of the two evaluations of a step."""
 
     on_object: Annotated[Records[TipContact], 2]
     on_tip: Annotated[Records[TipContact], 2]
-    extra_rate: Shears  # extra shear rates without slip [m/s]
+    extra_rate: Shears  # rates of the extra shears without slip [m/s]
 
 
 class ExtraRow(Record):
-    """Matrix row over all coordinates, for a contact that occurs only in some scenes."""
+    """Row of the step matrix for a contact that occurs only in some scenes."""
 
     row: FloatFive
     stiffness: float
     damping: float
-    shear: int  # index of the row's extra shear plus 1, or 0 if the row has none
+    shear: int  # 1 + index of the row's extra shear, or 0 without an extra shear
 
 
 class Factors(Record):
-    """Step matrix over all coordinates, factorised as L D Lᵀ."""
+    """Factorisation L D Lᵀ of the step matrix."""
 
     inverse: FloatFive  # inverse pivots
     lower: Annotated[FloatArray, 5, 5]
@@ -238,13 +239,13 @@ class Plant(Record):
     parameters: Parameters
     goals: Goals
     state: Motion
-    # Current contact of each tip: the stronger contact if a tip has two.
+    # Current contact of each tip, or the stronger contact if a tip has two.
     sensed_contact: Annotated[Records[TipContact], 2]
     on_other_tip: Flags  # 1 if the contact is with the other tip
     step_count: int  # number of completed sub-steps
     sample_count: int  # number of samples taken
     energy: float  # kinetic, elastic and gravitational energy [J]
-    energy_limit: float  # maximum energy, given the work done on the hand [J]
+    energy_limit: float  # upper limit of the energy, including the work of motors and loads [J]
     limited_step_count: int  # number of sub-steps that the energy guard has limited
     last_state: Motion  # state before the step
     stage_state: Motion  # state of the second stage
@@ -253,11 +254,11 @@ class Plant(Record):
     stages: Annotated[Records[Stage], 2]
     fingers: Annotated[Records[Finger], 2]
     gears: Annotated[Records[Gears], 2]
-    forces: FloatFive  # generalised forces, excluding the motors
-    drag: FloatFive  # ratio of friction to velocity
+    forces: FloatFive  # generalised forces without the motor torques
+    drag: FloatFive  # ratio of viscous friction to velocity
     external: Pair  # contact torque on each joint in the last evaluation [N·m]
     load: FloatFive  # right-hand side of the step equations
-    motor_by_q: Pair  # motor torque derivatives for the matrix
+    motor_by_q: Pair  # derivatives of the motor torques, for the step matrix
     motor_by_rate: Pair
     layers: Annotated[FloatArray, 2, LAYERS]  # layer shears of each tip [m]
     last_layers: Annotated[FloatArray, 2, LAYERS]  # layer shears before the step [m]

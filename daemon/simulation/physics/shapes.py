@@ -1,4 +1,4 @@
-"""Define the shapes of the simulated object: outline, inertia and radius for table friction."""
+"""Define the shapes of the simulated object."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shape:
-    """Outline of an object with its centre of mass at the origin. Lengths are in m."""
+    """Outline of an object whose centre of mass is at the origin. Lengths are in m."""
 
     kind: int  # shape constant from plant_state
-    corners: FloatArray  # counter-clockwise [n, 2]; for a disc, corners of the circumscribed square
+    corners: FloatArray  # counter-clockwise [n, 2]; corners of the bounding square for a disc
     roundness: float  # radius of a disc, or 0 for other shapes
     gyration: float  # radius of gyration
-    mean_radius: float  # mean distance of all points from the centre, used for the spin friction
+    mean_radius: float  # mean distance of the shape's points from the centre
 
     @property
     def extent(self) -> float:
@@ -50,7 +50,7 @@ class Shape:
         return float(0.5 * (max(across) - min(across)))
 
     def edges(self) -> FloatArray:
-        """Return the edges as float64 [n, 5]: start x, y, outward normal x, y, length."""
+        """Return the edges [n, 5] with the columns start x, y, outward normal x, y, and length."""
         edge = np.roll(self.corners, -1, axis=0) - self.corners
         length = np.hypot(*edge.T)
         normal = np.stack((edge[:, 1], -edge[:, 0]), axis=1) / length[:, None]
@@ -58,7 +58,7 @@ class Shape:
 
 
 def shape_of(settings: Settings) -> Shape:
-    """Create the configured object with the function registered in `daemon.backends`."""
+    """Create the configured shape with the function that `daemon.backends` registers."""
     simulation = settings.simulation
     found = backend("shapes", simulation.object_shape)
     shape: Shape = found.load()(simulation, *found.options(settings.plugins.tables))
@@ -66,11 +66,11 @@ def shape_of(settings: Settings) -> Shape:
 
 
 def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
-    """Create a convex polygon with 3 to 8 ``corners`` [n, 2] in m, counter-clockwise.
+    """Create a convex polygon from 3 to 8 ``corners`` [n, 2] in m, in counter-clockwise order.
 
-    The corners may refer to any origin; they are shifted so that the centre of mass is at 0. The
-    area integrals are closed-form sums over the triangles between the centre and each edge. Raises
-    ValueError if the outline is not a convex polygon with 3 to 8 corners.
+    The function shifts the corners so that the centre of mass is at the origin. The area integrals
+    are closed-form sums over the triangles that the edges form with the centre. Raises ValueError
+    if the outline is not a convex polygon with 3 to 8 corners.
     """
     points = np.array(corners, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or not 3 <= len(points) <= CORNERS:
@@ -89,7 +89,7 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
         3.0 * areas.sum()
     )
     length = np.hypot(*along.T)
-    height = _cross(points, along) / length  # inward distance of the centre from each edge
+    height = _cross(points, along) / length  # distance of the centre from each edge
     begin = (points * along).sum(axis=1) / length / height
     end = begin + length / height
     area = (0.5 * height**2 * (end - begin)).sum()
@@ -104,9 +104,9 @@ def rectangle(simulation: SimulationSettings) -> Shape:
 
 
 def wedge(simulation: SimulationSettings) -> Shape:
-    """Create a wedge with faces tilted by half the taper and the given width at mid-height.
+    """Create a wedge whose faces are tilted by half the configured taper.
 
-    Raises ValueError if the faces meet; `profile.validation` checks profiles for this error.
+    The width is measured at mid-height. Raises ValueError if the faces meet.
     """
     leaning = 0.5 * simulation.object_height * math.tan(0.5 * simulation.object_taper)
     width = simulation.object_width
@@ -127,7 +127,7 @@ def disc(simulation: SimulationSettings) -> Shape:
 
 
 def nothing(simulation: SimulationSettings) -> Shape:
-    """Create the placeholder for a scene without an object; it has the outline of a rectangle."""
+    """Create the rectangular placeholder for a scene without an object."""
     return polygon(_trapezoid(simulation, 0.0), NO_OBJECT)
 
 

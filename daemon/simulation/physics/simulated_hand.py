@@ -1,8 +1,8 @@
-"""Simulate the hand: servo commands, state and tip contacts.
+"""Simulate the hand's motion and tip contacts in response to servo commands.
 
 Only :meth:`SimulatedHand.advance` advances time. The state depends only on the settings, the
 commands and their times, so runs are reproducible bit for bit. Physical constants that are not
-settings are plausible values chosen for this project, not taken from a publication.
+settings have plausible values without a published source.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ _MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
 STANDARD_GRAVITY = 9.80665  # m/s²
 STEP_MAX = 0.25e-3  # s
 STEP_MIN = 0.05e-3  # s
-PHASE_MAX = 0.25  # maximum phase angle of the fastest oscillation in one sub-step [rad]
+PHASE_MAX = 0.25  # maximum phase advance of the fastest oscillation per sub-step [rad]
 ELECTRIC_TIME = 1e-3  # lag of the servo current behind its reference [s]
-FULL_EFFORT_ERROR = 0.27  # position error at which the loop commands the stall current [rad]
+FULL_EFFORT_ERROR = 0.27  # error at which the position loop commands the stall current [rad]
 TABLE_SPEED = 0.0005  # speed below which table friction is viscous [m/s]
 STOP_CLEARANCE = 0.05  # distance from the commanded range to the mechanical end stops [rad]
 STOP_STIFFNESS = 500.0  # N·m/rad
@@ -69,12 +69,12 @@ def geometry_of(settings: Settings) -> HandGeometry:
 
 
 def stiff_step(settings: Settings, table: ContactTable) -> float:
-    """Return a sub-step [s] that resolves an object's fastest oscillation on compressed tips."""
+    """Return a sub-step [s] that resolves the fastest oscillation on compressed tips."""
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius, table.header.deepest)
     c = table(d, 0.0)
-    # The normal stiffness ∂F/∂d and the shear stiffness 2F/d are similar. The result is doubled
-    # because there are two tips.
+    # Use the larger of the normal stiffness ∂F/∂d and the shear stiffness 2F/d. The factor 2
+    # accounts for the two tips.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
     stiffness *= 1.0 + sum(simulation.tip_relaxation)
     shape = shape_of(settings)
@@ -84,8 +84,7 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
         turning = (shape.half_width / shape.gyration) ** 2
         fastest = math.sqrt(stiffness / simulation.object_mass * max(1.0, turning))
     step = min(max(PHASE_MAX / fastest, STEP_MIN), STEP_MAX)
-    # With an integer number of sub-steps per millisecond, ticks and frames stay aligned with
-    # sub-steps.
+    # An integer number of sub-steps per millisecond keeps ticks and frames aligned with sub-steps.
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
 
@@ -133,7 +132,7 @@ def _object(p: Parameters, settings: Settings) -> None:
     for k, values in enumerate(shape.edges().tolist()):
         edge = p.outline[k]
         edge.x, edge.y, edge.normal_x, edge.normal_y, edge.length = values
-    # κ for a face with this radius; see tip.py.
+    # Factor κ for a face of this radius; see tip.py.
     curved = shape.roundness
     p.factor = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
     if settings.tip.physics == "solid":
@@ -173,7 +172,7 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # Make the joint and its position loop critically damped.
+    # This gain makes the position loop critically damped.
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
@@ -196,19 +195,19 @@ def _script(p: Parameters, settings: Settings) -> None:
 
 
 class SimulatedHand:
-    """Planar hand: two fingers with joints and soft tips, and an object between the fingers.
+    """Planar hand that consists of two fingers with soft tips and an object between the fingers.
 
     The tips touch the object, or each other if there is no object between them. If a tip has two
     contacts, its sensor measures the stronger contact. The object may lie on the palm.
 
     ``settings.scene.fingers`` selects the tips. If only one finger is selected, the object is fixed
-    to the test bench, as in a compression test. Without servos (``settings.servos.backend`` is
-    ``none``), the joints stay at ``settings.hand.open_angle``. If there are no servos and
-    ``simulation.compression_speed`` is above 0, the object moves back and forth between both tips
-    and compresses each tip by 0.4 radii.
+    to the test bench, as in a compression test. If ``settings.servos.backend`` is ``none``, the
+    joints stay at ``settings.hand.open_angle``. With this backend, a
+    ``simulation.compression_speed`` above 0 moves the object back and forth between the tips. The
+    object compresses each tip by 0.4 tip radii.
 
-    The array attributes are views of the state with shape (2,), left finger first. The views are
-    valid until the next call to ``advance``.
+    The array attributes are views of the state. Arrays of shape (2,) contain the value of the left
+    finger first. The views are valid until the next call to ``advance``.
     """
 
     def __init__(
@@ -253,7 +252,7 @@ class SimulatedHand:
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         goals.stiffness[:] = goals.duty[:] = 1.0
-        # The buffer holds all samples that a sensor may still deliver.
+        # The buffer stores all samples that a sensor may still need.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLE_COUNT
         self._ring = np.zeros(stored, Sample.dtype)
@@ -270,18 +269,18 @@ class SimulatedHand:
         felt: Any = self.plant.sensed_contact
         self.d = felt.array["d"]  # normal displacement, negative for a gap [m]
         self.theta = felt.array["theta"]  # rad
-        self.force = felt.array["force"]  # F on the tip base [N]
+        self.force = felt.array["force"]  # force F on the tip base [N]
         self.normal = felt.array["normal"]  # N [N]
         self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
-        # Penetration depth of the backing plate's rim. If the rim penetrates the object, the tip is
-        # compressed beyond its limit.
+        # Depth to which the backing plate's rim penetrates the object. A depth above 0 means that
+        # the tip is compressed beyond its limit.
         self.rim = felt.array["rim"]  # m
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
         self.torque_on = goals.torque_on  # 1 if the servo's torque is on
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
-        # Faults of each finger's tactile sensor and servo, left finger first. Measurement faults do
-        # not change the physics.
+        # Measurement faults of the left and the right finger. These faults do not change the
+        # physics.
         self.measurement_faults = MeasurementFaults(), MeasurementFaults()
         self.servo_heat = ServoHeat.of(settings), ServoHeat.of(settings)
         self._run(0)
@@ -309,11 +308,11 @@ class SimulatedHand:
             remaining -= count
 
     def refresh(self) -> None:
-        """Evaluate the contacts after an external change to the state, without advancing time."""
+        """Recompute the contacts for a changed state, without advancing time."""
         self._run(0)
 
     def place_object(self) -> None:
-        """Move the object back to its start pose, at rest and without load."""
+        """Move the object back to its start pose, stop it, and remove its load."""
         self.object_pose[:], self.object_velocity[:] = self._first_pose, 0.0
         self.load()
         self.refresh()
@@ -323,8 +322,8 @@ class SimulatedHand:
     ) -> None:
         """Set a servo's mode, torque, goal angle [rad] and goal current [A].
 
-        The mode numbers are Dynamixel's: 0 current, 3 position, 5 current-based position. Raises
-        ValueError for another mode or a non-finite goal.
+        The Dynamixel mode numbers are 0 (current), 3 (position) and 5 (current-based position).
+        Raises ValueError for another mode or a non-finite goal.
         """
         if mode not in _MODES:
             raise ValueError(f"operating mode {mode} is not simulated; expected one of {_MODES}")
@@ -336,7 +335,7 @@ class SimulatedHand:
         self._goal_current[joint] = goal_current
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
-        """Set a servo's position gains and motor voltage limit (fraction of supply)."""
+        """Set a servo's position gains and its voltage limit (fraction of the supply voltage)."""
         goals = self.plant.goals
         goals.stiffness[joint], goals.damping[joint] = stiffness, damping
         goals.duty[joint] = duty
@@ -357,14 +356,14 @@ class SimulatedHand:
     def load(self, push: float = 0.0, twist: float = 0.0) -> None:
         """Apply a permanent ``push`` [N] and ``twist`` [N·m] to the object; zeros remove the load.
 
-        The push acts along the faces and away from the palm. The direction of the push stays the
-        same when the object rotates.
+        The push acts along the faces and away from the palm. The direction of the push does not
+        change when the object rotates.
         """
         angle = self.object_pose.item(2)
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
 
     def apply_fault(self, event: FaultEvent) -> bool:
-        """Apply a change of an object load or measurement fault; return False for other faults."""
+        """Change an object load or a measurement fault; return False for other faults."""
         kind, part = event.kind, event.part
         if part == OBJECT:
             self.load(**{kind: event.value})

@@ -1,9 +1,9 @@
 """Solve the linear equations of a step by L D Lᵀ factorisation.
 
-``g`` is the product γh from `plant`.
+``g`` is the product γh that `plant` defines.
 
-The matrix always includes the tip contacts with the object. Extra rows are added for the object on
-the palm and for tip-to-tip contact.
+The matrix always includes the contacts between the tips and the object. Palm contacts and
+tip-to-tip contacts add extra rows.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 
 @inner_kernel
 def joint_pivot(plant: Plant, joint: int, g: float) -> float:
-    """Return a joint's diagonal entry, which includes inertia, friction, end stop and motor."""
+    """Return a joint's diagonal entry in the step matrix."""
     motor = plant.motor_by_rate[joint] + g * plant.motor_by_q[joint]
     pivot: float = plant.parameters.joint_inertia + g * (
         plant.drag[joint] + g * (joint_stiffness(plant, joint) + motor)
@@ -35,7 +35,7 @@ def joint_pivot(plant: Plant, joint: int, g: float) -> float:
 
 @inner_kernel
 def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
-    """Return the product of a tip's row ``r`` and the coordinate ``rates``."""
+    """Return the scalar product of a tip's row ``r`` and the ``rates`` of the coordinates."""
     rate: float = (
         tip.rows[r, 0] * rates[finger]
         + tip.rows[r, 1] * rates[2]
@@ -47,7 +47,7 @@ def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract g K r from the load, with the first-stage stiffness K and the rates r in ``k``."""
+    """Subtract g K r from the load; K is the first-stage stiffness, r the rates in ``k``."""
     for finger in range(2):
         tip = plant.stages[0].on_object[finger]
         rows, stiffness = tip.rows, tip.stiffness
@@ -62,7 +62,7 @@ def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def factorise(plant: Plant, g: float) -> None:
-    """Factorise the first stage's M + gD + g²K over all five coordinates."""
+    """Factorise the first-stage matrix M + gD + g²K of the five coordinates."""
     p = plant.parameters
     full = plant.factors.lower
     for i in range(5):
@@ -112,7 +112,7 @@ def factorise(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def solve(plant: Plant, k: Motion) -> None:
-    """Solve for the load and set the velocities in ``k``; bodies that are held fixed get 0."""
+    """Solve the step equations for the velocities in ``k``, which are 0 for fixed bodies."""
     full, out = plant.factors.lower, k.velocity
     for i in range(5):
         value = plant.load[i]
@@ -128,7 +128,7 @@ def solve(plant: Plant, k: Motion) -> None:
 
 @inner_kernel
 def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
-    """Return the product of an extra row and the coordinate ``rates``."""
+    """Return the scalar product of an extra row and the ``rates`` of the coordinates."""
     rate: float = 0.0
     for j in range(5):
         rate += extra.row[j] * rates[j]
@@ -151,7 +151,7 @@ def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def add_extra_shears(plant: Plant, k: Motion, g: float) -> None:
-    """Add the effect of the solved velocities to the extra shears in ``k``."""
+    """Add the contribution of the solved velocities to the extra shear rates in ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.shear > 0 and extra.stiffness != 0.0:

@@ -1,57 +1,58 @@
-"""Simulate a soft tip: its contact law and its contact with the object.
+"""Compute the contact forces of a soft tip on the object.
 
-All elastic forces are the gradient of a single energy, so the contact can't create energy:
+All elastic forces are derived from a single energy U, so a contact can't create energy:
 
     U = w(θ) κ [ U₀(d, θ) + F(d, θ) (sin θ d_t + s cos θ d_t²/d) ] + U_rim(d, θ)
 
-U₀ and F are the energy and the force on a plane face, from the contact table. With a constant
-modulus E, F = πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1, the second term then becomes πE(d²
-d_t tan θ + d d_t²), the tangential energy of the parallel-distributed model. For other materials, F
-contains the effective modulus of the material. w(θ) is 1 on the soft hemisphere and fades to 0
-towards the side of the finger. U_rim is a stiff spring between the rim of the backing plate and the
-object. A plane reaches the rim at d = a(1 − |sin θ|), which is the end of the soft range. Beyond d
-= a(1 − √(sin² θ + 0.03²)), which is slightly smaller, U₀ is continued linearly in d, and F is
-constant.
+The contact table contains the energy U₀ and the force F on a plane face. For a constant modulus E,
+F = πEd²/cos θ. For other materials, F contains the effective modulus of the material. The factor s
+is ``tip_shear_stiffness``. For constant E and s = 1, the second term is πE(d² d_t tan θ + d d_t²).
+This term is the tangential energy of the parallel-distributed model. The factor w(θ) is 1 on the
+soft hemisphere and fades to 0 towards the side of the finger. U_rim is the energy of a stiff spring
+between the rim of the backing plate and the object. A plane reaches the rim at d = a(1 − |sin θ|),
+which is the end of the soft range. Slightly before the rim, beyond d = a(1 − √(sin² θ + 0.03²)), U₀
+is linear in d, and F is constant.
 
-The formulas above are the contact law for ``simulation.tip_law = "springs"``. With ``"bristles"``,
-the term sin θ d_t is omitted. The tangential force T = 2 s F cos θ d_t/d (2πE s d d_t for a
-constant E) then comes from a bristle at the centre of the contact. Tilt and compression do not bend
-the bristle, and d_t follows only the sliding motion at the centre of the contact. The upright
-force, the force at d_t = 0 and the sensor readings are the same for both laws. A controller that
-compensates for the springs' tangential terms can therefore be tested with ``"bristles"``, a tip
-without these terms.
+These formulas are the contact law for ``simulation.tip_law = "springs"``. The law ``"bristles"``
+omits the term sin θ d_t. The tangential force of the bristle law is T = 2 s F cos θ d_t/d, or 2πE s
+d d_t for a constant E. A bristle at the centre of the contact exerts the tangential force. Tilt and
+compression do not bend the bristle. The bristle's deflection d_t changes only when the surfaces
+slide at the centre of the contact. The upright force, the force at d_t = 0 and the sensor readings
+are the same for both laws. A controller that compensates for the tangential terms of springs can be
+tested on a ``"bristles"`` tip, which lacks these terms.
 
 The tip touches the nearest point of the object. On a face, the contact direction is the face
-normal. At a corner, the contact direction is the line to the corner, as for a plane normal to that
-line. On a disc, the contact direction is the line to the disc centre. A disc's axis is normal to
-the hand plane, so the disc's face is curved about one axis only, with radius R. To leading order in
-d, the spring model's contact with a disc differs in two ways from its contact with the tangent
-plane. First, the footprint is narrower along the tilt by the factor κ² = R/(R + a), because the
-curvatures add to 1/a + 1/R. Second, the force and energy are κ times the values for the plane at
-any θ. For a constant modulus, a = 20 mm and d up to 8 mm, integrals over the springs agree with
-both factors to within 1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and to within 3 % and 9
-% for R = 10 mm. The sensor frame is computed from the springs (`sensor.sensor_model`), so the sum
-of its cells differs from the force by the same amount. The force of a solid tip is proportional to
-d^(3/2) and √κ, as in Hertz's theory for a sphere on a cylinder in the limit of small d. The frame
-of a solid tip on a disc is the frame on a plane multiplied by √κ.
+normal. At a corner, the contact direction is the line to the corner. The corner acts like a plane
+that is normal to the contact direction. On a disc, the contact direction is the line to the disc
+centre. A disc is a cylinder of radius R whose axis is normal to the hand plane. To leading order in
+d, a contact with a disc differs in two ways from a contact with its tangent plane. First, the
+curvatures add up to 1/a + 1/R, so the footprint is narrower along the tilt by the factor κ = √(R/(R
++ a)). Second, at any θ, the force and energy are κ times those on the plane. Numerical integrals
+over the springs confirm the factors for a constant modulus, a = 20 mm and d up to 8 mm. For R = 20
+and 40 mm, the error is at most 1.6 % upright and 4.5 % at 30°. For R = 10 mm, the error is at most
+3 % upright and 9 % at 30°. The sensor frame is computed directly from the springs
+(`sensor.sensor_model`). Therefore, the sum of its cells differs from the force by the error of the
+factors. For small d, the force of a solid tip on a disc is proportional to √κ d^(3/2), as in
+Hertz's theory for a sphere on a cylinder. A solid tip's frame on a disc is its frame on a plane
+multiplied by √κ.
 
-Coulomb friction limits d_t to the range between the two shears at which |T| = μN. In the model, the
-ratio |T|/N may be unable to reach μ: with a constant E and s = 1, the maximum ratio at θ = 0 is 1.
-If the ratio cannot reach μ, the tip slips at the maximum ratio. Damping is viscous and proportional
-to the stiffness of the soft part, so it increases as the contact grows.
+Coulomb friction limits d_t to the range between the two shears at which |T| = μN. The ratio |T|/N
+has a maximum, which is 1 for constant E, s = 1 and θ = 0. If the maximum of |T|/N is below μ, the
+tip slips at this maximum. Damping is viscous and proportional to the stiffness of the soft part, so
+it increases as the contact grows.
 
-The shear of a stuck tip may relax by creep and by micro-slip. Both effects are off by default.
-Without creep and micro-slip, a tip sticks or slips as a whole and has no memory. Micro-slip occurs
-because each spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed
-by w = ℓ − h, exerts the pressure Ew/ℓ. When the face has moved by u, the spring has the shear
-traction Eu/ℓ. The spring slips if u > μw. All layers w = 0 … d are equally stiff, because r dr = −ℓ
-dℓ. Starting from zero shear, integration gives
+Creep and micro-slip, which are off by default, relax the shear of a stuck tip. Without creep and
+micro-slip, a tip sticks or slips as a whole and has no memory. Micro-slip occurs because each
+spring has its own Coulomb friction. A spring of length ℓ(r) = √(a² − r²) that is compressed by w
+exerts the pressure Ew/ℓ. When the face has moved sideways by u, the spring has the shear traction
+Eu/ℓ. The spring slips if u > μw. All layers w = 0 … d are equally stiff, because r dr = −ℓ dℓ. For
+a motion that starts at zero shear, integration gives
 
     T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
 
-The whole tip slips at u = μd. The layers form an Iwan model with uniformly distributed limits. The
-layers scale with the footprint. The mean of the layer shears is the tip's d_t, and the variance of
-the layer shears adds to d_t² in the tip energy.
+The whole tip slips at u = μd. The layers form an Iwan model with uniformly distributed slip limits.
+The layers scale with the footprint. The mean of the layer shears is the tip's d_t. In the tip
+energy, the variance of the layer shears is added to d_t².
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ _FADE_TO = 1.35  # angle at which w(θ) becomes 0 [rad]
 _CORNER_DISTANCE_MIN = 1e-3
 _FRICTION_TOLERANCE = 5e-13  # relative tolerance for the friction limit
 _RELAXATION_MIN = 0.02  # minimum relaxation factor, for tips with delayed recovery
-# Distance from the end of the soft range to the rim at θ = 0, as a fraction of the radius.
+# Distance from the end of the soft range to the rim at θ = 0, as a fraction of the tip radius.
 _RIM_ROUNDING = 0.03
 
 
@@ -98,9 +99,11 @@ def fade(theta: float) -> tuple[float, float]:
 
 @inner_kernel
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
-    """Return the maximum ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of the maximum ratio.
+    """Return the largest shear ζ ≥ 0 at which the tip does not slip.
 
-    In this function, ζ is measured from the shear at which T = 0.
+    The tip sticks while t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²). If the tip sticks at every ζ, the function
+    returns the ζ with the largest ratio |T|/N. The shear ζ is measured from the shear at which T =
+    0.
     """
     if friction <= 0.0 or n0 <= 0.0:
         return 0.0
@@ -135,8 +138,9 @@ def clear_contact(tip: TipContact) -> None:
 def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) -> None:
     """Compute the forces, stiffness and damping of ``tip`` along d, θ and d_t.
 
-    Let ζ be the shear d_t, v its variance, γ = ``gain`` = w(θ) κ, ρ = ``ratio`` = s cos θ/d, and χ
-    = ``shear_coupling`` (1 for springs, 0 for bristles). Within the soft range:
+    ζ is the shear d_t, and v is its variance. The factors are γ = ``gain`` = w(θ) κ, ρ = ``ratio``
+    = s cos θ/d, and χ = ``shear_coupling``, which is 1 for springs and 0 for bristles. Within the
+    soft range:
 
         T = t0 + t1 ζ             t0 = χ γ F sin θ,  t1 = 2 γ F ρ
         N = n0 + n1 ζ + n2 ζ²     n0 = γ ∂U₀/∂d − χ t0 tan θ + ∂U_rim/∂d
@@ -145,9 +149,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         |T| ≤ μ N limits ζ on both sides of ``neutral`` = −χ d tan θ/2s, where T = 0
         losses: loss · stiffness · rate    stiffness = γ/cos θ (∂F/∂d, 2d/3 ∂U₀/∂d) and t1
 
-    ``factor`` is κ. The function reads d, θ, travel, rates, slip rate, shear, shear variance and
-    rim from ``tip``. All other fields of ``tip`` are set, except for the rows and the generalised
-    forces.
+    ``factor`` is κ. ``tip`` must contain d, θ, travel, rates, slip rate, shear, shear variance and
+    rim. The function sets all other fields except for the rows and the generalised forces.
     """
     d = tip.d
     sine = tip.sine
@@ -180,8 +183,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         ahead = stiffness_ahead(table, 2.0 * math.pi * p.modulus * gain, tip.travel)
         ahead *= inverse_cosine
     if gain > 0.0 and d > D_MIN:
-        # d_soft is d limited to the soft range. d_soft_d and d_soft_theta are the derivatives of
-        # d_soft.
+        # d_soft is the part of d within the soft range. The derivatives of d_soft are d_soft_d and
+        # d_soft_theta.
         radius = p.radius
         d_soft = d
         d_soft_d = 1.0
@@ -226,7 +229,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # shear at which T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # Two comparisons show whether the contact is far from slipping, as it is in most steps.
+        # Two comparisons detect contacts that are far from slipping, as in most steps.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction
@@ -241,7 +244,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
             tangential = t0 + t1 * shear
         normal += n2 * shear_variance
 
-        # Compute the second term of U and its derivatives.
+        # Compute the second term of U and the derivatives of this term.
         bent = firm * sine * inverse_d
         sheared = coupled * shear + ratio * shear * shear + ratio * shear_variance
         by_soft = force_d * sheared - force * ratio * inverse_d * shear * shear
@@ -260,8 +263,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         shear = 0.0
 
     # Damping must not make a separating tip pull the object. Shear damping must not exceed the
-    # friction force. A sticking tip does not slide, apart from the term tan θ ḋ of the spring
-    # model, which keeps the virtual work consistent.
+    # friction force. The rate of d_t contains the spring model's term tan θ ḋ, which keeps the
+    # virtual work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
     loss = p.loss
@@ -306,8 +309,8 @@ def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: flo
 def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
     """Add the rim stiffness to a tip whose rim may touch the object in this step.
 
-    The rim depth's row is at most the sum of the d row and a times the θ row, so twice each
-    stiffness is an upper bound.
+    The row of the rim depth is at most the d row plus a times the θ row. Therefore, doubling the
+    stiffness along each row gives an upper bound.
     """
     hard = 2.0 * p.rim_stiffness
     tip.stiffness[ALONG_D] += hard
@@ -341,8 +344,8 @@ def touch_object(
     tip.sine = sine
     tip.cosine = cosine
 
-    # Derivatives with respect to (q, x, y, φ). The contact point is at ``distance`` · m from the
-    # tip centre.
+    # Derivatives with respect to (q, x, y, φ). The vector from the tip centre to the contact point
+    # is ``distance`` · m.
     px = rx + distance * mx
     py = ry + distance * my
     rotation_m = my * px - mx * py
@@ -354,8 +357,8 @@ def touch_object(
     y_rate = now.velocity[3]
     rotation_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
-    # The integrator matrix uses the stiffness at the end of the step and therefore remains accurate
-    # during an impact. Damping uses the stiffness at the present position.
+    # The step matrix uses the stiffness at the end of the step, so it remains accurate during an
+    # impact. Damping uses the stiffness at the present position.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
         tip.gain = fade(theta)[0] * p.factor * plant.relaxation_factor[finger]
@@ -366,8 +369,8 @@ def touch_object(
     theta_y = 0.0
     theta_rotation = 1.0
     if curved >= 0.0:
-        # The vector m points to the centre of curvature, which is fixed to the object: either a
-        # corner or the centre of a disc.
+        # The vector m points to a fixed point of the object, which is either a corner or the centre
+        # of a disc.
         inverse = 1.0 / max(distance + curved, _CORNER_DISTANCE_MIN * radius)
         theta_q -= v_t * inverse
         theta_x = -my * inverse
@@ -385,7 +388,7 @@ def touch_object(
     tip.rate_theta = (
         theta_q * q_rate + theta_x * x_rate + theta_y * y_rate + theta_rotation * rotation_rate
     )
-    # Velocity of the object relative to the tip at the contact, along t.
+    # Sliding velocity of the object relative to the tip, along t.
     t_q = side * distance - v_t
     tip.slip_rate = t_q * q_rate - my * x_rate + mx * y_rate + rotation_t * rotation_rate
     tip.shear = now.shear[finger]
@@ -412,7 +415,7 @@ def touch_object(
 
 @inner_kernel
 def relax_shears(plant: Plant) -> None:
-    """Relax the shears after a sub-step, using the contacts from the start of that sub-step."""
+    """Relax the shears after a sub-step, based on the contacts at the start of the sub-step."""
     p, state = plant.parameters, plant.state
     for finger in range(2):
         tip, layers = plant.stages[0].on_object[finger], plant.layers[finger]
@@ -447,11 +450,11 @@ def relax_shears(plant: Plant) -> None:
 
 @inner_kernel
 def relax_tips(plant: Plant) -> None:
-    """Advance each tip's relaxation on the object by one sub-step and set its factor ρ.
+    """Advance the relaxation of each tip by one sub-step, and set the tip's force factor ρ.
 
-    ρ = 1 + Σ r_i (1 − h_i/F∞) with ḣ_i = (F∞ − h_i)/τ_i scales all tip forces, where F∞ is the
-    long-term force. A tip that is loaded suddenly is initially stiffer by Σ r_i. A tip that is
-    unloaded suddenly recovers with a delay.
+    All tip forces are multiplied by ρ = 1 + Σ r_i (1 − h_i/F∞), where F∞ is the long-term force.
+    The states h_i satisfy ḣ_i = (F∞ − h_i)/τ_i. A suddenly loaded tip is initially stiffer by the
+    factor 1 + Σ r_i. A suddenly unloaded tip recovers with a delay.
     """
     p = plant.parameters
     for finger in range(2):

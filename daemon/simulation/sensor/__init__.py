@@ -1,1 +1,1 @@
-"""Simulate the pressure sensor: readings, imperfections and frame arrival times."""
+"""Simulate the readings, imperfections and frame delays of the pressure sensor."""

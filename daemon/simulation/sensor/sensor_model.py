@@ -1,15 +1,15 @@
-"""Model the simulated pressure sensor: convert a contact to the counts that a board sends.
+"""Convert a simulated contact to the counts that a sensor board sends.
 
-`simulated_tactile` handles delayed and lost frames. The imperfections follow standard models, which
-the ``velostat`` and ``capacitive`` profiles use.
+`simulated_tactile` handles delayed and lost frames. The sensor imperfections follow standard
+models.
 
-`sensing.pressure_grid` computes the pressure of a plane face; this module computes the pressure of
-a cylindrical face, as on a disc. Both modules use the same spring model: above each point of the
-base, the face compresses a vertical spring whose length is the height of the hemisphere. An
-estimator that assumes a plane face interprets the narrower footprint as a smaller d: the estimated
-d is 0.72 of the true d for R = a, and 0.83 for R = 2a. The estimated θ is 1 % to 12 % too small
-(the error increases with d), and the estimated gain is above 1, which compensates for the
-underestimated force.
+This module computes the pressure of a cylindrical face, such as that of a disc.
+`sensing.pressure_grid` computes the pressure of a plane face. Both modules model the tip as
+vertical springs that the face compresses. The length of a spring is the height of the hemisphere
+above the foot of the spring. An estimator that assumes a plane face underestimates d on a disc,
+because the footprint is narrower. The estimated d is 0.72 times the true d for a disc radius R = a,
+and 0.83 times for R = 2a. The estimated θ is 1 % to 12 % too small, and this error increases with
+d. The estimated gain is above 1 and compensates for the underestimated force.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _FINENESS = 60.0  # minimum number of sample points per tip radius
 class SensorModel:
     """Pressure sensor under one simulated tip, with the board's range and imperfections.
 
-    ``gain`` is the ratio of the reading to the pressure according to the material law. ``dead``
+    ``gain`` is the ratio of the reading to the pressure that the material law predicts. ``dead``
     lists the cells (row, col) that always read 0. Two models that are created and called with the
     same arguments produce the same frames.
     """
@@ -120,9 +120,9 @@ class SensorModel:
     ) -> None:
         """Write the counts of the next frame to ``out``, a contiguous uint16 array [rows, cols].
 
-        ``d`` [m] ≤ 0 means no contact. Tilts [rad] are as in :meth:`SensorGrid.pressure`. ``t`` [s]
-        is the frame time, which is used for creep, response and drift. ``curvature`` is as in
-        :meth:`press`.
+        If ``d`` [m] is 0 or negative, there is no contact. The tilts [rad] are defined in
+        :meth:`SensorGrid.pressure`. ``t`` [s] is the frame time, which determines creep, response
+        and drift. ``curvature`` is defined in :meth:`press`.
         """
         self.press(d, tilt_x, tilt_y, t, curvature)
         self.read(out)
@@ -137,12 +137,13 @@ class SensorModel:
         fraction: float = 1.0,
         shear: float = 0.0,
     ) -> None:
-        """Apply the contact at time ``t`` to the cells without reading the cells.
+        """Apply the contact at time ``t`` to the cells, but do not read the cells.
 
-        ``curvature`` [1/m] is the face curvature in the plane of ``tilt_x``, 0 for a plane. The
-        face is a cylinder with its axis along the finger's y. All pressures are multiplied by
-        ``fraction``. For a solid tip, the curvature acts only through ``fraction``. The frame of a
-        solid tip also shows the ``shear`` force [N], which acts along x at height a.
+        ``curvature`` [1/m] is the curvature of the face in the plane of ``tilt_x``, or 0 for a
+        plane face. A curved face is a cylinder whose axis is parallel to the finger's y axis. All
+        pressures are multiplied by ``fraction``. A solid tip ignores ``curvature``, because
+        ``fraction`` already includes its effect. The frame of a solid tip also depends on the
+        ``shear`` force [N], which acts along x at height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
         flaws, pressure = self._flaws, self._pressure
@@ -172,10 +173,10 @@ class SensorModel:
 
     @cached_property
     def _points(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Sample point positions across the cylinder axis, and the hemisphere heights there [m].
+        """Sample positions across the cylinder axis, hemisphere heights [m], and weights.
 
-        The position and height arrays have the shape [lines, points per line]; the height is 0
-        beyond the rim. The third and fourth results are the weights of the points in a cell mean
+        The position and height arrays have the shape [lines, points per line]. The height is 0
+        beyond the rim. The third and fourth arrays contain the weights for averaging over a cell
         along y and along x.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
@@ -189,8 +190,8 @@ class SensorModel:
     def _curved(self, d: float, n_x: float, n_y: float, roundness: float) -> FloatArray:
         """Return the pressure [Pa] on each cell due to a cylinder of radius R = ``roundness`` [m].
 
-        The normal (n_x, n_y, …) points from the tip centre to the cylinder axis, which is
-        a − d + R away. Let p be the coordinate across the axis. Then
+        The normal (n_x, n_y, …) points from the tip centre to the cylinder axis. The distance to
+        the axis is a − d + R. With the coordinate p across the axis:
 
             z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
 
@@ -245,18 +246,18 @@ class SensorModel:
         count(signal, self._sensitivity > 0.0, self._ends, out)
 
 
-# --- effects of a soft, resistive sensor, computed in place on arrays [rows, cols] ---------------
+# --- effects of a soft, resistive sensor ---------------------------------------------------------
 
 
 def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
-    """Apply hysteresis: each cell reads higher during unloading than during loading.
+    """Apply hysteresis, which makes cells read higher during unloading than during loading.
 
-    In this Prandtl-Ishlinskii model, the output of a cell is the mean of PLAY_COUNT generalised
-    play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each operator follows an
-    increasing pressure p immediately. An operator follows a decreasing pressure only when its state
-    is above (1 + h_k) p. The h_k are evenly distributed over 0 … 2·excess. Therefore, the loading
-    curve is the pressure itself, and the unloading curve ends at (1 + excess) p. Loops are closed,
-    inner loops lie inside outer loops, and zero pressure always reads 0.
+    This is a Prandtl-Ishlinskii model. The output of a cell is the mean of PLAY_COUNT generalised
+    play operators, whose states are ``state`` [PLAY_COUNT, rows, cols]. At the pressure p, the
+    state of operator k is limited to the range from p to (1 + h_k) p. The widths h_k are evenly
+    spaced between 0 and 2·excess. Therefore, the output is p during loading and at most (1 +
+    excess) p during unloading. Hysteresis loops are closed, and smaller loops lie inside larger
+    loops. Zero pressure always reads 0.
     """
     widths = 2.0 * excess * (np.arange(PLAY_COUNT) + 0.5) / PLAY_COUNT
     np.minimum(state, (1.0 + widths)[:, None, None] * pressure, out=state)
@@ -265,17 +266,18 @@ def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
 
 
 def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) -> FloatArray:
-    """Return z, each cell's pressure p after a first-order lag: dz/dt = (p − z)/time.
+    """Apply a first-order lag, dz/dt = (p − z)/time, to each cell's pressure p and return z.
 
-    p + share · z is the creep of a standard linear solid. The solution is exact for a pressure that
-    changes linearly during ``elapsed`` [s]. ``state`` [2, rows, cols] contains the last p and z and
-    is updated.
+    The sum p + share · z models the creep of a standard linear solid. The solution is exact for a
+    pressure that changes linearly during ``elapsed`` [s]. The function updates ``state`` [2, rows,
+    cols], which contains the last p and z.
     """
     before = state[0]
     lagged: FloatArray = state[1]
     ratio = elapsed / time
     decay = math.exp(-ratio)
-    # Mean decay over the interval, which is 1 − r/2 + … for a short interval.
+    # Mean decay factor over the interval. For a short interval, the mean is 1 − r/2 + …, where r is
+    # `ratio`.
     mean = -math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0
     lagged *= decay
     lagged += (mean - decay) * before + (1.0 - mean) * pressure
@@ -286,8 +288,8 @@ def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) ->
 def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float) -> FloatArray:
     """Return the readings (p/full_scale)^exponent · full_scale for pressures p.
 
-    If ``fold`` [Pa] is above 0, a pressure p above ``fold`` is replaced by fold²/p: beyond the
-    range of the contact resistance, a cell's reading decreases with pressure.
+    If ``fold`` [Pa] is above 0, each pressure p above ``fold`` is replaced by fold²/p. Beyond the
+    range of the contact resistance, a cell's reading decreases as the pressure increases.
     """
     if fold > 0.0:
         pressure = np.minimum(pressure, fold * fold / np.maximum(pressure, fold))
@@ -299,10 +301,11 @@ def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float)
 def drift(
     value: FloatArray, deviation: float, time: float, elapsed: float, normals: FloatArray
 ) -> None:
-    """Advance the zero drift or gain drift, an Ornstein-Uhlenbeck process.
+    """Advance a zero drift or gain drift, modelled as an Ornstein-Uhlenbeck process.
 
-    ``value`` starts at 0 after a tare, and its standard deviation approaches ``deviation`` with the
-    correlation time ``time`` [s]. ``normals`` are standard normal numbers.
+    ``value`` starts at 0 after a tare. ``value`` has the correlation time ``time`` [s], and its
+    standard deviation approaches ``deviation``. ``normals`` contains standard normal random
+    numbers.
     """
     decay = math.exp(-elapsed / time)
     value *= decay
@@ -324,7 +327,7 @@ def count(
 ) -> None:
     """Round a signal to counts and store the counts in ``out``; inactive cells read 0.
 
-    ``ends`` contains the maximum count and the threshold below which counts are set to 0.
+    ``ends`` contains a threshold and the maximum count. Counts below the threshold are set to 0.
     """
     lowest, full = ends
     value = np.clip(signal + 0.5, 0.0, full + 0.5)

@@ -1,4 +1,4 @@
-"""Simulate the tactile sensor under one tip of the simulated hand, without a thread."""
+"""Simulate the tactile sensor under one tip of the simulated hand."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
 
 
 class StageTouch(NamedTuple):
-    """Contact of a tip, at one instant, with a body other than the object."""
+    """Contact between a tip and the stage at one instant."""
 
     d: float  # m
     theta: float  # rad
@@ -46,15 +46,16 @@ class StageTouch(NamedTuple):
 class SimulatedTactile:
     """Frame source for one fingertip of a :class:`SimulatedHand`.
 
-    The hand's settings define the sensor. Frame k samples the contact at k / ``tactile.rate`` after
-    the hand's start. The frame arrives ``simulation.tactile_delay`` after the sample or later, or
-    is lost (see :class:`Arrivals`). As on hardware, the sample time is unknown; it is assumed to be
-    ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is computed, and
-    only on request. The frames that are never computed are also counted in ``seq``. The hand's
-    ``measurement_faults`` are applied to the frames.
+    The hand's settings define the sensor. Frame k samples the contact at the time k /
+    ``tactile.rate`` after the hand's start. A frame arrives at least ``simulation.tactile_delay``
+    after its sample time, or is lost (see :class:`Arrivals`). As on hardware, the exact sample time
+    is unknown. The estimated sample time is the nominal arrival time minus
+    ``settings.tactile.latency``. Only the newest frame is computed, and only on request. Frames
+    that are not computed still increase ``seq``. The hand's ``measurement_faults`` are applied to
+    the frames.
 
-    If ``stage`` is set, it defines the contact instead of the object. ``stage`` is a function of
-    the time since the hand's start [s].
+    If the function ``stage`` is set, it defines the contact instead of the object. The argument of
+    ``stage`` is the time since the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:
@@ -99,7 +100,7 @@ class SimulatedTactile:
         self.latest()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame, or None before the first frame or if the sensor is not open."""
+        """Return the newest frame, or None if no frame has arrived yet."""
         now = self._clock.now()
         if self._open and self._arrivals.take(now):
             self._hand.advance(now)
@@ -107,7 +108,7 @@ class SimulatedTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return the number of ``frames`` received and of frames ``missed`` since opening.
+        """Return the numbers of ``frames`` received and ``missed`` since opening.
 
         ``resyncs`` and ``skipped_bytes`` are always 0.
         """
@@ -125,7 +126,8 @@ class SimulatedTactile:
 
     def _read(self, number: int, arrival: float) -> None:
         """Compute the newest frame from a sample that the plant still stores."""
-        # If readings depend on earlier contacts, also apply the samples without a computed frame.
+        # If readings depend on earlier contacts, also apply the samples whose frames are not
+        # computed.
         first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
             self._press(each)
@@ -151,7 +153,7 @@ class SimulatedTactile:
         return next(self._replayed)
 
     def _relaxation_factor(self, d: float, theta: float) -> float:
-        """Advance a tip's relaxation under the plate by one frame; return the relaxation factor."""
+        """Advance the relaxation under the plate by one frame; return the relaxation factor."""
         lasting = float(self._hand.table(d, theta).force)
         state, factor = self._relaxation_state, 1.0
         for k, (strength, time) in enumerate(self._relaxation):
@@ -183,8 +185,7 @@ class SimulatedTactile:
             return True
         # Remove the effect of curvature, because the sensor model already includes this effect.
         factor *= math.sqrt(1.0 + curvature * self._radius)
-        # The force is proportional to d². If half the tip is beyond the face edge, the force is
-        # halved.
+        # The force is proportional to d², so scale d by the square root of the force ratio.
         relaxation_factor = float(sample.relaxation_factor[finger])
         d *= math.sqrt(factor / relaxation_factor)
         self._model.press(d, theta, 0.0, number * self._period, curvature, relaxation_factor)
@@ -192,14 +193,14 @@ class SimulatedTactile:
 
 
 class Arrivals:
-    """Arrival times of the frames 0, 1, … of a sensor.
+    """Arrival times of a sensor's frames.
 
     Frame k is sampled at start + k · period and is due ``delay`` [s] later. A frame is lost with
-    probability ``dropped``. A frame that is not lost is delayed by a uniformly distributed time of
-    up to ``jitter`` [s]. Frames always arrive in order.
+    the probability ``dropped``. The additional delay of a frame is uniformly distributed between 0
+    and ``jitter`` [s]. Frames always arrive in order.
     """
 
-    # Tolerance for clock rounding errors: a frame that is due now counts as arrived.
+    # Tolerance for rounding errors of the clock [s], so that a frame due now counts as arrived.
     _SLACK = 1e-9
 
     def __init__(

@@ -1,5 +1,5 @@
-"""Emulate Dynamixel servos: registers, their effects, and bus packets.
+"""Emulate the registers and bus packets of Dynamixel servos.
 
-The input and output are bytes with time stamps, so no port is needed. The only code that this
-package shares with the client is the control table and the CRC.
+The input and output are bytes with time stamps, so no port is needed. The package shares only the
+control table and the CRC with the client.
 """

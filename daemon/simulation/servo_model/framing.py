@@ -1,6 +1,6 @@
-"""Implement Dynamixel Protocol 2.0 framing on the servo side: byte stuffing, packets and parser.
+"""Implement the framing of Dynamixel Protocol 2.0 on the servo side.
 
-The only code shared with the client is the CRC, so that tests against the client are meaningful.
+This module shares only the CRC with the client, so tests against the client are meaningful.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ DATA_LIMIT: Final = 0x06
 ACCESS: Final = 0x07
 ALERT: Final = 0x80
 
-MAX_LENGTH: Final = 1024  # maximum packet length that a servo accepts
+MAX_LENGTH: Final = 1024  # maximum packet length that a servo accepts [bytes]
 _PREFIX: Final = HEADER + b"\x00"
 _STUFFED: Final = HEADER + b"\xfd"
 _UNSTUFFED: Final = re.compile(rb"\xff\xff\xfd[^\xfd]")
@@ -95,14 +95,14 @@ def _packet(raw: bytes) -> Packet:
 class PacketParser:
     """Packet parser that behaves like a real servo.
 
-    A packet is discarded if a header occurs inside it (FF FF FD not followed by FD, which stuffing
-    prevents), or if it is interrupted by more than ``gap`` seconds of silence. Therefore, a packet
-    sent without stuffing is never executed.
+    The parser discards a packet if silence of more than ``gap`` seconds interrupts the packet. A
+    packet that contains an unstuffed header (FF FF FD not followed by FD) is also discarded and
+    therefore never executed.
     """
 
     def __init__(self, gap: float = 0.0015) -> None:
         self.gap = gap
-        self.dropped = 0  # number of bytes outside packets
+        self.dropped = 0  # number of discarded bytes
         self._buffer = bytearray()
         self._last = 0.0
 
@@ -142,7 +142,7 @@ class PacketParser:
             end = 7 + length
             body = bytes(buffer[7 : end - 2])
             if len(buffer) > end - 2:
-                body += b"\0"  # No stuffing follows a header at the end of the body.
+                body += b"\0"  # A header at the end of the body is not followed by stuffing.
             if intruder := _UNSTUFFED.search(body):
                 self._drop(7 + intruder.start())
                 continue

@@ -1,8 +1,8 @@
-"""Simulate independent joints without contact, for servo buses without a hand.
+"""Simulate independent joints for a servo bus without a hand.
 
-The model of each joint includes first-order current dynamics, inertia, viscous and Coulomb
-friction, and the servo's inner position loop, which commands the current. A fixed step makes runs
-deterministic. The constants approximate an XM430-W350 with a bare horn.
+Each joint has inertia, viscous friction and Coulomb friction. The servo's position loop commands
+the current, which responds with a first-order lag. A fixed step makes runs deterministic. The
+constants approximate an XM430-W350 with a bare horn.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ STALL = 3.21  # stall current at full supply voltage [A]
 
 
 class FreeJoints:
-    """``count`` joints, initially at rest at angle 0, with the interface that a servo bus needs."""
+    """``count`` joints that implement :class:`JointPlant`, initially at rest at angle 0."""
 
     def __init__(self, count: int = 2, start: float = 0.0) -> None:
         self._start = start

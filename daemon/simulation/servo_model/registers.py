@@ -1,6 +1,6 @@
-"""Define an emulated servo's registers: access rights, defaults, ranges and rejected writes.
+"""Define the registers of an emulated servo, and check writes to these registers.
 
-:mod:`simulation.servo_model.servo` implements the effects of writes.
+:mod:`simulation.servo_model.servo` implements the effects of accepted writes.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 class Item:
     """One register.
 
-    ``low`` and ``high`` are the limits in the manual's table. The values of other registers may
-    narrow the range.
+    ``low`` and ``high`` are the limits stated in the manual. The values of other registers may
+    narrow this range.
     """
 
     address: int
@@ -137,7 +137,7 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
 
 
 class ControlTable:
-    """Memory of registers that can be accessed one by one or by address range.
+    """Memory of all registers, accessed by register or by address range.
 
     Addresses between registers read as 0. The servo may write directly to ``memory``.
     """
@@ -163,7 +163,7 @@ class ControlTable:
     # --- values ----------------------------------------------------------------------------------
 
     def get(self, address: int) -> int:
-        """Return the value of the item at ``address``."""
+        """Return the value of the register at ``address``."""
         value: int = self._unpack[address](self.memory, address)[0]
         return value
 
@@ -174,7 +174,7 @@ class ControlTable:
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
 
     def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
-        """Restore the factory defaults from address ``first``, except for the items in ``keep``.
+        """Restore the defaults from address ``first`` onwards, except for the items in ``keep``.
 
         If ``first`` is `control_table.RAM`, the reset has the effect of a power-up.
         """
@@ -189,7 +189,7 @@ class ControlTable:
         return length > 0 and address + length <= self.size
 
     def resolve(self, address: int) -> int:
-        """Return the actual address of a byte; an indirect data byte refers to another address."""
+        """Return the actual address of a byte. An indirect data byte refers to another address."""
         pointer = self._indirect.get(address)
         if pointer is None:
             return address
@@ -206,11 +206,11 @@ class ControlTable:
     # --- writing ---------------------------------------------------------------------------------
 
     def plan(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
-        """Return the effect of a write: an error number, and the items with their new values.
+        """Return the error number of a write, and the written items with their new values.
 
-        The error is DATA_LENGTH for a partially written item, ACCESS for a read-only or undefined
-        byte, and DATA_RANGE for a value outside the item's range. After an error, the write must
-        not change any item.
+        The error is DATA_LENGTH if an item is written only partially, and ACCESS if a byte is
+        read-only or undefined. The error is DATA_RANGE if a value is outside the item's range. If
+        there is an error, the caller must not change any item.
         """
         if not data:
             return framing.DATA_LENGTH, []
@@ -263,5 +263,5 @@ class ControlTable:
 
     @property
     def shut_down(self) -> bool:
-        """True while a hardware error included in the shutdown mask keeps torque off."""
+        """True while a hardware error in the shutdown mask keeps torque off."""
         return bool(self.memory[reg.HARDWARE_ERROR_STATUS] & self.memory[reg.SHUTDOWN])

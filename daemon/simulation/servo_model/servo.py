@@ -1,12 +1,13 @@
-"""Emulate a Dynamixel X servo: the effects of its registers on a plant joint.
+"""Emulate a Dynamixel X servo that drives a joint of the plant.
 
 The model includes torque, operating modes, limits, profiles, bus watchdog, hardware errors,
 shutdown and reboot. Packets are handled in :mod:`simulation.servo_model.servo_bus`. PWM mode, which
-no known client uses, is rejected as out of range. The integral gain and startup from a RAM backup
-have no effect.
+no known client uses, is rejected as out of range. The emulator ignores the integral gain, and the
+option to restore RAM from a backup at startup.
 
 The manuals do not specify two details. In this emulation, a write that violates any rule leaves all
-registers unchanged. After a shutdown, an attempt to switch torque on is rejected with RESULT_FAIL.
+registers unchanged. After a shutdown, the servo returns RESULT_FAIL if a client tries to switch
+torque on.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
     ServoJoint,
 )
 
-REBOOT_TIME = 0.34  # time without a reply during a reboot [s]
-JUMP_COUNTS = 130  # jump in the encoder zero, in counts (0.2 rad at the shaft)
-FAR_GOAL = 0.05  # distance from the torque-on angle above which a goal counts as far [rad]
+REBOOT_TIME = 0.34  # duration of a reboot, during which the servo does not reply [s]
+JUMP_COUNTS = 130  # jump of the encoder zero [counts], equal to 0.2 rad at the shaft
+FAR_GOAL = 0.05  # minimum distance between a far goal and the joint angle [rad]
 _WATCHED_REGISTERS = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 _TUNING_REGISTERS = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
 _CLEAR_FIRMWARE = 42
@@ -40,17 +41,18 @@ _CLEAR_KEY = b"\x01DXL\x22"
 
 
 def prepared(model: ServoModel, mode: int) -> dict[int, int]:
-    """Return the EEPROM values that the daemon requires: return delay 0 and the operating mode."""
+    """Return the EEPROM values (return delay, operating mode) that the daemon requires."""
     needed = {reg.RETURN_DELAY_TIME: 0}
     return needed | {reg.OPERATING_MODE: mode} if mode in model.modes else needed
 
 
 class EmulatedServo:
-    """Servo on joint ``joint`` of ``plant``, with factory defaults except for ``eeprom`` values.
+    """Emulated servo that drives joint number ``joint`` of ``plant``.
 
-    ``health`` may be set externally. A ``silent`` servo neither receives nor replies. The measured
-    values and clock of a ``frozen`` servo stay constant. If ``refuses`` is set, the servo replies
-    to every read with an error.
+    All registers have factory defaults except for the ``eeprom`` values. ``health`` may be set
+    externally. A ``silent`` servo neither receives nor replies. In a ``frozen`` servo, the measured
+    values and the clock stay constant. If ``refuses`` is set, the servo replies to every read with
+    an error.
     """
 
     def __init__(
@@ -67,7 +69,6 @@ class EmulatedServo:
     ) -> None:
         self.model = model
         self.firmware = model.firmware if firmware is None else firmware
-        # True if the firmware supports fast sync read and fast bulk read
         self.fast_reads = model.fast_read(self.firmware)
         self.table = ControlTable(model, self.firmware)
         self._memory = self.table.memory
@@ -102,7 +103,7 @@ class EmulatedServo:
 
     @property
     def old_protocol(self) -> bool:
-        """True if the servo is set to Protocol 1.0, of which this emulator only supports ping."""
+        """True if the servo is set to Protocol 1.0; this emulator then supports only ping."""
         return self._memory[reg.PROTOCOL_TYPE] == 1
 
     @property
@@ -128,7 +129,7 @@ class EmulatedServo:
 
     @property
     def torque_on(self) -> bool:
-        """True while the motor is driven."""
+        """True while the motor torque is on."""
         return bool(self._memory[reg.TORQUE_ENABLE])
 
     @property
@@ -152,7 +153,7 @@ class EmulatedServo:
     # --- time ------------------------------------------------------------------------------
 
     def heard(self, t: float) -> None:
-        """Restart the bus watchdog after an instruction packet on the bus."""
+        """Restart the bus watchdog because an instruction packet has arrived on the bus."""
         self._watched = t
         self.recorder.heard(t, self._memory[reg.TORQUE_ENABLE] != 0)
 
@@ -236,7 +237,7 @@ class EmulatedServo:
         return self.write(address, data, t)
 
     def reboot(self, t: float) -> None:
-        """Switch torque off, and restart after REBOOT_TIME with the RAM values of a power-up."""
+        """Switch torque off and restart after REBOOT_TIME with the default RAM values."""
         self.table.set(reg.TORQUE_ENABLE, 0)
         self._joint.drive()
         self._next_step = math.inf
@@ -244,7 +245,11 @@ class EmulatedServo:
         self._next_sense = self._boot_at
 
     def factory_reset(self, option: bytes, t: float) -> int:
-        """Restore defaults (FF: all, 01: except ID, 02: except ID and baud rate), then reboot."""
+        """Restore the factory defaults, then reboot.
+
+        Option FF restores all registers. Option 01 keeps the ID, and option 02 keeps the ID and the
+        baud rate.
+        """
         if len(option) != 1:
             return framing.DATA_LENGTH
         keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option[0])
@@ -358,7 +363,7 @@ class EmulatedServo:
         self._joint.forget_turns()
         self._registered = None
         self._reset_goals()
-        # The value is 0 if the firmware lacks the register.
+        # The byte is 0 if the firmware lacks this register.
         if self._memory[reg.STARTUP_CONFIGURATION] & 1:
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.hold()
@@ -369,7 +374,7 @@ class EmulatedServo:
     # --- internal events -------------------------------------------------------------------
 
     def _stop(self) -> None:
-        """Apply a bus watchdog stop: hold the current position with torque still on."""
+        """Stop after a bus watchdog timeout, and hold the current position with torque on."""
         table = self.table
         if self.mode == reg.CURRENT_MODE:
             table.set(reg.GOAL_CURRENT, 0)
@@ -399,13 +404,13 @@ class EmulatedServo:
 
 
 class BusRecorder:
-    """Record of the goals sent to a servo, used to test the daemon's limits.
+    """Record of the goals that a servo has received, for tests of the daemon's limits.
 
-    Goals are recorded in counts as received, even if the servo rejects them.
+    Goals are recorded in counts, even if the servo rejects them.
     """
 
     def __init__(self, t: float) -> None:
-        self._goals: dict[int, tuple[int, int]] = {}  # minimum and maximum goal per register
+        self._goals: dict[int, tuple[int, int]] = {}  # minimum and maximum goal of each register
         self._refused = 0
         self._torque_on = 0  # number of torque-on events
         self._torque_t: float | None = None
@@ -417,7 +422,7 @@ class BusRecorder:
         self._fired_t: float | None = None
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
-        """Record a goal write, except for goals near the current angle while torque is off."""
+        """Record the goals of a write. While torque is off, ignore goals near the current angle."""
         goals = _WATCHED_REGISTERS & values.keys()
         self._refused += refused and bool(goals)
         for address in goals:
@@ -428,7 +433,7 @@ class BusRecorder:
             self._goals[address] = min(least, value), max(greatest, value)
 
     def torque_on(self, t: float, joint: ServoJoint, mode: int, position: int) -> None:
-        """Record that torque is on at time t and that the goal is ``position`` [counts]."""
+        """Record that torque was switched on at time t with the goal ``position`` [counts]."""
         self._torque_on += 1
         self._torque_t = self._last = t
         if mode in POSITION_MODES:
@@ -443,7 +448,7 @@ class BusRecorder:
         self._last = t
 
     def fired(self, t: float) -> None:
-        """Record a motor stop by the bus watchdog."""
+        """Record that the bus watchdog has stopped the motor."""
         self._fired += 1
         self._fired_t = t
 
@@ -469,5 +474,5 @@ class BusRecorder:
 
 
 def _away(joint: ServoJoint, position: int) -> float:
-    """Return the distance between a goal and the current joint angle [rad]."""
+    """Return the distance [rad] between a goal and the current joint angle."""
     return abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))

@@ -1,10 +1,10 @@
-"""Emulate a Dynamixel servo bus, which receives instruction packets and sends status packets.
+"""Emulate a bus of Dynamixel servos.
 
 Input and output are bytes with time stamps, so tests and fuzzers need no port.
-:mod:`simulation.emulator.pty_bus` adds the pseudo-terminal. In group reads, each servo replies
-after the previous one in the list, so servos after a missing servo stay silent. Control table
-backups, which no known client uses, return an instruction error. Servos that are set to Protocol
-1.0 reply only to a Protocol 1.0 ping.
+:mod:`simulation.emulator.pty_bus` adds the pseudo-terminal. In a group read, each servo waits for
+the reply of the previous servo in the list. Servos after a missing servo therefore do not reply.
+Control table backups are not supported; their instructions return an instruction error. Servos that
+are set to Protocol 1.0 reply only to a Protocol 1.0 ping.
 """
 
 from __future__ import annotations
@@ -37,13 +37,16 @@ _SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
 _GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}
 _FAST_READS = frozenset((framing.FAST_SYNC_READ, framing.FAST_BULK_READ))
 _READS = _GROUP_READS | {framing.PING, framing.READ}
-_FACTORY_RESET_GUARD = 42  # first firmware version that ignores a broadcast full factory reset
+_FACTORY_RESET_GUARD = 42  # first firmware that ignores a full factory reset by broadcast
 _SPAN = struct.Struct("<HH")  # address, length
 _ITEM = struct.Struct("<BHH")  # ID, address, length
 
 
 class TimedReply(NamedTuple):
-    """Bytes to send ``delay`` [s] after the wire is free, plus ``late`` [s] for this reply only."""
+    """Reply that is sent ``delay`` [s] after the wire becomes free.
+
+    ``late`` [s] is an extra delay of this reply that does not delay later replies.
+    """
 
     delay: float
     data: bytes
@@ -51,7 +54,7 @@ class TimedReply(NamedTuple):
 
 
 class ServoBus:
-    """Group of servos that share one wire and one plant, and ignore corrupted packets."""
+    """Servos that share one wire and one plant. Corrupted packets are ignored."""
 
     def __init__(
         self,
@@ -82,9 +85,9 @@ class ServoBus:
     ) -> ServoBus:
         """Create the configured servos, one per joint, left finger first.
 
-        If given, ``ids`` and a ``baud`` above 0 replace the IDs and the baud rate in the settings.
-        If ``factory`` is True, all other registers have their factory defaults. Raises ValueError
-        if the model does not support the baud rate.
+        ``ids`` replaces the IDs in the settings, and a ``baud`` above 0 replaces the baud rate. If
+        ``factory`` is True, all other registers have their factory defaults. Raises ValueError if
+        the model does not support the baud rate.
         """
         servos = settings.servos
         model = by_name(servos.model)
@@ -113,7 +116,7 @@ class ServoBus:
         return self._now
 
     def advance(self, t: float) -> None:
-        """Advance plant and servos to time t [s], handling each servo event at its time."""
+        """Advance the plant and servos to time t [s], and handle each servo event at its time."""
         if t <= self._now:
             return
         if t >= self._due:
@@ -133,7 +136,7 @@ class ServoBus:
     # --- bytes -----------------------------------------------------------------------------
 
     def feed(self, data: bytes, t: float, baud: int = 0) -> bytes:
-        """Return the replies to ``data``, which arrives at time t. The reply delays are omitted."""
+        """Return the replies, without delays, to ``data`` that arrives at time t."""
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
@@ -206,13 +209,13 @@ class ServoBus:
             return self._broadcast(packet, servos, t)
         if instruction == framing.STATUS:
             return []  # The packet is a reply from another servo, or an echo.
-        # Status return level 0 allows replies only to pings, level 1 also to reads, and level 2 to
-        # all instructions.
+        # At status return level 0, a servo replies only to pings. Level 1 adds reads, and level 2
+        # adds all other instructions.
         needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)
         replies = []
         for servo in servos:
             if servo.id == packet.id:
-                # The reply uses the return level, delay and ID that applied before the instruction.
+                # The reply uses the return level, delay and ID from before the instruction.
                 level = servo.table.get(reg.STATUS_RETURN_LEVEL)
                 delay, name = servo.return_delay, servo.id
                 error, data = _execute(servo, instruction, packet.parameters, t)
@@ -275,15 +278,15 @@ class ServoBus:
             delay += servo.return_delay
         if not block:
             return replies
-        # The blocks form one packet, and their delays add up.
+        # The blocks form one packet, so their return delays add up.
         return [TimedReply(delay, block + piece)]
 
 
 @lru_cache(maxsize=32)
 def _requested(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], bytes]:
-    """Return (ID, address, length) for each part of a group read, and the start of a fast reply.
+    """Return the items (ID, address, length) of a group read, and the first bytes of a fast reply.
 
-    The result is empty if the packet is incomplete or if it contains an ID twice.
+    The result is empty if the packet is incomplete or contains an ID twice.
     """
     requested: list[tuple[int, int, int]] = []
     if instruction not in _SYNC_READS:
@@ -362,10 +365,10 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
 
 
 def _at_once(replies: list[TimedReply]) -> list[TimedReply]:
-    """Merge the replies of servos with the same ID into one corrupted reply; 0 bits dominate.
+    """Merge the replies of servos with the same ID into one corrupted reply.
 
-    Servos never start at exactly the same time, so even identical replies collide. In the
-    emulation, each reply begins one byte after the previous reply.
+    On the wire, 0 bits dominate. Servos never start at exactly the same time, so even identical
+    replies collide. In the emulation, each reply begins one byte after the previous reply.
     """
     if len(replies) < 2:
         return replies

@@ -1,9 +1,9 @@
-"""Emulate the physical side of a servo: connect its registers to a joint of the plant.
+"""Connect the registers of an emulated servo to a joint of the plant.
 
-`ServoJoint` converts counts to angles (turns, homing offset, drive direction), follows the profile,
-drives the plant according to the operating mode, and writes the present values to the control
-table. `ServoHealth` models heat (`ServoHeat`), supply voltage and overload. The manuals do not
-specify when an overload error occurs. In the emulation, the error occurs after OVERLOAD_TIME at the
+`ServoJoint` converts counts to angles, follows the motion profile, and drives the plant in the
+selected operating mode. `ServoJoint` also writes the measured values to the control table.
+`ServoHealth` models heat (`ServoHeat`), supply voltage and overload. The manuals do not specify
+when an overload error occurs. In the emulation, an overload error occurs after OVERLOAD_TIME at the
 configured current limit.
 """
 
@@ -21,7 +21,7 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
 STEP_TIME = 0.001  # time step for trajectories and velocity mode [s]
-OVERLOAD_TIME = 2.0  # time at the current limit until an overload error [s]
+OVERLOAD_TIME = 2.0  # time at the current limit after which an overload error occurs [s]
 SENSE_INTERVAL = 0.010  # interval between checks of heat, voltage and overload [s]
 _VOLTAGE = 0  # bit in the hardware error status
 POSITION_MODES = (
@@ -102,7 +102,7 @@ class ServoJoint:
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_current(self, counts: int) -> float:
-        """Convert a goal current to A, positive when closing. The sign of a limit is ignored."""
+        """Convert a goal current from counts to A; positive currents close the finger."""
         return self._scale.amperes(self.sign * counts)
 
     # --- trajectory --------------------------------------------------------------------------
@@ -112,7 +112,7 @@ class ServoJoint:
         self.profile.hold(self.position())
 
     def aim(self) -> None:
-        """Start a trajectory to the goal position, as defined by the profile registers."""
+        """Start a trajectory to the goal position with the limits in the profile registers."""
         memory, table, profile = self._memory, self._table, self.profile
         if memory[reg.OPERATING_MODE] not in POSITION_MODES:
             return
@@ -134,7 +134,7 @@ class ServoJoint:
         return mode == reg.VELOCITY_MODE
 
     def follow(self) -> None:
-        """Advance the trajectory, or the position in velocity mode, by STEP_TIME."""
+        """Advance the trajectory by STEP_TIME; in velocity mode, advance the position."""
         mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             self.profile.step(STEP_TIME)
@@ -148,10 +148,10 @@ class ServoJoint:
     # --- plant -------------------------------------------------------------------------------
 
     def tune(self) -> None:
-        """Pass the gain and PWM registers to the plant; the integral gain has no effect.
+        """Pass the values of the gain and PWM registers to the plant, except for the integral gain.
 
-        The servo torque is K_P·error − K_D·Δposition per millisecond, with K_P = P / 128 and K_D =
-        D / 16 (e-Manual, position PID gain).
+        The servo torque is K_P·error − K_D·Δposition, where Δposition is the change per
+        millisecond. According to the e-Manual (position PID gain), K_P = P / 128 and K_D = D / 16.
         """
         get, (d, _, p) = self._table.get, self._model.position_gains
         stiffness = get(reg.POSITION_P_GAIN) / p
@@ -177,7 +177,7 @@ class ServoJoint:
             self._plant.drive(joint, reg.POSITION_MODE, True, goal, self.current_limit)
 
     def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
-        """Update registers 120 … 146, ``seconds`` after power-up."""
+        """Update registers 120 to 146 at the time ``seconds`` after power-up."""
         profile, memory, position = self.profile, self._memory, self.position()
         plant, joint, scale = self._plant, self._joint, self._scale
         current = velocity = pwm = 0
@@ -185,7 +185,7 @@ class ServoJoint:
             ampere = plant.measured_current(joint)
             if self._model.senses_current:
                 current = scale.current_counts(ampere)
-            else:  # The register contains the present load in 0.1 %.
+            else:  # The register contains the present load in units of 0.1 %.
                 current = round(1000.0 * self._load * ampere)
             current = max(-32768, min(32767, self.sign * current))
             velocity = self.sign * scale.velocity_counts(plant.dq.item(joint))
@@ -223,7 +223,8 @@ _ARRIVAL_TOLERANCE = 1e-6
 class Profile:
     """Velocity-based or time-based trajectory to a goal.
 
-    The object stores the trajectory's present position and velocity. A limit of 0 means no limit.
+    The object stores the present position and velocity of the trajectory. A velocity or
+    acceleration limit of 0 means no limit.
     """
 
     def __init__(self) -> None:
@@ -250,7 +251,7 @@ class Profile:
             self.hold(target)
 
     def aim_in(self, target: float, duration: float, ramp: float) -> None:
-        """Set a target to reach in ``duration`` [s], with ramps of ``ramp`` [s] (time-based)."""
+        """Set a target to reach after ``duration`` [s], with ramps of ``ramp`` [s] (time-based)."""
         if duration <= 0.0:
             self.hold(target)
             return
@@ -270,7 +271,7 @@ class Profile:
             return
         limit = self.speed if self.speed > 0.0 else math.inf
         if self.acceleration > 0.0:
-            # Maximum speed for one more step after which the servo can still stop at the target.
+            # Maximum speed in this step that still allows a stop at the target.
             a = self.acceleration
             stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
             speed = math.copysign(min(limit, stop), distance)
@@ -290,9 +291,9 @@ class ServoHeat:
     """Thermal model of one servo. ``ambient`` [°C] may be changed at any time.
 
     `ServoHeat` is independent of the daemon's model (`kinematics.hand.servo_heat`) and uses
-    different constants. Copper resistance increases with temperature, convection at the case
-    increases with the temperature difference, and the thermometer lags behind the case temperature.
-    ``heating``, ``cooling`` and ``capacity`` scale the servo model's values.
+    different constants. Copper resistance increases with temperature, and convection at the case
+    increases with the temperature difference. The thermometer lags behind the case temperature.
+    ``heating``, ``cooling`` and ``capacity`` are factors applied to the servo model's values.
     """
 
     def __init__(
@@ -307,7 +308,7 @@ class ServoHeat:
 
     @classmethod
     def of(cls, settings: Settings) -> Self:
-        """Create the thermal model for the configured servo, at ambient temperature."""
+        """Create the thermal model of the configured servo at ambient temperature."""
         simulation = settings.simulation
         heat = cls(by_name(settings.servos.model), *simulation.servo_heat)
         heat.ambient = simulation.ambient
@@ -340,7 +341,7 @@ class ServoHeat:
 class ServoHealth:
     """Supply voltage, heat and overload of a servo.
 
-    ``supply`` (no-load voltage [V]) and ``heat`` may be changed externally.
+    ``heat`` and the no-load voltage ``supply`` [V] may be changed externally.
     """
 
     def __init__(self, model: ServoModel, heat: ServoHeat | None = None) -> None:
@@ -357,7 +358,7 @@ class ServoHealth:
 
     @property
     def voltage(self) -> float:
-        """No-load supply voltage minus the voltage drop caused by the servo current [V]."""
+        """Supply voltage [V] at the present servo current."""
         return self.supply - reg.SAG * self._current
 
     def restart(self) -> None:
