@@ -16,9 +16,9 @@ Any baud rate is allowed, and USB boards may ignore it. The firmware sends every
    12      …      rows × cols counts, row by row
    ======  ====== =====================================================================
 
-2. Append the CRC-16 of the message, low byte first. The type is CRC-16/IBM-3740 (CCITT-FALSE):
-   polynomial 0x1021, initial value 0xFFFF, highest bit first, no inversion. The CRC of
-   "123456789" is 0x29B1. To compute the CRC::
+2. Append the CRC-16 of the message, low byte first. The CRC type is CRC-16/IBM-3740 (CCITT-FALSE):
+   polynomial 0x1021, initial value 0xFFFF, highest bit first, no inversion. The CRC of "123456789"
+   is 0x29B1. To compute the CRC::
 
        crc = 0xFFFF
        for each byte:  crc ^= byte << 8
@@ -35,8 +35,8 @@ Any baud rate is allowed, and USB boards may ignore it. The firmware sends every
 A 44 × 44 frame of uint16 counts takes at most 3903 bytes on the wire. `encode` is the reference
 implementation. A reader that starts in the middle of a frame synchronises at the next zero byte.
 Incomplete and corrupted frames are dropped. The CRC detects every error that is confined to 16
-adjacent bits. Of all other errors, it misses 1 in 65536. A gap in the sequence numbers shows how
-many frames were missed.
+adjacent bits. Of all other errors, the CRC misses 1 in 65536. The sequence numbers show how many
+frames were missed.
 """
 
 from __future__ import annotations

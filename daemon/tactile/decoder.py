@@ -1,6 +1,6 @@
 """Define the interface and the shared code of decoders, which convert serial bytes to frames.
 
-A decoder processes bytes as they arrive. It does not use a port, a clock or a thread.
+A decoder processes bytes as they arrive, without a port, a clock or a thread.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 __all__ = ["Decoded", "DelimitedDecoder"]
 
-_LOST_AFTER = 10  # frame lengths of data without a frame after which the stream is lost
+_LOST_AFTER = 10  # The stream is lost after this many frame lengths without a frame.
 
 
 @dataclass(slots=True)
@@ -31,8 +31,7 @@ class Decoder(ABC):
     """Converter from bytes to frames [rows, cols].
 
     Every received byte belongs to a frame, is counted in ``skipped_bytes``, or is still buffered.
-    ``frame_bytes`` is the wire length of a frame. If lengths vary, it is the length of the last
-    frame.
+    ``frame_bytes`` is the wire length of a frame or, if lengths vary, of the last frame.
     """
 
     def __init__(self, rows: int, cols: int, frame_bytes: int) -> None:
@@ -100,7 +99,7 @@ class DelimitedDecoder(Decoder):
     def __init__(self, rows: int, cols: int, delimiter: bytes, longest: int) -> None:
         """Create a decoder.
 
-        ``longest`` is the maximum frame size on the wire in bytes, including the delimiter.
+        ``longest`` is the maximum wire size of a frame [bytes], including the delimiter.
         """
         super().__init__(rows, cols, longest)
         self.longest = longest

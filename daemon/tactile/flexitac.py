@@ -30,15 +30,15 @@ class FlexiTacDecoder(Decoder):
     *Lock.* A marker can be distinguished from two counts ``AA 55`` only by its position. The search
     requires two markers at a distance of one frame. If another ``AA 55`` between the markers also
     recurs one frame later, the search waits for more frames until only one position remains. The
-    decoder can't lock to a constant image that contains ``AA 55``. It counts such searches as
+    decoder can't lock to a constant image that contains ``AA 55``, and counts the failed search as
     ``ambiguous``.
 
     *Hold.* After locking, the decoder returns a frame when it finds the next marker at the expected
-    position. This marker proves that no byte of the frame was lost. On a line with gaps between
+    position. The marker proves that no byte of the frame was lost. On a line with gaps between
     frames, waiting for the next marker would delay every frame by one period. After a gap, the
     decoder therefore returns a complete frame immediately if the frame can't consist of parts of
-    two frames. This requires that its bytes arrived within their transmission time and that its
-    counts contain no ``AA 55``. All other frames are returned at the next marker or by ``settle``.
+    two frames. The bytes must have arrived within their transmission time, and the counts must not
+    contain ``AA 55``. All other frames are returned at the next marker or by ``settle``.
 
     *Loss.* If a marker is not at its expected position, the preceding frame is dropped, and the
     search restarts.
@@ -183,7 +183,7 @@ class FlexiTacDecoder(Decoder):
         )
 
     def _in_one_go(self) -> bool:
-        """Return True if the frame at the buffer start arrived after a gap and uninterrupted."""
+        """Return True if the first buffered frame arrived after a gap and without interruption."""
         first, whole = self._pieces[0][1], self._pieces[-1][1]
         return first - self._t_whole > _GAP_TIME and whole - first < self._longest
 

@@ -44,7 +44,7 @@ _NOISE_SIGMA_MAX = 6.0  # maximum magnitude of negative readings, in noise stand
 _CLIPPED_COUNT_MIN = 3  # minimum number of saturated cells that causes a warning
 _UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # time units other than s
 _DATE_RANGE = (1e9, 4e9)  # range of Unix times [s], 2001 to 2096
-_INTERVAL_RATIO_MAX = 100.0  # maximum ratio of actual to expected frame interval for times in s
+_INTERVAL_RATIO_MAX = 100.0  # maximum ratio of actual to expected frame interval if times are in s
 _INTERVAL_RATIO_NOTED = 10.0  # ratio of actual to expected frame interval that causes a note
 
 
@@ -163,7 +163,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
 
 
 def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) -> str:
-    """Return the name of the frames array. Raises ValueError if there is not exactly one."""
+    """Return the name of the only array that can contain frames, or raise ValueError."""
     if "frames" in names:
         return "frames"
     shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
@@ -379,7 +379,7 @@ def _factor(t: NDArray[Any], step: float, rate: float) -> float:
     """Return the unit [s] of times without a date, based on their intervals. Raises ValueError."""
     whole = t.dtype.kind in "ui"
     if len(t) > 2 and (t % 1 == 0).all() and (np.diff(t) == 1).all():
-        if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # about one frame per second
+        if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # The rate is about 1 Hz.
             return 1.0
         raise ValueError(
             "t: found frame numbers that increase by 1, expected times in s; remove t if the "

@@ -37,9 +37,9 @@ class SensorClock:
     """Converter from a board's clock to the local clock, based on the minimum recent delay.
 
     Frames may arrive late but never early. Using the minimum delay therefore removes port jitter
-    from ``t_sample``. The offset between the clocks may increase at a rate of up to 200 ppm. Two
-    quartz clocks drift apart more slowly. A jump of more than one second is treated as a board
-    restart.
+    from ``t_sample``. The offset between the clocks may increase at up to 200 ppm, which is faster
+    than two quartz clocks drift apart. A jump of the offset by more than one second is treated as a
+    board restart.
     """
 
     _DRIFT = 2e-4
@@ -66,13 +66,13 @@ class SerialReader:
     """Backend for a board on a serial port; subclasses provide the framing.
 
     A frame's ``t_arrival`` is the time at which its last byte was read. ``t_sample`` estimates the
-    mid-scan time. It is ``t_arrival`` minus the transmission time of the frame and of later bytes
-    in the same read, and minus ``latency`` [s]. ``latency`` is the time from mid-scan to the
-    frame's first byte. ``t_sample`` never decreases from frame to frame. If frames contain the
-    board time, :class:`SensorClock` removes port jitter.
+    mid-scan time. The reader subtracts the transmission time of the frame, and of later bytes in
+    the same read, from ``t_arrival``. The reader also subtracts ``latency`` [s], the time from
+    mid-scan to the frame's first byte. ``t_sample`` never decreases from frame to frame. If frames
+    contain the board time, :class:`SensorClock` removes port jitter.
 
-    The reader sends ``request`` to a polled board at the start and after each frame. It repeats the
-    request if no frame arrives within its transmission time plus 0.1 s.
+    The reader sends ``request`` to a polled board at the start and after each frame. If no frame
+    arrives within its transmission time plus 0.1 s, the reader repeats the request.
 
     ``latest`` may be called from any thread. Each frame has its own array, which is never modified.
     If the port is lost or the stream becomes unreadable, the reader provides a final frame with the
@@ -154,7 +154,7 @@ class SerialReader:
     def close(self) -> None:
         """Stop the thread and close the port.
 
-        This method never raises an exception and may be called repeatedly.
+        ``close`` never raises an exception and may be called repeatedly.
         """
         stop, thread, port = self._stop, self._thread, self._port
         self._stop = self._thread = self._port = None

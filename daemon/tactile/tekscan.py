@@ -1,15 +1,15 @@
 """Parse Tekscan-style ASCII exports of pressure frames.
 
 An export starts with a header: lines of the form ``KEY value``, up to the line ``ASCII_DATA @@``.
-Each frame starts with a line ``Frame n``, which may contain more text. The rows of the frame
-follow. The letter ``B`` marks a position without a cell. A line ``@@`` may end the file. An export
-with a single frame has no ``Frame`` line.
+Each frame starts with a line ``Frame n``, which may contain more text, and continues with its rows.
+The letter ``B`` marks a position without a cell. A line ``@@`` may end the file. An export with a
+single frame has no ``Frame`` line.
 
-The encoding, the decimal sign and the separator depend on the locale of the exporting machine. The
-parser detects all three. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings are
-raw counts, pressures, or forces per cell. Free text may follow ``COMMENTS:``. A line of this text
-is a key line only if its first word is in capitals. Spreadsheets may add quotation marks and may
-append separators to lines.
+The encoding, the decimal sign and the separator depend on the locale of the exporting machine, so
+the parser detects them. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings are
+raw counts, pressures, or forces per cell. Free text may follow ``COMMENTS:``. Within the free text,
+a line is a ``KEY value`` line only if its first word is in capitals. Spreadsheets may add quotation
+marks and may append separators to lines.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SIZE_MAX = 1024  # maximum number of rows or columns
 _HEADER_LINES_MAX = 1000
 _READING_MAX = 1e12  # maximum reading, in the unit of the file
 _RAW_SATURATION = 255  # maximum reading of the manufacturer's 8-bit electronics
-_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure that counts as saturated
+_SATURATION_FRACTION = 0.995  # Cells above this fraction of the saturation pressure are saturated.
 _EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
@@ -54,7 +54,7 @@ _FORCES = {
     **dict.fromkeys(("oz", "ozf"), 0.27801385095),
 }
 _AREAS = {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6, "in2": 0.0254**2, "ft2": 0.3048**2}
-# Notations of squares. The byte of ² in DOS code pages is ý in Latin-1.
+# Notations of squares. The byte that means ² in DOS code pages means ý in Latin-1.
 _SQUARES = str.maketrans({"²": "2", "ý": "2", "^": "", ".": "", "*": ""})
 
 
