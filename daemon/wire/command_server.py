@@ -6,9 +6,9 @@ it. If this number is below the current number of stops, the request is refused,
 ``status``. A ``hold`` replaces a queued ``hold`` that directly precedes it on the same connection.
 
 A client may add a unique ``key`` to a request. If the request is refused as late, the client may
-repeat it. The daemon executes a command with a key at most once. A repetition must not override a
-newer command. It is therefore refused if another command has been executed since the refusal. The
-commands in `NO_LEASE_COMMANDS` can only make the hand safer and are executed every time.
+repeat it. The daemon executes a command with a key at most once. To protect newer commands, the
+daemon refuses a repetition if it has executed another command in the meantime. The commands in
+`NO_LEASE_COMMANDS` can only make the hand safer and are executed every time.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class CommandServer:
         self._clock = clock
         self._changes = 0  # number of executed commands other than status and stop
         # Outcomes of requests with a key, oldest first. The dictionary keys consist of the client
-        # name and the packed request. The outcome is the reply. For a late request, it is instead
-        # the number of stops and the number of changes at the first attempt.
+        # name and the packed request. The outcome is the reply. For a late request, the outcome is
+        # instead the number of stops and the number of changes at the first attempt.
         self._outcomes: OrderedDict[tuple[str, bytes], bytes | tuple[int, int]] = OrderedDict()
         self._stopped = b""  # reply to the last local stop
-        self._answer_by = 0.0  # time at which waiting for the gateway's confirmation ends
+        self._answer_by = 0.0  # time at which the wait for the gateway's confirmation ends
 
     def serve(self, handler: Handler) -> None:
         """Pass this tick's requests to ``handler`` and send its replies.

@@ -12,8 +12,8 @@ folder with these files:
     the files to copy to the client's machine; the client ``local`` is for this machine
 
 The files are ZeroMQ certificates, which other ZeroMQ programs can also read. A file or folder is
-refused if another user owns it, or may write to it or to a parent folder. Such a user could add a
-key.
+refused if another user owns it or may write to it, because this user could add a key. All parent
+folders are checked in the same way.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class ServerKeys:
 
         Raises KeyFileError.
 
-        This method does not open files, so it works even if no file descriptor is free.
+        ``left`` does not open files, so it works even if no file descriptor is free.
         """
         clients = _place(folder) / "clients"
         _check_above(clients / "any")

@@ -92,7 +92,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
         ):
             require_own(folder)
             asking.settimeout(seconds)
-            # The system assigns a name to the socket. The daemon replies to this name.
+            # The system assigns a name to the socket, and the daemon replies to this name.
             asking.bind("")
             asking.connect(str(folder / _name(address)))
             asking.send(b"stop")
@@ -103,7 +103,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
 
 def free_socket_path(path: Path, kind: socket.SocketKind) -> str:
-    """Remove the socket file left by a killed process; return a reason if the path is in use."""
+    """Remove a socket file left behind by a killed process; return a reason if it is in use."""
     if not path.exists():
         return ""
     if not path.is_socket():

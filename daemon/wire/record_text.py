@@ -20,7 +20,8 @@ _COLOUR = "#0a8078"  # colour that is readable on light and on dark pages
 # Number of shades in a picture. More shades would make the SVG longer without a visible difference.
 _SHADES = 12
 _SIDE = 176  # longer side of a picture [px]
-# Minimum pressure of the darkest shade [Pa], so that the noise of an unloaded tip stays faint.
+# The darkest shade stands for at least this pressure [Pa], so that the noise of an unloaded tip
+# stays faint.
 _FULL = 10e3
 
 

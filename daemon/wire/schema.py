@@ -75,7 +75,7 @@ TRUTH = b"hand/truth"
 
 NO_FRAME = Frame(0, t_sample=0.0, t_arrival=0.0, valid=False, data=np.zeros((0, 0), np.uint16))
 
-# First fields, which several topics share.
+# Fields with which several topics begin.
 _SCHEMA = "", "schema version; changes only if the meaning of a field changes"
 _SEQ = "", "sequence number of the tick, frame or event"
 _STEP = "", "decimation factor n: every n-th message is sent"
