@@ -43,7 +43,7 @@ Kind = Literal["power", "cubic"]
 DEAD_RESPONSE = 0.2  # fraction of the median response below which a cell counts as dead
 _EXPONENTS = (0.3, 3.0)
 _UNREST_SIGMA = 8.0  # multiple of the median noise above which a cell is unsteady
-# A tare fails if at least this many cells are unsteady. Fewer unsteady cells may be faulty cells.
+# A tare fails if at least this many cells are unsteady. Fewer unsteady cells may merely be faulty.
 _UNREST_CELL_COUNT = 4
 _TILT_MIN = math.radians(3.0)  # minimum tilt range from which the rotation can be determined
 _UPRIGHT_ERROR = math.radians(0.5)
@@ -140,7 +140,7 @@ class Equilibration:
 
     ``gain`` float64 [rows, cols] equalises the response of all cells; it is 0 for dead cells.
     ``spread`` is the relative rms deviation of the cells from their mean before equilibration.
-    ``residual`` is the deviation after equilibration.
+    ``residual`` is the relative rms deviation after equilibration.
     """
 
     gain: FloatArray
@@ -285,7 +285,7 @@ def _power(
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
     """Set mean readings [rows, cols] below 4 σ to 0; ``frames`` is the number of averaged frames.
 
-    Clipped noise has a positive mean. The sum of this mean over all cells may be as large as the
+    Clipped noise has a positive mean. Summed over all cells, clipped noise may be as large as the
     force of a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)

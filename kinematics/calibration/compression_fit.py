@@ -206,11 +206,11 @@ class CompressionFit:
 
     If k > 1, ``factors`` [k] [Pa] are the coefficients of the powers 1 to k of the strain. If k =
     1, the single factor multiplies the shape ``law``. ``std`` is the maximum relative standard
-    deviation of the force for d above a quarter of its maximum. For k = 1, it is also the relative
-    standard deviation of the modulus. Each row of ``zeros`` contains a run's zero offsets of d [m]
-    and F [N], and their standard deviations. ``residual`` [N] is the rms residual. ``chi2`` is the
-    squared ratio of ``residual`` to the scatter about a smooth curve. ``score`` is the Bayesian
-    information criterion; the best law has the lowest score.
+    deviation of the force for d above a quarter of its maximum. For k = 1, ``std`` is also the
+    relative standard deviation of the modulus. Each row of ``zeros`` contains a run's zero offsets
+    of d [m] and F [N], and their standard deviations. ``residual`` [N] is the rms residual.
+    ``chi2`` is the squared ratio of ``residual`` to the scatter about a smooth curve. ``score`` is
+    the Bayesian information criterion; the best law has the lowest score.
     """
 
     tip: Fingertip
@@ -234,7 +234,7 @@ class CompressionFit:
         return np.asarray(self.modulus * self.law.stress(strain))
 
     def force(self, run: Run, zeros: FloatArray) -> FloatArray:
-        """Return the modelled force of a run [N], given the run's row in ``zeros``."""
+        """Return the modelled force [N] of a run; ``zeros`` contains the run's zero offsets."""
         tables = _tables(self.tip, self.law if len(self.factors) == 1 else None)
         theta = np.full(len(run.d), run.theta)
         return np.asarray(_shapes(tables, run.d - zeros[0], theta)[0] @ self.factors + zeros[1])
@@ -323,8 +323,8 @@ def compare_laws(
     """Fit spring and solid rubber models to runs; return the fits (best first) and notes.
 
     Springs are fitted with a constant and with a strain-dependent modulus. If ``material`` is
-    nonlinear, they are also fitted with the shape of its law. The Poisson's ratio of solid rubber
-    is not fitted, because F(d) does not determine it.
+    nonlinear, springs are also fitted with the shape of its law. The Poisson's ratio of solid
+    rubber is not fitted, because F(d) does not determine it.
     """
     springs, solid = Fingertip(radius), Fingertip(radius, "solid", poisson)
     tried: list[tuple[str, Fingertip, Material | None]] = [("springs", springs, _UNIT)]
@@ -364,7 +364,7 @@ def _tables(tip: Fingertip, law: Material | None) -> list[ContactTable]:
 def _shapes(
     tables: Sequence[ContactTable], d: FloatArray, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the normal force for each power of the strain, and ∂/∂d of this force, both [n, k]."""
+    """Return the normal forces for the powers of the strain, and their ∂/∂d, both [n, k]."""
     touching, depth = d > 0.0, np.maximum(d, _STEP)
 
     def forces(at: FloatArray) -> FloatArray:

@@ -21,8 +21,8 @@ _GAP_MAX = 0.035  # maximum gap in the data across which values are interpolated
 _SLIDING_SPEED = 0.2
 # Speed below which a joint counts as stationary [rad/s]: one count of 1.5 mrad in 0.08 s.
 _REST_SPEED = 0.02
-# Rotation that counts as break-away [rad]. It equals three counts, which is ten times the elastic
-# deflection of the gears.
+# Rotation that counts as break-away [rad]: three counts, which are ten times the elastic deflection
+# of the gears.
 _BREAK_AWAY_DISTANCE = 5e-3
 # Maximum goal velocity at break-away [rad/s], and number of steps over which it is averaged. The
 # limit keeps the inertial torque small.

@@ -74,8 +74,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
 
     def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
         case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
-        # Equal readings share one rounding error. Together, they therefore have the weight of one
-        # reading.
+        # Equal readings share one rounding error, so all equal readings together have the weight of
+        # one reading.
         weight = np.sqrt(warmed / grid.size) / _READING_ERROR
         return np.concatenate([(case - readings) * weight, (x - prior) / _PRIOR_STD])
 

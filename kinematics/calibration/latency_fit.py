@@ -92,7 +92,7 @@ def fit_latency(
         shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # At standstill, the encoder error is constant. Half of the encoder error shifts the ramp.
+    # At standstill, the encoder error is constant, and half of this error shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))

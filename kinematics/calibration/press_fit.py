@@ -100,7 +100,7 @@ def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
 
 
 def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | None:
-    """Return the mean relative excess of the force of first presses over their repetitions.
+    """Compare first presses with their repetitions; return the mean relative excess force.
 
     Filled rubber softens over its first cycles (Mullins, 1948), so one fit cannot describe both
     first and repeated presses. The mean covers all poses (``d`` [n] [m], ``theta`` [n] [rad]) that
@@ -177,8 +177,8 @@ def compare_tips(
 ) -> list[TipFit]:
     """Fit spring and solid models of the tip; return the fits, best first.
 
-    Springs are fitted with a constant modulus. If ``material`` is nonlinear, they are also fitted
-    with its law. For solid rubber, ν is a free parameter. Both base types are fitted with a
+    Springs are fitted with a constant modulus. If ``material`` is nonlinear, springs are also
+    fitted with its law. For solid rubber, ν is a free parameter. Both base types are fitted with a
     frictionless face. The better base type is then also fitted with a sticking face.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
