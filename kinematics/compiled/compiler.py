@@ -1,20 +1,20 @@
 """Compile and cache kernels with Numba, using its private interfaces.
 
-Only this module uses Numba's private interfaces. It is imported only with tested Numba versions.
-For other versions, `plain` replaces it.
+Only this module uses Numba's private interfaces. With Numba versions that have not been tested,
+`plain` replaces this module.
 
-`KernelCompiler` runs only the passes that kernels need. It omits the passes for closures, `with`
-statements and parallel loops. It does not prune constant branches, because LLVM prunes them anyway.
-It does not store type annotations, which would fill the cache. It caches the result types of
-operations and the sizes of LLVM types. Without these caches, Numba would search dozens of
-candidates for each operation and let LLVM parse a module for each size.
+`KernelCompiler` runs only the passes that kernels need. The compiler omits the passes for closures,
+`with` statements and parallel loops. The compiler does not prune constant branches, because LLVM
+prunes them anyway. Type annotations are not stored, because they would fill the cache. The compiler
+caches the result types of operations and the sizes of LLVM types. Without these caches, Numba would
+search dozens of candidates for each operation and let LLVM parse a module for each size.
 
-A `BitcodeKernel` can be called only by other kernels. It is compiled to LLVM bitcode but not to
-machine code. By default, Numba compiles each function that a kernel calls as if Python might call
-it, too. Numba then optimises the function together with its callees, compiles it to machine code,
-adds two wrappers and caches it. The callers link the bitcode and repeat the optimisation and
-compilation. Stopping at bitcode reduces the compile time by a third and the cache size by three
-quarters.
+A `BitcodeKernel` is compiled to LLVM bitcode but not to machine code. Only other kernels can call a
+`BitcodeKernel`. By default, Numba compiles each function that a kernel calls as if Python might
+call it, too. Numba then optimises the function together with its callees, compiles it to machine
+code, adds two wrappers and caches the result. The callers link the bitcode and repeat the
+optimisation and compilation. Stopping at bitcode reduces the compile time by a third and the cache
+size by three quarters.
 
 `KernelCache` stores the machine code of a kernel but not its bitcode. A caller of the stored kernel
 needs the bitcode, so Numba compiles the stored kernel again for the caller. Normally, Numba imports
@@ -106,7 +106,7 @@ class KernelCompiler(CompilerBase):
 
 
 class _Arguments(tuple[Any, ...]):
-    """Argument types with a short string form; Numba would build a long one in every pass."""
+    """Argument types with a short string form; Numba would build a long form in every pass."""
 
     __slots__ = ()
 
@@ -325,7 +325,7 @@ def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     try:
         dispatcher._cache = KernelCache(function)
     except RuntimeError:
-        pass  # There is no folder, and `kernel_folder` has already issued a warning.
+        pass  # Without a folder, kernels are not stored. `kernel_folder` has issued a warning.
     called = inner(function, options).dispatcher  # Callers need bitcode, which is not cached.
     dispatcher.get_call_template = called.get_call_template
     dispatcher.get_overload = called.get_overload

@@ -1,10 +1,10 @@
 """Decorators for compiled kernels.
 
 A kernel is a pure function of arrays, records and scalars. A function decorated with ``kernel`` can
-be called from Python. On its first call, Numba compiles the function and all functions that it
-calls. Numba stores the code in the folder that `compiled.kernel_folder` selects. Functions
-decorated with ``inner_kernel``, ``fast_inner_kernel`` or ``inlined_kernel`` can be called only from
-other kernels. They compile in a fraction of the time.
+be called from Python. When the function is first called, Numba compiles it together with all
+functions that it calls. Numba stores the code in the folder that `compiled.kernel_folder` selects.
+Functions decorated with ``inner_kernel``, ``fast_inner_kernel`` or ``inlined_kernel`` can be called
+only from other kernels, but compile in a fraction of the time.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def fast_inner_kernel(function: Function) -> Function:
 
 
 def inlined_kernel(function: Function) -> Function:
-    """Compile an :func:`inner_kernel` inline into its callers; products and sums may be fused.
+    """Compile an inlined :func:`inner_kernel`, whose products and sums may be fused.
 
     Use this decorator for the innermost functions of a hot path, where a call costs as much as the
     function body. The code is repeated in each caller, so it should be short.

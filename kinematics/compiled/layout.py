@@ -38,7 +38,7 @@ _SCALARS: dict[Any, Any] = {float: np.float64, int: np.int64, bool: np.bool_}
 
 
 class Records(Protocol, Generic[Each]):
-    """Type of a structured array of records, which kernels index."""
+    """Type of a structured array; kernels index its records."""
 
     def __getitem__(self, index: int, /) -> Each: ...
     def __setitem__(self, index: int, record: Any, /) -> None: ...  # copies the record

@@ -1,8 +1,8 @@
 """Check that only the current user can modify a folder, and write files atomically.
 
-A user who can write to a parent folder can replace the folder, even after the check. Therefore, all
-parent folders are also checked. The folder is opened once, and files are read through its
-descriptor. The owner of each file is checked as well.
+A user who can write to a parent folder can replace the folder, even after the check. All parent
+folders are therefore checked, too. The folder is opened once, and files are read through its
+descriptor. The owner of each file is also checked.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ _config: Any = config
 
 
 class InnerKernel:
-    """Inner kernel as a Python object: Numba can compile it, but calling it from Python fails."""
+    """Inner kernel as a Python object, which Numba can compile but Python cannot call."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         self.py_func = function
