@@ -1,15 +1,15 @@
 """Exact formulas for the contact of a soft hemispherical tip, of constant modulus, with a plane.
 
 The module defines the fingertip's geometry and computes force, energy and partial derivatives. The
-tip is a hemisphere of radius a on a rigid base. Independent springs, normal to the base, stand on
-every point of the base. The object's face is displaced by d along the normal of the face. This
-normal is tilted by θ from the base normal. With h = a − d:
+tip is a hemisphere of radius a on a rigid base. An independent spring, normal to the base, stands
+on every point of the base. The object's face is displaced by d along the face's normal, which is
+tilted by θ from the base normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
 The formulas are exact. On the spherical cap, strain × area is an axisymmetric measure about the
-face's normal. All moments of this measure are therefore elementary. Beyond the limit on θ, the face
-touches the base plate.
+face's normal, and all its moments are elementary. Beyond the limit on θ, the face touches the base
+plate.
 """
 
 from __future__ import annotations

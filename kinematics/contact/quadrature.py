@@ -11,10 +11,10 @@ The ratio is 1 plus a term that describes the material's nonlinearity, so there 
 as d → 0.
 
 The integral over φ is exact. The substitution ε dφ = (t − h)/(p cos θ) dχ with p = √(t² − sin² θ)
-makes ε linear in cos χ, so a polynomial law needs few nodes. The integral over t is evaluated in y
-= √(t − sin θ); in this variable, the integrand is analytic except for poles at and near y = 0. The
-range is divided into pieces of at most one octave. The number of pieces grows logarithmically as
-the face approaches the rim.
+makes ε linear in cos χ. A polynomial law therefore needs few nodes. The integral over t is
+evaluated in y = √(t − sin θ). As a function of y, the integrand is analytic except for poles at and
+near y = 0. The range is divided into pieces of at most one octave. The number of pieces grows
+logarithmically as the face approaches the rim.
 """
 
 from __future__ import annotations

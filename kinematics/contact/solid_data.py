@@ -1,7 +1,7 @@
 """Precomputed finite element data for a solid rubber tip: energy and base pressure.
 
-The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², where
-μ = E/(2 + 2ν) and κ = E/(3 − 6ν) are the small-strain moduli. Contact is computed in the deformed
+The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)². The
+small-strain moduli are μ = E/(2 + 2ν) and κ = E/(3 − 6ν). Contact is computed in the deformed
 configuration.
 
 The data file contains dimensionless polynomials in t = √(d/a), sin² θ and Poisson's ratio ν. The
@@ -15,7 +15,7 @@ energy is U = E a³ t⁵ g(t, sin² θ). The partials of U are the force along t
 Without friction, F = N cos θ. A sticking face holds each point of the tip at the position where the
 point first touched it. The plane moves straight along its normal. N = ∂U/∂d still holds. ∂U/∂θ
 compares the energies of straight presses at different tilts. A shear force T = −N sin θ cos θ q_0
-pulls the tip up the slope. Therefore, F = N cos θ (1 − sin² θ q_0).
+pulls the tip up the slope, so that F = N cos θ (1 − sin² θ q_0).
 
 A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T) to the base pressure. The
 shear force T is assumed to act at the height a above the base, so its moment about the base centre
@@ -125,6 +125,6 @@ def to_powers(count: int) -> FloatArray:
 
 
 def _slope(rising: FloatArray) -> FloatArray:
-    """Return the derivatives of polynomials stored in columns, padded to the same length."""
+    """Return the derivatives of the polynomials in the columns, padded to the same length."""
     factors = np.arange(1.0, len(rising))[:, None]
     return np.concatenate([rising[1:] * factors, np.zeros((1, rising.shape[1]))])

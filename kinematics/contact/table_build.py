@@ -3,7 +3,7 @@
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
 higher coefficients, and rounding. The bound assumes that the reference integrals have only rounding
-errors, and that the higher coefficients continue to decrease. Both assumptions hold for all
+errors, and that the higher coefficients continue to decrease. The assumptions hold for all
 supported laws, because each law is a single polynomial. Pieces are halved until the bound is within
 the tolerance.
 """
@@ -39,8 +39,8 @@ from softfinger.kinematics.contact.table_record import (
 
 # Rounding error of the closed forms and of the final products in the kernel.
 _ROUNDING = 16.0 * np.finfo(float).eps
-# Bound on the relative rounding error of a piece. An error analysis of the pieces of seven laws of
-# degree 7 to 11 gives at most 3.5e-13. The largest part arises in y², because the terms of cos² θ −
+# Bound on the relative rounding error of a piece. An error analysis of seven laws of degree 7 to 11
+# yields at most 3.5e-13 for any piece. The largest part arises in y², because the terms of cos² θ −
 # ρ² cancel near the limit on θ.
 _PIECE_ROUNDING = 1e-12
 # Number of additional Chebyshev coefficients in h and y that are computed but not stored.

@@ -1,8 +1,8 @@
 """Define the record type of contact tables, and evaluate their polynomials.
 
-A table consists of pieces. Each piece has five polynomials in two variables, which are called lanes
-and evaluated together. The meaning of the polynomials and of their variables depends on the tip
-model; see `lookup` and `solid_lookup`.
+A table consists of pieces. Each piece has five polynomials (lanes) in two variables. The lanes are
+evaluated together. The meaning of the polynomials and of their variables depends on the tip model;
+see `lookup` and `solid_lookup`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Table(Record):
     tilt: float  # maximum |θ| of a solid tip [rad]
     by_root: float  # 2/(maximum t)
     by_square: float  # 2/(maximum sin² θ)
-    at_first: float  # g at t = 0, from Hertz theory
+    at_first: float  # g at t = 0, from Hertz's theory
     tolerance: float
     max_error: float  # bound on the relative error; for a solid tip, relative error of its data
     worst_d: float  # d at which the error is largest [m]

@@ -7,8 +7,8 @@ With t = √(d/a) and q = sin² θ, each curve is a polynomial Σ c_ij t^i q^j:
     lever    frame centroid along the tilt direction, divided by sin θ [m]
     extent   mean squared radius of the frame [m²]
 
-The lowest power of t in ``push`` is 3, so the energy U = ∫ N dd has the same polynomial form as for
-a solid tip.
+The lowest power of t in ``push`` is 3. The energy U = ∫ N dd therefore has the same polynomial form
+as for a solid tip.
 """
 
 from __future__ import annotations
