@@ -21,7 +21,7 @@ MARKER = b"\xaa\x55"
 _SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest frame
 _MARKER_COUNT_MAX = 96  # maximum number of stored markers, from which the grid size is estimated
 _GAP_TIME = 1e-3  # minimum gap between frames [s]
-_CELL_COUNT_MIN = 16  # minimum number of cells between markers; closer bytes ``AA 55`` are counts
+_CELL_COUNT_MIN = 16  # minimum number of cells between two markers
 
 
 class FlexiTacDecoder(Decoder):
@@ -29,9 +29,9 @@ class FlexiTacDecoder(Decoder):
 
     *Lock.* A marker can be distinguished from two counts ``AA 55`` only by its position. The search
     requires two markers at a distance of one frame. If another ``AA 55`` between the markers also
-    recurs one frame later, the search waits for more frames until only one position remains. The
-    decoder can't lock to a constant image that contains ``AA 55``, and counts the failed search as
-    ``ambiguous``.
+    recurs one frame later, the search waits for more frames. The search ends when only one position
+    remains. The decoder can't lock to a constant image that contains ``AA 55``, and counts the
+    failed search as ``ambiguous``.
 
     *Hold.* After locking, the decoder returns a frame when it finds the next marker at the expected
     position. The marker proves that no byte of the frame was lost. On a line with gaps between

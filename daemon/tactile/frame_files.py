@@ -398,8 +398,7 @@ def _clipped(found: FrameRecording, scale: float, full: int) -> str:
     cells = np.count_nonzero(at_top.any(axis=0))
     if top == 0 or top >= full or cells < _CLIPPED_COUNT_MIN:
         return ""
-    # If cells share the maximum reading only because of rounding, the next lower reading is about
-    # as frequent.
+    # Rounding alone makes the next lower reading about as frequent as the maximum reading.
     below = int(counts[~at_top].max(initial=0))
     if below and np.count_nonzero(at_top) <= 2 * np.count_nonzero(counts == below):
         return ""

@@ -27,7 +27,7 @@ __all__ = ["SerialReader"]
 _READ_SIZE = 65536  # maximum number of bytes per read, equal to the buffer size of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _GAP_TIME = 5e-4  # time without a byte that counts as a gap between frames [s]
-# Time after which a request is repeated, in addition to a frame's transmission time [s].
+# A request is repeated after this time [s] plus the transmission time of a frame.
 _REQUEST_TIMEOUT = 0.1
 _WAIT_MIN = 3e-4  # minimum wait [s]; shorter waits cost more than the wake-ups they avoid
 _WAIT_MAX = 2e-3  # maximum wait [s], which limits the delay if the number of missing bytes is wrong
@@ -75,8 +75,8 @@ class SerialReader:
     arrives within its transmission time plus 0.1 s, the reader repeats the request.
 
     ``latest`` may be called from any thread. Each frame has its own array, which is never modified.
-    If the port is lost or the stream becomes unreadable, the reader provides a final frame with the
-    old data and ``valid`` False.
+    If the port is lost or the stream becomes unreadable, the reader provides the old data again in
+    a frame with ``valid`` False.
     """
 
     request = b""
