@@ -29,8 +29,8 @@ Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: reques
 
 _ANSWER_TIMEOUT = 0.4  # maximum time to wait for the gateway before confirming a local stop [s]
 _COMMANDS_PER_TICK = 2  # maximum number of commands per tick, not counting stops
-_UNPACKED_SIZE_MAX = 4096  # number of bytes after which unpacking pauses until the next tick
-_OUTCOME_COUNT_MAX = 256  # maximum number of stored outcomes of requests with a key
+_UNPACKED_SIZE_MAX = 4096  # After this number of bytes, unpacking pauses until the next tick.
+_OUTCOME_COUNT_MAX = 256  # maximum number of stored outcomes
 _KEY_LENGTH_MAX = 64
 _VALUE_TYPES = (str, int, float, type(None))  # bool is a subclass of int
 
@@ -50,8 +50,8 @@ class CommandServer:
         self._clock = clock
         self._changes = 0  # number of executed commands other than status and stop
         # Outcomes of requests with a key, oldest first. The dictionary keys consist of the client
-        # name and the packed request. The outcome is the reply. For a late request, the outcome is
-        # instead the number of stops and the number of changes at the first attempt.
+        # name and the packed request. The outcome is the reply. For a late request, the outcome
+        # consists of the counts of stops and changes at the first attempt.
         self._outcomes: OrderedDict[tuple[str, bytes], bytes | tuple[int, int]] = OrderedDict()
         self._stopped = b""  # reply to the last local stop
         self._answer_by = 0.0  # time at which the wait for the gateway's confirmation ends
