@@ -40,17 +40,17 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD_RESPONSE = 0.2  # fraction of the median response below which a cell counts as dead
+DEAD_RESPONSE = 0.2  # Cells below this fraction of the median response are dead.
 _EXPONENTS = (0.3, 3.0)
-_UNREST_SIGMA = 8.0  # multiple of the median noise above which a cell is unsteady
+_UNREST_SIGMA = 8.0  # Cells above this multiple of the median noise are unsteady.
 # A tare fails if at least this many cells are unsteady. Fewer unsteady cells may merely be faulty.
 _UNREST_CELL_COUNT = 4
-_TILT_MIN = math.radians(3.0)  # minimum tilt range from which the rotation can be determined
+_TILT_MIN = math.radians(3.0)  # minimum range of the tilts for determining the rotation
 _UPRIGHT_ERROR = math.radians(0.5)
 _PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, as a multiple of the noise
 _LAG_MAX = 8  # maximum lag of the noise correlation, in cells
-_SIGNIFICANT_SIGMA = 4.0  # number of standard errors above which a result is significant
-# Minimum zero offset that is not affected by clipping at 0, in noise standard deviations.
+_SIGNIFICANT_SIGMA = 4.0  # Results above this number of standard errors are significant.
+# Clipping at 0 does not affect zero offsets above this number of noise standard deviations.
 _CLIPPED_SIGMA = 4.0
 _HOLD_RATIO_MIN = 2.0  # minimum hold time, as a multiple of the longest time constant
 _ITERATIONS = 25  # number of iterations that alternate between F∞ and the strengths

@@ -89,8 +89,8 @@ def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
     """Find the loading branch of a test, and the d at which the curve begins.
 
     Rubber softens in its first cycles (Mullins, 1948). The last cycle that reaches the full depth
-    is therefore used. The branch ends when d is within 0.5 % of its maximum, so that it does not
-    include a hold.
+    is therefore used. The branch ends when d is within 0.5 % of its maximum, and thus excludes a
+    hold.
 
     Parameters
     ----------

@@ -15,14 +15,14 @@ FloatArray = NDArray[np.float64]
 DURATION_MAX = 3600.0  # maximum recording time [s], which limits the memory use
 _STEP = 0.01  # step of the time grid for motion and torque [s]
 _WINDOW = 6  # half width of the window for velocity and acceleration, in steps
-_GAP_MAX = 0.035  # maximum gap in the data across which values are interpolated [s]
-# Minimum speed at which static friction has mostly vanished [rad/s]. For the XL330, a speed of 0.12
-# rad/s is sufficient.
+_GAP_MAX = 0.035  # maximum gap that is interpolated [s]
+# Static friction has mostly vanished above this speed [rad/s]. For the XL330, a speed of 0.12 rad/s
+# is sufficient.
 _SLIDING_SPEED = 0.2
-# Speed below which a joint counts as stationary [rad/s]: one count of 1.5 mrad in 0.08 s.
+# A joint is stationary below this speed [rad/s], which is one encoder count (1.5 mrad) in 0.08 s.
 _REST_SPEED = 0.02
-# Rotation that counts as break-away [rad]: three counts, which are ten times the elastic deflection
-# of the gears.
+# Minimum rotation at break-away [rad]. The value is three encoder counts, or ten times the elastic
+# deflection of the gears.
 _BREAK_AWAY_DISTANCE = 5e-3
 # Maximum goal velocity at break-away [rad/s], and number of steps over which it is averaged. The
 # limit keeps the inertial torque small.

@@ -104,7 +104,7 @@ def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | 
 
     Filled rubber softens over its first cycles (Mullins, 1948), so one fit cannot describe both
     first and repeated presses. The mean covers all poses (``d`` [n] [m], ``theta`` [n] [rad]) that
-    are pressed repeatedly. The result is None if there are no such poses.
+    are pressed repeatedly. The result is None if no pose is repeated.
     """
     poses = np.round(np.stack([d / _REPEATED_D, theta / _REPEATED_THETA], axis=1))
     _, which = np.unique(poses, axis=0, return_inverse=True)
@@ -314,6 +314,6 @@ def fit_place(
 
 
 def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:
-    """Look up the d [m] of an upright tip at ``force`` [N] in its contact table."""
+    """Look up the displacement d [m] of an upright tip at ``force`` [N] in its contact table."""
     d = np.linspace(0.0, 0.4 * tip.radius, 401)
     return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)
