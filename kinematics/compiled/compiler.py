@@ -6,8 +6,8 @@ Only this module uses Numba's private interfaces. With Numba versions that have 
 `KernelCompiler` runs only the passes that kernels need. The compiler omits the passes for closures,
 `with` statements and parallel loops. The compiler does not prune constant branches, because LLVM
 prunes them anyway. Type annotations are not stored, because they would fill the cache. The compiler
-caches the result types of operations and the sizes of LLVM types. Without these caches, Numba would
-search dozens of candidates for each operation and let LLVM parse a module for each size.
+caches the result types of operations and the sizes of LLVM types. Without the cache, Numba would
+search dozens of candidates for each operation, and LLVM would parse a module for each size.
 
 A `BitcodeKernel` is compiled to LLVM bitcode but not to machine code. Only other kernels can call a
 `BitcodeKernel`. By default, Numba compiles each function that a kernel calls as if Python might

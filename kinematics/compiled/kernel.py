@@ -21,7 +21,7 @@ from softfinger.kinematics.compiled import plain
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Minor versions of Numba with which `compiler` was tested; it uses private interfaces.
+# Minor versions of Numba whose private interfaces were tested with `compiler`.
 TESTED_NUMBA = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
 # index(k) converts k to an unsigned index. Negative indices count from the end, so Numba tests the
@@ -38,7 +38,7 @@ class JitDisabled(SoftfingerError):
 
 
 def _chosen_compiler() -> tuple[ModuleType, str]:
-    """Return the compiler module and, if it is `plain`, the reason (otherwise an empty string)."""
+    """Return the compiler module and a reason, which is empty unless the module is `plain`."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         raise JitDisabled(
             "NUMBA_DISABLE_JIT is set, but the kernels must be compiled; unset this variable"

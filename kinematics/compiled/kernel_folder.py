@@ -1,9 +1,10 @@
 """Manage the cache folders for compiled kernels, one per version of the sources and compiler.
 
-The folder name is a digest of the processor, the versions of Python, Numba, llvmlite and NumPy, and
-all sources that may affect a kernel. Outdated kernels are therefore never loaded. The files are
-unpickled and executed, so the folder is used only if no other user can modify it. Each file begins
-with a digest of its content. If a file is corrupted, its kernel is compiled again.
+The folder name is a digest of all sources that may affect a kernel. The digest also includes the
+processor and the versions of Python, Numba, llvmlite and NumPy. Outdated kernels are therefore
+never loaded. The files are unpickled and executed, so the folder is used only if no other user can
+modify it. Each file begins with a digest of its content. If a file is corrupted, its kernel is
+compiled again.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
 # Number of other cache folders to keep, for example those of other checkouts or the previous
 # release.
 _FOLDERS_MAX = 4
-_RECENT = 600.0  # age below which a folder may still be in use and is not removed [s]
+_RECENT = 600.0  # minimum age of a removed folder [s]; newer folders may be in use
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",

@@ -18,8 +18,8 @@ A record is declared once as a class. Python code and kernels then access the sa
         deeper(tip, more)     # an inner kernel takes the record itself
 
 A field is a `float`, an `int` (64 bit), a `bool`, another record, or an array of fixed shape
-declared with :data:`Annotated`. Arrays whose size depends on a grid cannot be fields, because
-kernels would have to be compiled again for each size.
+declared with :data:`Annotated`. Arrays whose size depends on a grid cannot be fields, because each
+size would require another compilation.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ def fault(path: Path, found: os.stat_result) -> str:
     """Return the reason why other users can modify ``path``, or "" if they cannot modify it.
 
     ``found`` is the stat result for the path. The owner must be this user or root. Folders with the
-    sticky bit, such as /tmp, are allowed, because only the owner of an entry can replace the entry.
+    sticky bit, such as /tmp, are allowed, because only an entry's owner can replace the entry.
     """
     if not HAS_OWNERS:
         return ""
