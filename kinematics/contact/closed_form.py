@@ -8,8 +8,8 @@ tilted by θ from the base normal. With h = a − d:
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
 The formulas are exact. On the spherical cap, strain × area is an axisymmetric measure about the
-face's normal, and all its moments are elementary. Beyond the limit on θ, the face touches the base
-plate.
+face's normal. The moments of such a measure are elementary. Beyond the limit on θ, the face touches
+the base plate.
 """
 
 from __future__ import annotations
@@ -143,9 +143,9 @@ _quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 
-    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN input.
-    The formulas are valid up to the limit on θ. Beyond the limit, the function still evaluates the
-    same formulas.
+    ``d`` [m] and ``theta`` [rad] are broadcast. The results are zero for d ≤ 0 and NaN for NaN
+    input. The formulas are valid up to the limit on θ. Beyond the limit, the function still
+    evaluates the same formulas.
     """
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)

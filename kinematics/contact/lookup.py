@@ -49,11 +49,11 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bit pattern of the smallest numb
 
 @inlined_kernel
 def _slab(h: float) -> tuple[int, float]:
-    """Return the slab index of h in (H_END, 1], and the position of h in its slab, from −1 to 1.
+    """Return the slab index of h, and the position of h in the slab, from −1 to 1.
 
-    The index and the position are computed from the bits of h. The exponent determines the octave.
-    The mantissa determines the slab and the position. Each slab includes its upper end but not its
-    lower end.
+    h must be in (H_END, 1]. The index and the position are computed from the bits of h. The
+    exponent determines the octave. The mantissa determines the slab and the position. Each slab
+    includes its upper end but not its lower end.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
     fraction = ((number << SLAB_BITS) & _FRACTION) | _ONE

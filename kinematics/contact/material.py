@@ -86,10 +86,10 @@ class Material:
         The paper gives slopes of the stress-strain curve ('Young's modulus, which corresponds to
         the slope'). The slopes are used as the tangent modulus dσ/dε. The modulus is 0.135 MPa at
         zero strain, and 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at strains of 20 to 100 %. The
-        modulus is interpolated by the lowest-degree polynomial with zero slope at zero strain,
-        because the paper calls the first value the smallest. The interpolating polynomial increases
-        on [0, 1]. The largest modulus in the paper, 0.304 MPa, occurs above 100 % strain and is not
-        used.
+        modulus is interpolated by the lowest-degree polynomial with zero slope at zero strain. The
+        zero slope is required because the paper calls the first value the smallest. The
+        interpolating polynomial increases on [0, 1]. The largest modulus in the paper, 0.304 MPa,
+        occurs above 100 % strain and is not used.
         """
         return cls(tuple(map(Fraction, _TABLE_I.split())), name="table_i")
 

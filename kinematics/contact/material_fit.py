@@ -20,13 +20,13 @@ __all__ = ["MaterialError"]
 
 MIN_POINTS = 4
 _DEGREES = range(11)  # polynomial degrees of the modulus, in the order in which they are tried
-_NEGLIGIBLE_MISFIT = 1e-9  # misfit that is negligible, relative to the maximum stress
+_NEGLIGIBLE_MISFIT = 1e-9  # negligible misfit, relative to the maximum stress
 # A lower degree is accepted if its misfit is at most this multiple of the smallest misfit.
 _MISFIT_RATIO_MAX = 1.5
 _MISFIT_MAX = 0.05  # maximum misfit of a successful fit, relative to the maximum stress
 _MODULUS_MIN = 1e-3  # minimum modulus, relative to the mean modulus
 _EXTENSION_WEIGHT = 0.1  # weight of the points that extend the curve
-_SMOOTHING = 1e-7  # weight of the modulus's second differences, which prevents oscillation
+_SMOOTHING = 1e-7  # weight of the second differences of the modulus, to prevent oscillation
 
 
 class MaterialError(SoftfingerError, ValueError):

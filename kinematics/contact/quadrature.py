@@ -7,8 +7,8 @@ plane, and the object's face cuts the spherical cap, so
 
 The coordinates are t = n·P and the angle φ about the normal n. With lengths divided by a, dx dy = z
 dt dφ. The integrals give the ratio of each quantity to its closed form for a constant modulus E₀.
-The ratio is 1 plus a term that describes the material's nonlinearity, so there is no cancellation
-as d → 0.
+The ratio is 1 plus a term for the nonlinearity of the material. This form avoids cancellation as d
+→ 0.
 
 The integral over φ is exact. The substitution ε dφ = (t − h)/(p cos θ) dχ with p = √(t² − sin² θ)
 makes ε linear in cos χ. A polynomial law therefore needs few nodes. The integral over t is
@@ -203,7 +203,7 @@ def integrate(
 ) -> ClosedForms:
     """Integrate force, energy and first partials for any material, with a relative error of 1e-14.
 
-    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. The results are NaN
+    ``d`` [m] and ``theta`` [rad] are broadcast. The results are zero for d ≤ 0. The results are NaN
     outside the domain, which ends at d = a and at the limit on θ. ``nodes`` is as in
     :func:`ratios`.
     """

@@ -96,8 +96,8 @@ def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
 def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate `lookup.lookup`.
 
-    If |θ| is beyond the range of the data, the energy is assumed to be independent of θ, and the
-    partials are computed accordingly. The force still varies with cos θ.
+    If |θ| is beyond the range of the data, the energy is assumed to be independent of θ. The
+    partials are consistent with this assumption. The force still varies with cos θ.
     """
     within = abs(theta) <= table.tilt
     inside = within and d <= table.deepest

@@ -84,7 +84,7 @@ _numbers: Any = tuple.__new__
 
 _EDGE_FACTOR = 1.0 - 1e-12  # factor that keeps edge points inside the domain despite rounding
 
-_LAW_ERROR = 0.05  # relative force error due to the law's misfit, above which `build` warns
+_LAW_ERROR = 0.05  # `build` warns if the law's misfit causes a larger relative force error.
 
 
 class ContactTable:
@@ -185,7 +185,7 @@ class ContactTable:
         Parameters
         ----------
         d, theta
-            Numbers or arrays, which broadcast. If d and theta are numbers, the results are numbers.
+            Numbers or arrays, which are broadcast. If d and theta are numbers, the results are numbers.
             Results are zero for d ≤ 0 and NaN for NaN input.
         edge
             If True, clamp points outside the domain without a RuntimeWarning. Regardless of

@@ -128,8 +128,8 @@ def _bound(values: FloatArray, lost: FloatArray, h: FloatArray, y: FloatArray) -
     """Return the bound on a piece's relative error and the approximate location of the maximum.
 
     ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` contains the Chebyshev
-    coefficients of the difference between ratios and table. The sum of the magnitudes of these
-    coefficients bounds the difference. Higher coefficients are not computed. Each coefficient is
+    coefficients of the difference between ratios and table. The difference is at most the sum of
+    the magnitudes of the coefficients. Higher coefficients are not computed. Each coefficient is
     less than half of its predecessor, because the ratios are analytic well beyond the piece. In
     each direction, the higher coefficients therefore contribute less than twice the last two
     coefficients.

@@ -85,7 +85,7 @@ class TipCurves:
         return math.sin(self.tilt) ** 2
 
     def at(self, curve: Curve, d: ArrayLike, theta: ArrayLike) -> FloatArray:
-        """Evaluate one of the curves at d [m] and θ [rad], which broadcast."""
+        """Evaluate one of the curves at d [m] and θ [rad], which are broadcast."""
         t, q = np.sqrt(np.asarray(d) / self.radius), np.sin(theta) ** 2
         return np.asarray(_value(*np.broadcast_arrays(t, q), np.array(curve)))
 
@@ -104,7 +104,7 @@ class TipCurves:
 
 
 def _shifted_polynomial(count: int, end: float) -> FloatArray:
-    """Return the powers of u = end/2 (1 + x) as polynomials in x, [power of u, power of x]."""
+    """Expand the powers of u = end/2 (1 + x) in powers of x: [power of u, power of x]."""
     return np.array(
         [[(0.5 * end) ** i * math.comb(i, k) for k in range(count)] for i in range(count)]
     )
