@@ -1,4 +1,4 @@
-"""Read a tactile board's serial port in a thread and provide its newest complete frame.
+"""Read a tactile board's serial port in a thread, and provide the newest complete frame.
 
 This module handles the port, the thread and the timing for all serial framings. A :class:`Decoder`
 handles only the bytes of one framing.

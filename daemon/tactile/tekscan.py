@@ -349,6 +349,6 @@ def _per_area() -> dict[str, float]:
 
 
 def _plain_unit(unit: str) -> str:
-    """Normalise a unit, including different notations for squares."""
+    """Convert a unit to a uniform notation, in which squares end in 2."""
     plain = re.sub(r"[\s\[\]()]", "", unit.translate(_SQUARES)).lower()
     return re.sub(r"(sq|square)([a-z]+)", r"\g<2>2", plain)

@@ -88,7 +88,7 @@ def _tilt(finger: FingerState) -> str:
 
 
 def state_html(state: HandState) -> str:
-    """Return an HTML table of both fingers, with a one-line summary of the state as its caption."""
+    """Return an HTML table of both fingers; the caption summarises the state in one line."""
     rows: dict[str, Callable[[FingerState], str]] = {
         "force [N]": lambda finger: _force(finger) if finger.contact else "",
         "d [mm]": lambda finger: _depth(finger) if finger.contact else "",
