@@ -86,7 +86,7 @@ class Run:
 
 
 def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
-    """Find the loading branch of a test, and the d at which the curve begins.
+    """Find the loading branch of a test, and the displacement at which the curve begins.
 
     Rubber softens in its first cycles (Mullins, 1948). The last cycle that reaches the full depth
     is therefore used. The branch ends when d is within 0.5 % of its maximum, and thus excludes a

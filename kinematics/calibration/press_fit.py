@@ -103,8 +103,8 @@ def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | 
     """Compare first presses with their repetitions; return the mean relative excess force.
 
     Filled rubber softens over its first cycles (Mullins, 1948), so one fit cannot describe both
-    first and repeated presses. The mean covers all poses (``d`` [n] [m], ``theta`` [n] [rad]) that
-    are pressed repeatedly. The result is None if no pose is repeated.
+    first and repeated presses. The mean is taken over the poses (``d`` [n] [m], ``theta`` [n]
+    [rad]) that occur more than once. The result is None if no pose is repeated.
     """
     poses = np.round(np.stack([d / _REPEATED_D, theta / _REPEATED_THETA], axis=1))
     _, which = np.unique(poses, axis=0, return_inverse=True)
@@ -261,8 +261,8 @@ def fit_place(
 ) -> tuple[SensorGrid, float, float]:
     """Fit the tip centre and, if ``rotate`` is True, the sensor rotation.
 
-    The tilts are known. The Gauss-Newton method also fits the depth of each press, starting from
-    ``presses.d``, and the modulus of a spring tip. Returns the grid, the last step [m] and the
+    The tilts are known. The Gauss-Newton method also fits the modulus of a spring tip and the depth
+    of each press. The initial depths are ``presses.d``. Returns the grid, the last step [m] and the
     standard deviation of the centre [m].
     """
     gain, free_gain = 1.0, tip.physics == "springs"

@@ -8,8 +8,8 @@ tilted by θ from the base normal. With h = a − d:
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
 The formulas are exact. On the spherical cap, strain × area is an axisymmetric measure about the
-face's normal. The moments of such a measure are elementary. Beyond the limit on θ, the face touches
-the base plate.
+face's normal. The moments of this measure are elementary functions. Beyond the limit on θ, the face
+touches the base plate.
 """
 
 from __future__ import annotations

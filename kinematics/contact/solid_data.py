@@ -18,8 +18,8 @@ compares the energies of straight presses at different tilts. A shear force T = 
 pulls the tip up the slope, so that F = N cos θ (1 − sin² θ q_0).
 
 A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T) to the base pressure. The
-shear force T is assumed to act at the height a above the base. Its moment about the base centre is
-therefore T·a.
+shear force T is assumed to act at a height of one radius a above the base. Its moment about the
+base centre is therefore T·a.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Contact tables for solid and measured tips, and the lookup kernels for these tables.
 
 All six outputs are derived from the energy U = E a³ t⁵ g (see `solid_data`). The function g(t, sin²
-θ) is a polynomial in t = √(d/a) and sin² θ. The outputs are therefore consistent to within
-rounding. For a sticking face, a second polynomial q_0 describes the reduction of the base force.
+θ) is a polynomial in t = √(d/a) and sin² θ. The outputs are therefore consistent with each other to
+within rounding. For a sticking face, a second polynomial q_0 describes the reduction of the base
+force.
 """
 
 from __future__ import annotations

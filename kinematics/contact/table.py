@@ -185,8 +185,8 @@ class ContactTable:
         Parameters
         ----------
         d, theta
-            Numbers or arrays, which are broadcast. If d and theta are numbers, the results are numbers.
-            Results are zero for d ≤ 0 and NaN for NaN input.
+            Numbers or arrays, which are broadcast. If both are numbers, the results are numbers.
+            The results are zero for d ≤ 0 and NaN for NaN input.
         edge
             If True, clamp points outside the domain without a RuntimeWarning. Regardless of
             ``edge``, ``inside`` is False for clamped points.
