@@ -163,7 +163,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
 
 
 def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) -> str:
-    """Return the name of the only array that can contain frames, or raise ValueError."""
+    """Return the name of the frames array. Raises ValueError if no single array qualifies."""
     if "frames" in names:
         return "frames"
     shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
