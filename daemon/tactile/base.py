@@ -13,7 +13,7 @@ __all__ = ["TactileSensor"]
 
 
 class TactileSensor(Protocol):
-    """Pressure grid under one fingertip. The grid is read outside the tick."""
+    """Pressure sensor under one fingertip, which is read outside the control tick."""
 
     def open(self) -> None:
         """Open the sensor and wait for a valid frame. Raises TactileError if no frame arrives."""
@@ -25,10 +25,10 @@ class TactileSensor(Protocol):
         """
 
     def counters(self) -> dict[str, int]:
-        """Return the counts since opening: ``frames``, ``resyncs``, ``skipped_bytes``, …"""
+        """Return counts since `open` was called: ``frames``, ``resyncs``, ``skipped_bytes``, …"""
 
     def close(self) -> None:
-        """Stop reading and close. Never raises."""
+        """Stop reading and close the sensor. Never raises."""
 
 
 def make_sensor(
@@ -38,8 +38,8 @@ def make_sensor(
 
     Returns None if the scene has no sensors.
 
-    ``hand`` is the simulated hand, for backends that use it. Raises the same errors as the
-    backend's constructor.
+    ``hand`` is the simulated hand, which some backends use. Raises the same errors as the backend's
+    constructor.
     """
     found = backend("tactile", settings.tactile.backend)
     if settings.tactile.backend == "none":

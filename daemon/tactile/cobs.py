@@ -1,6 +1,6 @@
-"""Read boards with COBS framing, a format intended for custom boards and 44 × 44 sensors.
+"""Read boards with COBS framing, a format for custom boards and for sensors of 44 × 44 cells.
 
-The firmware sends each scan without being asked, at any baud rate (USB boards may ignore the rate):
+Any baud rate is allowed, and USB boards may ignore it. The firmware sends every scan unprompted:
 
 1. Build the message with all numbers in little-endian order:
 
@@ -16,27 +16,27 @@ The firmware sends each scan without being asked, at any baud rate (USB boards m
    12      …      rows × cols counts, row by row
    ======  ====== =====================================================================
 
-2. Append the CRC-16 of the message, low byte first: polynomial 0x1021, initial value 0xFFFF,
-   highest bit first, no inversion (CRC-16/IBM-3740, also called CCITT-FALSE; "123456789" gives
-   0x29B1)::
+2. Append the CRC-16 of the message, low byte first. The CRC type is CRC-16/IBM-3740 (CCITT-FALSE):
+   polynomial 0x1021, initial value 0xFFFF, highest bit first, no inversion. The CRC of "123456789"
+   is 0x29B1. To compute the CRC::
 
        crc = 0xFFFF
        for each byte:  crc ^= byte << 8
                        eight times:  crc = (crc << 1) ^ (crc & 0x8000 ? 0x1021 : 0)   in 16 bits
 
 3. Encode the message with COBS, which removes all zero bytes. Split the message at its zero bytes
-   and drop the zero bytes. Write each piece as one byte with the value length + 1, followed by the
-   piece. Split pieces of 254 bytes or more into blocks of 254 bytes, each preceded by the byte 255.
-   The rest of the piece, which may be empty, follows as a separate piece. (An empty piece at the
-   end of the message may be omitted.)
+   and drop the zero bytes. Before each piece, write one byte: the length of the piece plus 1. Split
+   pieces of 254 bytes or more into blocks of 254 bytes, each preceded by the byte 255. Send the
+   rest of the piece, which may be empty, as a separate piece. (An empty piece at the end of the
+   message may be omitted.)
 
 4. Send a zero byte. An additional zero byte before the first frame is allowed.
 
 A 44 × 44 frame of uint16 counts takes at most 3903 bytes on the wire. `encode` is the reference
 implementation. A reader that starts in the middle of a frame synchronises at the next zero byte.
-Incomplete and corrupted frames are dropped: the CRC detects every error within 16 adjacent bits,
-and all but 1 in 65536 other errors. Gaps in the sequence numbers indicate the number of missed
-frames.
+Incomplete and corrupted frames are dropped. The CRC detects every error that is confined to 16
+adjacent bits. Of all other errors, the CRC misses 1 in 65536. The sequence numbers show how many
+frames were missed.
 """
 
 from __future__ import annotations
@@ -61,8 +61,7 @@ _BLOCK = 254  # maximum length of a COBS block [bytes]
 def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
     """Encode a frame with counts [rows, cols], a sequence number and the board time ``t`` [s].
 
-    `encode` is the reference implementation for firmware. Raises ValueError if the counts are
-    neither uint8 nor uint16.
+    Raises ValueError if the counts are not an array [rows, cols] of uint8 or uint16.
     """
     if counts.dtype not in (np.uint8, np.uint16) or counts.ndim != 2:
         raise ValueError(f"counts must be uint8 or uint16 [rows, cols], got {counts.dtype}")
@@ -80,7 +79,7 @@ def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -
 
 
 def longest_frame(rows: int, cols: int) -> int:
-    """Return the maximum size of a uint16 frame on the wire in bytes, including the delimiter."""
+    """Return the maximum wire size [bytes] of a uint16 frame, including the delimiter."""
     message = _HEADER.size + 2 * rows * cols + _CRC.size
     return message + 1 + message // _BLOCK + 1
 
@@ -120,7 +119,7 @@ class CobsDecoder(DelimitedDecoder):
         self._wraps = 0  # number of overflows of the board clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """Parse as in :meth:`DelimitedDecoder.parse`; also read the sequence number and time."""
+        """Parse a packet like :meth:`DelimitedDecoder.parse`, with its sequence number and time."""
         if len(packet) >= self.longest:
             self._reason = f"packets of {len(packet)} bytes"
             return None
@@ -152,7 +151,7 @@ class CobsDecoder(DelimitedDecoder):
         # restarted. SensorClock detects restarts.
         self._wraps += ticks < self._ticks
         self._ticks = ticks
-        # Two-byte counts are not copied, because no other frame uses this buffer.
+        # Two-byte counts need no copy, because no other frame uses this buffer.
         cells = message[_HEADER.size : size].view(f"<u{kind}")
         counts = cells.astype(np.uint16, copy=False)
         t_sensor = (self._wraps * 2.0**32 + ticks) * _TICK

@@ -1,6 +1,6 @@
-"""Decode bytes from serial boards into frames: interface of the decoders and shared code.
+"""Define the interface and the shared code of decoders, which convert serial bytes to frames.
 
-A decoder works incrementally, without a port, clock or thread.
+A decoder processes bytes as they arrive, without a port, a clock or a thread.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from numpy.typing import NDArray
 
 __all__ = ["Decoded", "DelimitedDecoder"]
 
-_LOST_AFTER = 10  # number of frame lengths without a frame that indicates a lost stream
+_LOST_AFTER = 10  # The stream is lost after this many frame lengths without a frame.
 
 
 @dataclass(slots=True)
 class Decoded:
-    """Decoded frame: newly allocated counts [rows, cols] and the time of its last byte [s]."""
+    """Decoded frame: a new array of counts [rows, cols], and the read time [s] of the last byte."""
 
     data: NDArray[np.uint16]
     t: float
     steps: int = 1  # increase in the board's sequence number since the previous frame
     t_sensor: float | None = None  # board clock at mid-scan [s]
-    behind: int = 0  # number of bytes after the frame in the same read
+    behind: int = 0  # number of bytes that follow the frame in the same read
 
 
 class Decoder(ABC):
     """Converter from bytes to frames [rows, cols].
 
-    Every byte is either part of a frame, counted in ``skipped_bytes``, or still in the buffer.
-    ``frame_bytes`` is the length of a frame on the wire, or of the last frame if lengths vary.
+    Every received byte belongs to a frame, is counted in ``skipped_bytes``, or is still buffered.
+    ``frame_bytes`` is the wire length of a frame or, if lengths vary, of the last frame.
     """
 
     def __init__(self, rows: int, cols: int, frame_bytes: int) -> None:
@@ -47,7 +47,7 @@ class Decoder(ABC):
 
     @abstractmethod
     def feed(self, data: bytes, t: float) -> Decoded | None:
-        """Add bytes read at time ``t`` [s]; return the newest frame that they complete, or None."""
+        """Add bytes read at time ``t`` [s]; return the newest completed frame, or None."""
 
     @abstractmethod
     def diagnosis(self) -> str:
@@ -59,9 +59,9 @@ class Decoder(ABC):
         return False
 
     def settle(self) -> Decoded | None:
-        """Return the pending frame.
+        """Return the pending frame, or None.
 
-        The reader calls this method when the line is quiet after the last byte.
+        The reader calls this method when bytes stop arriving.
         """
         return None
 
@@ -73,12 +73,12 @@ class Decoder(ABC):
 
     @property
     def lost(self) -> bool:
-        """True if no frame was found in the last ten frame lengths of data."""
+        """True if the last ten frame lengths of data contained no frame."""
         behind = self._skipped - self._skipped_at_frame + len(self._buffer)
         return behind > _LOST_AFTER * self.frame_bytes
 
     def counters(self) -> dict[str, int]:
-        """Return ``frames``, ``resyncs`` (synchronisation losses), ``skipped_bytes``, etc."""
+        """Return counts: ``frames``, ``resyncs`` (synchronisation losses), ``skipped_bytes``, …"""
         return {
             "frames": self._frames,
             "resyncs": self._resyncs,
@@ -90,27 +90,27 @@ class Decoder(ABC):
 
 
 class DelimitedDecoder(Decoder):
-    """Decoder for packets that end with a delimiter byte, which does not occur elsewhere.
+    """Decoder for packets that end with a delimiter byte, which occurs nowhere else.
 
-    A packet is complete at its delimiter. After any corruption, the decoder resynchronises at the
-    next packet. The buffer is at most as long as the longest packet.
+    After any corruption, the decoder resynchronises at the next packet. The buffer never exceeds
+    the length of the longest packet.
     """
 
     def __init__(self, rows: int, cols: int, delimiter: bytes, longest: int) -> None:
         """Create a decoder.
 
-        ``longest`` is the maximum frame size on the wire in bytes, including the delimiter.
+        ``longest`` is the maximum wire size of a frame [bytes], including the delimiter.
         """
         super().__init__(rows, cols, longest)
         self.longest = longest
         self._delimiter = delimiter
-        # Number of bytes in the buffer that were already searched for a delimiter.
+        # Number of buffered bytes that have already been searched for a delimiter.
         self._scanned = 0
         self._reason = ""  # short reason why the last packet was rejected
 
     @abstractmethod
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """Return the frame in a packet (without delimiter), or None after setting ``_reason``.
+        """Parse a packet without its delimiter; on failure, set ``_reason`` and return None.
 
         ``t`` [s] is the read time of the packet's last byte.
         """

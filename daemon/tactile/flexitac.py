@@ -1,8 +1,8 @@
 """Read FlexiTac boards over a serial port.
 
-In the stream (2,000,000 baud), each frame is ``AA 55`` followed by rows × cols bytes in row-major
-order, one per count. A frame contains no length, sequence number or checksum, and ``AA 55`` may
-also occur among the counts.
+The boards send at 2,000,000 baud. Each frame consists of the marker ``AA 55`` and rows × cols
+bytes, one byte per count in row-major order. A frame contains no length, sequence number or
+checksum. The bytes ``AA 55`` may also occur among the counts.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
 _SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest frame
-_MARKER_COUNT_MAX = 96  # maximum number of stored markers, used to detect a different grid size
+_MARKER_COUNT_MAX = 96  # maximum number of stored markers, from which the grid size is estimated
 _GAP_TIME = 1e-3  # minimum gap between frames [s]
-_CELL_COUNT_MIN = 16  # minimum number of cells between markers; a closer ``AA 55`` is image data
+_CELL_COUNT_MIN = 16  # minimum number of cells between two markers
 
 
 class FlexiTacDecoder(Decoder):
     """Decoder for FlexiTac streams.
 
     *Lock.* A marker can be distinguished from two counts ``AA 55`` only by its position. The search
-    requires two markers one frame apart. If other ``AA 55`` pairs between the markers recur at the
-    same distance, the search waits for more frames until only one position remains. The decoder
-    can't lock to a constant image that contains ``AA 55``; such searches are counted as
-    ``ambiguous``.
+    requires two markers at a distance of one frame. If another ``AA 55`` between the markers also
+    recurs one frame later, the search waits for more frames. The search ends when only one position
+    remains. The decoder can't lock to a constant image that contains ``AA 55``, and counts the
+    failed search as ``ambiguous``.
 
-    *Hold.* After locking, a frame is returned when the next marker is found at its expected
-    position, which proves that no byte of the frame was lost. On a line with gaps between frames,
-    waiting for the next marker would delay every frame by one period. On a line with gaps, a
-    complete frame is therefore returned immediately if it can't consist of parts of two frames: its
-    counts contain no ``AA 55``, and its bytes arrived within their transmission time. All other
-    frames are returned at the next marker or by ``settle``.
+    *Hold.* After locking, the decoder returns a frame when it finds the next marker at the expected
+    position. The marker proves that no byte of the frame was lost. On a line with gaps between
+    frames, waiting for the next marker would delay every frame by one period. After a gap, the
+    decoder therefore returns a complete frame immediately if the frame can't consist of parts of
+    two frames. The bytes must have arrived within their transmission time, and the counts must not
+    contain ``AA 55``. All other frames are returned at the next marker or by ``settle``.
 
     *Loss.* If a marker is not at its expected position, the preceding frame is dropped, and the
     search restarts.
@@ -50,7 +50,7 @@ class FlexiTacDecoder(Decoder):
         self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # [s]
         self._t_whole = -math.inf  # time at which the last returned frame was complete
         self._start = 0  # stream position of the buffer's first byte
-        # End position in the stream and read time of each piece in the buffer.
+        # For each buffered piece: stream position of its end, and read time [s].
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
         self._markers: deque[int] = deque(
@@ -73,7 +73,7 @@ class FlexiTacDecoder(Decoder):
         return newest
 
     def settle(self) -> Decoded | None:
-        """Settle as in :meth:`Decoder.settle`; return None if the counts may contain a marker."""
+        """Return the pending frame, or None if its counts may contain a marker."""
         return self._take() if self.pending and not self._may_be_spliced() else None
 
     @property
@@ -82,7 +82,7 @@ class FlexiTacDecoder(Decoder):
 
     @property
     def found_cells(self) -> int:
-        """Number of cells per frame, based on the most common marker distance; 0 while locked."""
+        """Number of cells per frame, from the most common distance of markers; 0 while locked."""
         apart = Counter(b - a for a, b in combinations(self._markers, 2))
         spacings = [each for each in apart if each >= _CELL_COUNT_MIN + len(MARKER)]
         spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)
@@ -141,10 +141,10 @@ class FlexiTacDecoder(Decoder):
             self._skip(stride)
 
     def _only_place(self) -> Literal["yes", "no", "undecided", "ambiguous"]:
-        """Check whether the marker at the start of the buffer is the only consistent marker.
+        """Check whether only the marker at the start of the buffer recurs in every frame.
 
-        Each level of the search adds one frame, so the result depends only on the stream, not on
-        how the stream is split into reads.
+        Each level of the search adds one frame. The result therefore does not depend on how the
+        stream is split into reads.
         """
         buffer, stride = self._buffer, self.frame_bytes
         rivals = self._between()
@@ -171,7 +171,7 @@ class FlexiTacDecoder(Decoder):
         return markers
 
     def _misplaced(self, marker: int) -> bool:
-        """Return True if the bytes received so far at position ``marker`` can't be a marker."""
+        """Return True if the buffered bytes at position ``marker`` can't be a marker."""
         return not MARKER.startswith(self._buffer[marker : marker + len(MARKER)])
 
     def _may_be_spliced(self) -> bool:
@@ -183,7 +183,7 @@ class FlexiTacDecoder(Decoder):
         )
 
     def _in_one_go(self) -> bool:
-        """Return True if the frame at the buffer start arrived after a gap and in one piece."""
+        """Return True if the first buffered frame arrived after a gap and without interruption."""
         first, whole = self._pieces[0][1], self._pieces[-1][1]
         return first - self._t_whole > _GAP_TIME and whole - first < self._longest
 

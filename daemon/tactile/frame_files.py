@@ -2,18 +2,18 @@
 
 Supported files:
 
-- ``.npz`` with ``frames`` [n, rows, cols], or with a single three-dimensional array that has
-  another name. Optional arrays are ``t`` [n], ``live`` [rows, cols] bool, and the true contact of
-  each frame, if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
+- ``.npz`` with ``frames`` [n, rows, cols], or with exactly one three-dimensional array of any other
+  name. Optional arrays are ``t`` [n] and ``live`` [rows, cols] (bool). If the true contacts are
+  known, the arrays ``d`` [m], ``theta`` [rad] and ``force`` [N], all [n], contain them.
 - ``.npy`` with one frame [rows, cols] or several frames [n, rows, cols], or a folder of such files.
-  The files are sorted by name, and numbers in names are sorted by value. The folder may contain
-  ``t.npy`` [n].
+  The files are sorted by name, and numbers in the names by value. The folder may contain ``t.npy``
+  [n].
 - Other files are read as Tekscan-style ASCII exports.
 
 Integer frames contain counts. Floating-point frames are in Pa and are converted with
 ``pascal_per_count``. A cell that is NaN in all frames counts as dead. Negative readings are set to
-0 if noise around a tared zero can explain them. Times are in seconds unless their step size or a
-date indicates another unit.
+0 if noise around a tared zero can explain them. Times are in seconds unless their intervals or, for
+Unix times, their values indicate another unit.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ _TIMES = ("t", "time", "times", "timestamp", "timestamps")
 _COUNT_MAX = 65535
 _RANGE_ERROR = f"frames: found readings outside 0 to {_COUNT_MAX} counts"
 _LISTED_COUNT_MAX = 8  # maximum number of arrays listed in a message
-_SAMPLE_COUNT_MAX = 200  # maximum number of frames for estimating zero and noise
+_SAMPLE_COUNT_MAX = 200  # maximum number of frames from which zero and noise are estimated
 _NOISE_SIGMA_MAX = 6.0  # maximum magnitude of negative readings, in noise standard deviations
-_CLIPPED_COUNT_MIN = 3  # minimum number of cells that share the maximum reading
+_CLIPPED_COUNT_MIN = 3  # minimum number of saturated cells that causes a warning
 _UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # time units other than s
-_DATE_RANGE = (1e9, 4e9)  # Unix time [s], from 2001 to 2096
-_INTERVAL_RATIO_MAX = 100.0  # maximum ratio of actual to expected frame interval for times in s
+_DATE_RANGE = (1e9, 4e9)  # range of Unix times [s], 2001 to 2096
+_INTERVAL_RATIO_MAX = 100.0  # maximum ratio of actual to expected frame interval if times are in s
 _INTERVAL_RATIO_NOTED = 10.0  # ratio of actual to expected frame interval that causes a note
 
 
 @dataclass(frozen=True)
 class FrameRecording:
-    """Counts uint16 [n, rows, cols] and times t float64 [n] [s]; the times increase from 0.
+    """Recording of counts uint16 [n, rows, cols] at times t float64 [n] [s], which increase from 0.
 
     ``live`` [rows, cols] is False where the sensor has no cell. ``truths`` contains the true
-    contact of each frame. ``largest`` is the maximum reading in the file's unit: counts if
-    ``whole``, otherwise Pa. ``notes`` lists corrections and suspicious values, one per line.
+    contact of each frame. ``largest`` is the maximum reading, in counts if ``whole`` is True and
+    otherwise in Pa. ``notes`` lists corrections and suspicious values.
     """
 
     counts: NDArray[np.uint16]
@@ -82,7 +82,7 @@ def load_recording(
     path : file or folder
     pascal_per_count : pressure of one count [Pa]
     rate : frame rate [Hz] of a recording without times
-    noise : expected standard deviation of a cell [Pa]
+    noise : expected standard deviation of the noise of a cell [Pa]
     full_count : reading of saturated cells [counts]
 
     Raises
@@ -133,7 +133,7 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _frames(path: Path) -> NDArray[Any]:
-    """Return the frames in one .npy file [n, rows, cols]."""
+    """Return the frames [n, rows, cols] in an .npy file."""
     array = _array(path)
     if array.ndim not in (2, 3):
         raise ValueError(f"{path.name}: found shape {array.shape}, expected [n, rows, cols]")
@@ -141,7 +141,7 @@ def _frames(path: Path) -> NDArray[Any]:
 
 
 def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
-    """Return the known arrays in an .npz file."""
+    """Return the arrays with known names in an .npz file."""
     held: dict[str, NDArray[Any]] = {}
     with open_regular(path) as file, zipfile.ZipFile(file) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
@@ -163,7 +163,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
 
 
 def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) -> str:
-    """Return the name of the frames array. Raises ValueError if the name is ambiguous."""
+    """Return the name of the frames array. Raises ValueError if no single array qualifies."""
     if "frames" in names:
         return "frames"
     shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
@@ -184,7 +184,7 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
 
 def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     part = archive.getinfo(f"{name}.npy")
-    # NumPy uses only stored and deflated parts. With other compression methods, the unpacked data
+    # NumPy writes only stored and deflated parts. With other compression methods, the unpacked data
     # may exceed the stated size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name}: found an unsupported compression method, expected deflate")
@@ -213,9 +213,9 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
 
 
 def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
-    """Read the array in a .npy file.
+    """Read the array in an .npy file.
 
-    Raises ValueError if the file header states more than ``size`` bytes.
+    Raises ValueError if the header declares an array of more than ``size`` bytes.
     """
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
@@ -376,10 +376,10 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
 
 
 def _factor(t: NDArray[Any], step: float, rate: float) -> float:
-    """Return the unit [s] of undated times, derived from their step. Raises ValueError."""
+    """Return the unit [s] of times without a date, based on their intervals. Raises ValueError."""
     whole = t.dtype.kind in "ui"
     if len(t) > 2 and (t % 1 == 0).all() and (np.diff(t) == 1).all():
-        if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # about one frame per second
+        if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # The rate is about 1 Hz.
             return 1.0
         raise ValueError(
             "t: found frame numbers that increase by 1, expected times in s; remove t if the "
@@ -398,7 +398,7 @@ def _clipped(found: FrameRecording, scale: float, full: int) -> str:
     cells = np.count_nonzero(at_top.any(axis=0))
     if top == 0 or top >= full or cells < _CLIPPED_COUNT_MIN:
         return ""
-    # If the top reading is due to rounding, the next lower reading is about as frequent.
+    # Rounding alone makes the next lower reading about as frequent as the maximum reading.
     below = int(counts[~at_top].max(initial=0))
     if below and np.count_nonzero(at_top) <= 2 * np.count_nonzero(counts == below):
         return ""

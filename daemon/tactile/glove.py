@@ -1,13 +1,13 @@
-"""Read a 32 × 32 glove-style board, which is polled over a serial port.
+"""Read a glove-style board with 32 × 32 cells by polling it over a serial port.
 
 The board runs at 1,000,000 baud. The host writes ``a``, and the board replies with one frame of 2 +
-2 · rows · cols bytes. A frame consists of the index + 11, then for each cell in row-major order the
-high 5 bits + 11 and the low 5 bits + 11, and finally a newline (10). Only the last byte can be a
-newline, so the decoder resynchronises at the next newline. There is no checksum, so a corrupted
-byte is not detected if its value is still in 11 … 42.
+2 · rows · cols bytes. The first byte of a frame is an index + 11, and the last byte is a newline
+(10). Between them, each cell has two bytes, in row-major order: the high 5 bits + 11 and the low 5
+bits + 11. Only the last byte can be a newline, so the decoder resynchronises at the next newline. A
+frame has no checksum. A corrupted byte is therefore detected only if its value is outside 11 to 42.
 
-Boards with a 12-bit converter use the same framing with 6 bits per half. A ``tactile.full_count``
-from 1024 to 4095 selects a 12-bit board.
+Boards with a 12-bit converter send 6 bits per half of a count. A ``tactile.full_count`` from 1024
+to 4095 selects a 12-bit board.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class GloveDecoder(DelimitedDecoder):
             self._reason = f"lines of {len(packet)} bytes, which correspond to {cells} cells"
             return None
         halves = np.frombuffer(packet, np.uint8, len(packet) - 1, 1) - np.uint8(_OFFSET)
-        # Bytes below the offset wrap around to large values here.
+        # In this uint8 subtraction, bytes below the offset wrap around to large values.
         if packet[0] < _OFFSET or halves.max() >= self._values:
             self._reason = (
                 "a byte that is not a valid half of a count (set tactile.full_count = 4095 if the "
@@ -53,7 +53,7 @@ def bits_of(full_count: int) -> int:
 
 
 class Glove(SerialReader):
-    """Glove-style board under one fingertip. After each frame, the next frame is requested."""
+    """Glove-style board under one fingertip. The reader requests each frame separately."""
 
     request = b"a"
 

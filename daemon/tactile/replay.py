@@ -1,4 +1,4 @@
-"""Replace a sensor with recorded frames, at recorded times or as set by the caller."""
+"""Replace a sensor with recorded frames or with frames that the caller sets."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
-# Tolerance for the relative difference between the pitches in the file and in the settings.
+# Maximum relative difference between the pitch in the file and the pitch in the settings.
 _PITCH_TOLERANCE = 0.01
 
 
 def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:
-    """Describe how the cell size in a file differs from ``pitch`` (x, y) [m]; y = 0 means y = x.
+    """Describe how the cell size in a file differs from ``pitch`` (x, y) [m].
 
-    The text is empty if the cell sizes agree or if the file does not state a cell size.
+    If y is 0, the cells are assumed to be square. The text is empty if the cell sizes agree or if
+    the file does not state a cell size.
     """
     if recording.pitch is None:
         return ""
@@ -71,9 +72,10 @@ class ReplayTactile:
     """Backend that replays a recording at its recorded times, starting when ``open`` is called.
 
     The recording restarts one mean frame interval after the last frame. If ``tactile.replay_again``
-    is false, the last frame is instead repeated once with ``valid`` False. ``live`` [rows, cols] is
-    False where the recording has no cell. ``full_count`` is the reading of saturated cells, or None
-    if the recording does not state it. ``notes`` describes suspicious properties of the recording.
+    is false, the last frame is repeated once with ``valid`` False, and the replay ends. ``live``
+    [rows, cols] is False where the recording has no cell. ``full_count`` is the reading of
+    saturated cells, or None if the recording does not state it. ``notes`` describes suspicious
+    properties of the recording.
     """
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
@@ -124,8 +126,8 @@ class ReplayTactile:
         self.latest()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame that is due, or None if the sensor is not open."""
-        now = self._clock.now() + 1e-9  # The margin includes a frame that is due now.
+        """Return the newest frame that is due, or None before `open`."""
+        now = self._clock.now() + 1e-9  # With this margin, rounding can't delay a frame.
         if now < self._due:
             return self._frame
         turn = math.floor((now - self._start) / self._period)
@@ -142,7 +144,7 @@ class ReplayTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return the ``frames`` since opening; ``resyncs`` and ``skipped_bytes`` are always 0."""
+        """Return the number of ``frames`` since `open`; all other counts are always 0."""
         frames = 0 if self._frame is None else self._frame.seq
         return {"frames": frames, "resyncs": 0, "skipped_bytes": 0}
 

@@ -1,7 +1,7 @@
-"""Read a tactile board's serial port in a thread and provide its newest complete frame.
+"""Read a tactile board's serial port in a thread, and provide the newest complete frame.
 
-All serial framings share this module, which handles the port, the thread and the timing. A
-:class:`Decoder` therefore handles only bytes.
+This module handles the port, the thread and the timing for all serial framings. A :class:`Decoder`
+handles only the bytes of one framing.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from softfinger.daemon.types import Frame
 
 __all__ = ["SerialReader"]
 
-_READ_SIZE = 65536  # number of bytes per read, which equals the capacity of a Linux tty
+_READ_SIZE = 65536  # maximum number of bytes per read, equal to the buffer size of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _GAP_TIME = 5e-4  # time without a byte that counts as a gap between frames [s]
-# Timeout of a request in addition to the transmission time of a frame [s].
+# A request is repeated after this time [s] plus the transmission time of a frame.
 _REQUEST_TIMEOUT = 0.1
 _WAIT_MIN = 3e-4  # minimum wait [s]; shorter waits cost more than the wake-ups they avoid
 _WAIT_MAX = 2e-3  # maximum wait [s], which limits the delay if the number of missing bytes is wrong
 
 
 class SensorClock:
-    """Converter from a board's clock to the local clock; the minimum recent delay is the offset.
+    """Converter from a board's clock to the local clock, based on the minimum recent delay.
 
-    Frames arrive with varying delays but never early, so using the minimum delay removes port
-    jitter from t_sample. The offset may increase at up to 200 ppm, which exceeds the difference
-    between two quartz clocks. A jump of more than one second is treated as a board restart.
+    Frames may arrive late but never early. Using the minimum delay therefore removes port jitter
+    from ``t_sample``. The offset between the clocks may increase at up to 200 ppm, which is faster
+    than two quartz clocks drift apart. A jump of the offset by more than one second is treated as a
+    board restart.
     """
 
     _DRIFT = 2e-4
@@ -65,23 +66,23 @@ class SerialReader:
     """Backend for a board on a serial port; subclasses provide the framing.
 
     A frame's ``t_arrival`` is the time at which its last byte was read. ``t_sample`` estimates the
-    mid-scan time: ``t_arrival`` minus the transmission time of the frame's bytes and of later bytes
-    in the same read, minus the ``latency`` [s] from mid-scan to the frame's first byte.
-    ``t_sample`` never decreases from frame to frame. If frames contain the board time,
-    :class:`SensorClock` removes port jitter.
+    mid-scan time. The reader subtracts the transmission time of the frame, and of later bytes in
+    the same read, from ``t_arrival``. The reader also subtracts ``latency`` [s], the time from
+    mid-scan to the frame's first byte. ``t_sample`` never decreases from frame to frame. If frames
+    contain the board time, :class:`SensorClock` removes port jitter.
 
-    A polled board receives ``request`` at the start, after each frame, and again if no frame
-    arrives within its transmission time plus 0.1 s.
+    The reader sends ``request`` to a polled board at the start and after each frame. If no frame
+    arrives within its transmission time plus 0.1 s, the reader repeats the request.
 
     ``latest`` may be called from any thread. Each frame has its own array, which is never modified.
-    If the port is lost or the stream becomes unreadable, a final frame with the old data and
-    ``valid`` False is provided.
+    If the port is lost or the stream becomes unreadable, the reader provides the old data again in
+    a frame with ``valid`` False.
     """
 
     request = b""
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
-        """Create a closed reader; ``finger`` selects the port (0 is the left finger)."""
+        """Create a reader without opening its port; ``finger`` selects the port (0 is left)."""
         self.settings = settings
         self._path = settings.port[finger]
         self._decoder = self.make_decoder()
@@ -138,7 +139,7 @@ class SerialReader:
         return self._latest
 
     def counters(self) -> dict[str, int]:
-        """Return ``bytes`` read, the decoder's counters, and ``port_lost`` (1 until reopened)."""
+        """Return the decoder's counters, ``bytes`` (read so far) and ``port_lost`` (0 or 1)."""
         return {
             "bytes": self._bytes,
             "port_lost": int(self._port_lost),
@@ -147,13 +148,13 @@ class SerialReader:
 
     @property
     def error(self) -> str:
-        """Reason for missing frames (port lost or stream unreadable); empty while frames arrive."""
+        """Reason why frames are missing; empty while frames arrive."""
         return self._error
 
     def close(self) -> None:
         """Stop the thread and close the port.
 
-        This method never raises an exception and may be called repeatedly.
+        ``close`` never raises an exception and may be called repeatedly.
         """
         stop, thread, port = self._stop, self._thread, self._port
         self._stop = self._thread = self._port = None
@@ -259,7 +260,7 @@ class SerialReader:
 
 
 def open_port(path: str, baud: int) -> serial.Serial:
-    """Open ``path`` exclusively: raw mode, eight data bits, no parity. Raises TactileError."""
+    """Open ``path`` exclusively in raw mode with 8 data bits and no parity. Raises TactileError."""
     try:
         return serial.Serial(path, baud, timeout=0, exclusive=True)
     except serial.SerialException as error:

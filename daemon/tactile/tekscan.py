@@ -1,14 +1,14 @@
 """Parse Tekscan-style ASCII exports of pressure frames.
 
-An export starts with lines of the form ``KEY value``, up to the line ``ASCII_DATA @@``. Each frame
-consists of a line ``Frame n``, which may contain more text, and the rows. The letter ``B`` marks a
-position without a cell. A line ``@@`` may end the file. An export with a single frame has no
-``Frame`` line.
+An export starts with a header: lines of the form ``KEY value``, up to the line ``ASCII_DATA @@``.
+Each frame starts with a line ``Frame n``, which may contain more text, and continues with its rows.
+The letter ``B`` marks a position without a cell. A line ``@@`` may end the file. An export with a
+single frame has no ``Frame`` line.
 
-Encoding, decimal sign and separator depend on the locale of the exporting machine. The parser
-detects the encoding, sign and separator from the file. Lengths are in mm, cm, m or inches,
-abbreviated or spelt out. Readings are raw counts, pressures, or forces per cell. Free text follows
-``COMMENTS:``; within this text, only words in capitals are keys. Spreadsheets may add quotation
+The encoding, the decimal sign and the separator depend on the locale of the exporting machine, so
+the parser detects them. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings are
+raw counts, pressures, or forces per cell. Free text may follow ``COMMENTS:``. Within the free text,
+a line is a ``KEY value`` line only if its first word is in capitals. Spreadsheets may add quotation
 marks and may append separators to lines.
 """
 
@@ -27,9 +27,9 @@ from softfinger.daemon.errors import SoftfingerError
 
 _SIZE_MAX = 1024  # maximum number of rows or columns
 _HEADER_LINES_MAX = 1000
-_READING_MAX = 1e12  # maximum reading in the unit of the readings
+_READING_MAX = 1e12  # maximum reading, in the unit of the file
 _RAW_SATURATION = 255  # maximum reading of the manufacturer's 8-bit electronics
-_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure that counts as saturated
+_SATURATION_FRACTION = 0.995  # Cells above this fraction of the saturation pressure are saturated.
 _EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
@@ -54,12 +54,12 @@ _FORCES = {
     **dict.fromkeys(("oz", "ozf"), 0.27801385095),
 }
 _AREAS = {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6, "in2": 0.0254**2, "ft2": 0.3048**2}
-# The superscript ² as encoded in Latin-1, UTF-8 and DOS code pages.
+# Notations of squares. The byte that means ² in DOS code pages means ý in Latin-1.
 _SQUARES = str.maketrans({"²": "2", "ý": "2", "^": "", ".": "", "*": ""})
 
 
 class TekscanError(SoftfingerError, ValueError):
-    """Text that is not a valid export. The message names the line."""
+    """Error raised if a text is not a valid export."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def _live_cells(
 
 
 def _digits(values: NDArray[np.float64]) -> int:
-    """Return the number of decimals in the readings."""
+    """Return the number of decimal places in the readings."""
     for digits in range(9):
         if np.allclose(values, np.round(values, digits), rtol=1e-12, atol=0.0):
             return digits
@@ -181,7 +181,7 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
 def _frames(
     lines: list[str], first: int, rows: int, cols: int
 ) -> tuple[list[int], list[list[NDArray[np.float64]]], list[list[int]]]:
-    """Parse lines from ``first`` on; return frame numbers, rows and the rows' line numbers."""
+    """Parse the lines after the header; return frame numbers, rows and line numbers of rows."""
     numbers: list[int] = []
     frames: list[list[NDArray[np.float64]]] = []
     places: list[list[int]] = []
@@ -247,7 +247,7 @@ def _cells(line: str, separator: str, cols: int) -> list[str]:
 
 
 def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float64]:
-    """Parse a row's readings, with −inf where the sensor has no cell."""
+    """Parse a row of readings; return −inf where the sensor has no cell."""
     cells = [cell.strip(' "').upper() for cell in _cells(line, separator, cols)]
     missing = cells.count("B")
     if separator == "," and len(cells) != cols:
@@ -349,6 +349,6 @@ def _per_area() -> dict[str, float]:
 
 
 def _plain_unit(unit: str) -> str:
-    """Normalise a unit, including different notations for squares."""
+    """Convert a unit to a uniform notation, in which squares end in 2."""
     plain = re.sub(r"[\s\[\]()]", "", unit.translate(_SQUARES)).lower()
     return re.sub(r"(sq|square)([a-z]+)", r"\g<2>2", plain)

@@ -1,14 +1,14 @@
 """Unpack and answer the requests that the gateway forwards to the loop.
 
-The command server runs in the loop's thread, once per tick, without a lock. A ``stop`` takes
-precedence. Each request carries the number of stops that preceded it. A request whose stop count is
-below the current stop count is refused, unless the request is ``status``. A ``hold`` replaces a
-queued ``hold`` that directly precedes it on the same connection.
+The command server runs in the loop's thread, once per tick, without a lock. A ``stop`` is executed
+before all other requests. The gateway stamps each request with the number of stops that preceded
+it. If this number is below the current number of stops, the request is refused, except for
+``status``. A ``hold`` replaces a queued ``hold`` that directly precedes it on the same connection.
 
-A client may add a unique ``key`` to a request and repeat the request if it was refused as late. The
-daemon executes a command with a key at most once. If another command has been executed since the
-refusal, the repeated request is refused, because the newest command prevails. Commands that can
-only make the hand safer (`NO_LEASE_COMMANDS`) are executed every time.
+A client may add a unique ``key`` to a request. If the request is refused as late, the client may
+repeat it. The daemon executes a command with a key at most once. To protect newer commands, the
+daemon refuses a repetition if it has executed another command in the meantime. The commands in
+`NO_LEASE_COMMANDS` can only make the hand safer and are executed every time.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # arguments: reques
 
 _ANSWER_TIMEOUT = 0.4  # maximum time to wait for the gateway before confirming a local stop [s]
 _COMMANDS_PER_TICK = 2  # maximum number of commands per tick, not counting stops
-_UNPACKED_SIZE_MAX = 4096  # number of bytes after which unpacking pauses until the next tick
-_OUTCOME_COUNT_MAX = 256  # maximum number of stored outcomes of requests with a key
+_UNPACKED_SIZE_MAX = 4096  # After this number of bytes, unpacking pauses until the next tick.
+_OUTCOME_COUNT_MAX = 256  # maximum number of stored outcomes
 _KEY_LENGTH_MAX = 64
 _VALUE_TYPES = (str, int, float, type(None))  # bool is a subclass of int
 
 
 class CommandServer:
-    """Reply to requests from the gateway link and to stops from the local socket."""
+    """Server for requests from the gateway and for stops from the local socket."""
 
     def __init__(
         self,
@@ -49,12 +49,12 @@ class CommandServer:
         self._local = local
         self._clock = clock
         self._changes = 0  # number of executed commands other than status and stop
-        # Outcomes of requests with a key, oldest first. Each outcome is stored under the client
-        # name (determined by the access key) and the request. An outcome is the reply or, for a
-        # late request, the numbers of stops and changes.
+        # Outcomes of requests with a key, oldest first. The dictionary keys consist of the client
+        # name and the packed request. The outcome is the reply. For a late request, the outcome
+        # consists of the counts of stops and changes at the first attempt.
         self._outcomes: OrderedDict[tuple[str, bytes], bytes | tuple[int, int]] = OrderedDict()
         self._stopped = b""  # reply to the last local stop
-        self._answer_by = 0.0  # time after which local stops are answered without the gateway
+        self._answer_by = 0.0  # time at which the wait for the gateway's confirmation ends
 
     def serve(self, handler: Handler) -> None:
         """Pass this tick's requests to ``handler`` and send its replies.
@@ -77,7 +77,7 @@ class CommandServer:
 
     def _stop(self, handler: Handler, client: str) -> bytes:
         reply = accepted(handler({"command": "stop", "client": client}, 0.0))
-        self.link.fence()  # The client may continue after the reply, so update the fence first.
+        self.link.fence()  # The client may act on the reply at once, so update the fence first.
         return reply
 
     def _unpack(self, handler: Handler) -> None:
@@ -89,7 +89,7 @@ class CommandServer:
             size += len(ask.payload)
             try:
                 request = decode(ask.payload)
-                if ask.urgent and request["command"] != "stop":  # Two keys are named "command".
+                if ask.urgent and request["command"] != "stop":  # The key "command" occurs twice.
                     raise _malformed('expected exactly one string under the key "command"')
             except Refused as refused:
                 self.link.reply(ask, refusal(str(refused), refused.reason))
@@ -135,7 +135,7 @@ class CommandServer:
 
 
 def _replaces(request: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Return True if both are ``hold`` and ``request`` sets every value that ``other`` sets."""
+    """Return True if both requests are ``hold`` and ``request`` sets all values of ``other``."""
     is_hold = request["command"] == other["command"] == "hold"
     return is_hold and other.keys() - {"key"} <= request.keys()
 
@@ -153,9 +153,10 @@ def refusal(error: str, reason: str) -> bytes:
 
 
 def decode(payload: bytes) -> dict[str, Any]:
-    """Unpack a command: a flat map of numbers and strings; the value of ``command`` is a string.
+    """Unpack a command, which is a flat map of numbers and strings.
 
-    Raises Refused for other data. Additional fields in a `stop` command are ignored.
+    Raises Refused for other data, or if the value of ``command`` is not a string. Additional fields
+    in a `stop` command are ignored.
     """
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)

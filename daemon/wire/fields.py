@@ -1,4 +1,4 @@
-"""Provide declarations of stream topics, records and fields for `wire.schema`."""
+"""Provide the functions and classes with which `wire.schema` declares topics and fields."""
 
 import dataclasses
 import inspect
@@ -40,7 +40,7 @@ TOPICS: dict[bytes, Topic] = {}
 
 
 class FieldSource(Generic[_From]):
-    """Object from which fields are read; ``get`` returns this object from the outer object."""
+    """Object from which field values are read; ``get`` extracts it from the ``outer`` object."""
 
     def __init__(
         self, outer: "FieldSource[Any] | None" = None, get: Getter = lambda it: it
@@ -49,7 +49,7 @@ class FieldSource(Generic[_From]):
         self.get = get
 
     def of(self, get: Callable[[_From], _Within]) -> "FieldSource[_Within]":
-        """Declare a source: the result of applying ``get`` to this source."""
+        """Declare the source that results from applying ``get`` to this source."""
         return FieldSource(self, get)
 
     def __call__(
@@ -63,7 +63,7 @@ class FieldSource(Generic[_From]):
         return cast(_Value, dataclasses.field(metadata=about))
 
     def part(self, prefix: str, get: Callable[[_From], object]) -> Any:
-        """Declare a nested map whose fields are read from the object that ``get`` returns.
+        """Declare a nested map; its fields are read from the object that ``get`` returns.
 
         ``prefix`` is prepended to the field descriptions.
         """
@@ -77,7 +77,7 @@ class Member(NamedTuple):
     name: str
     type: Any
     unit: str
-    meaning: str  # meaning of the field, or prefix for the descriptions of a nested map
+    meaning: str  # for a nested map, the prefix of its field descriptions
     source: FieldSource[Any]
     get: Getter
 
@@ -91,7 +91,7 @@ def members(cls: type[Any]) -> Iterator[Member]:
 
 @dataclass_transform(frozen_default=True)
 def record(cls: type[_Record]) -> type[_Record]:
-    """Turn a class of declared fields into a record whose docstring lists the fields."""
+    """Turn a class of declared fields into a record; list the fields in the docstring."""
     made = dataclasses.dataclass(frozen=True, slots=True)(cls)
     listed = ["", "Attributes", "----------"]
     for each in members(made):

@@ -9,11 +9,11 @@ folder with these files:
 ``server/clients/NAME.key``
     an accepted client's public key; removing the file disconnects that client
 ``NAME/server.key``, ``NAME/client.key_secret``
-    the folder to copy to the client's machine; ``local`` is for this machine
+    the files to copy to the client's machine; the client ``local`` is for this machine
 
-The files are ZeroMQ certificates, which other ZeroMQ programs can also read. Files and folders are
-refused if another user owns them, because that user could add a key. The same applies if another
-user may write to them or to any parent folder.
+The files are ZeroMQ certificates, which other ZeroMQ programs can also read. A file or folder is
+refused if another user owns it or may write to it, because this user could add a key. All parent
+folders are checked in the same way.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ import zmq.utils.z85
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.kinematics.compiled.own_folder import check_above, fault
 
-LOCAL = "local"  # name of the client that every key folder contains
+LOCAL = "local"  # name of the client for this machine, in every key folder
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _LENGTH = 32  # length of a key [bytes]
@@ -43,18 +43,18 @@ _LENGTH = 32  # length of a key [bytes]
 
 @dataclass(frozen=True, slots=True)
 class ServerKeys:
-    """The daemon's key pair and the public keys of its clients, in Z85."""
+    """The daemon's key pair and the public keys of its clients, encoded in Z85."""
 
     public: bytes
     secret: bytes
     clients: dict[bytes, str]  # maps each public key to a client name
 
     def left(self, folder: Path) -> ServerKeys:
-        """Return the keys, except those of clients whose key files have been removed.
+        """Return the keys without those of clients whose key files have been removed.
 
         Raises KeyFileError.
 
-        This method does not open files, so it works even if no file descriptor is free.
+        ``left`` does not open files, so it works even if no file descriptor is free.
         """
         clients = _place(folder) / "clients"
         _check_above(clients / "any")
@@ -64,7 +64,7 @@ class ServerKeys:
         return ServerKeys(self.public, self.secret, kept)
 
     def guard(self, socket: zmq.Socket[Any]) -> None:
-        """Make a socket accept only clients with known keys. Call this method before bind."""
+        """Make a socket accept only clients with known keys. Call this method before `bind`."""
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
@@ -72,7 +72,7 @@ class ServerKeys:
 
 @dataclass(frozen=True, slots=True)
 class ClientKeys:
-    """A client's key pair and the server's public key, all in Z85."""
+    """A client's key pair and the server's public key, encoded in Z85."""
 
     server: bytes
     public: bytes
@@ -105,8 +105,8 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     Raises
     ------
     KeyFileError
-        If a file can't be written, or if a client already exists. If a client already exists, no
-        files are written.
+        If a file can't be written or a client already exists. In the second case, no files are
+        written.
     """
     check_curve()
     server = folder / "server"

@@ -1,4 +1,4 @@
-"""Provide a local socket for ``stop`` that other clients can't block.
+"""Provide a local socket for ``stop``, which other clients can't block.
 
 The socket is a Unix datagram socket, so the daemon can't run out of connections. Only the daemon's
 user can send to the socket. `client.command_client` uses the socket if it exists.
@@ -30,8 +30,8 @@ _SENDER_COUNT_MAX = 16  # maximum number of senders that await a reply
 class LocalStop:
     """The daemon's end of the socket. The socket is named after the command address.
 
-    If another user can write to the preferred folder, ``notice`` gives the reason and the folder
-    that is used instead.
+    If another user can write to the preferred folder, another folder is used, and ``notice``
+    explains why.
     """
 
     def __init__(self, address: str) -> None:
@@ -81,7 +81,7 @@ class LocalStop:
 
 
 def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
-    """Stop this user's daemon at the command address ``address``, and return its reply.
+    """Stop this user's daemon with the command address ``address``; return its reply.
 
     Returns None if this user's daemon is not running on this machine or does not respond.
     """
@@ -92,7 +92,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
         ):
             require_own(folder)
             asking.settimeout(seconds)
-            # The system assigns the socket a name, to which the daemon replies.
+            # The system assigns a name to the socket, and the daemon replies to this name.
             asking.bind("")
             asking.connect(str(folder / _name(address)))
             asking.send(b"stop")
@@ -103,7 +103,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
 
 def free_socket_path(path: Path, kind: socket.SocketKind) -> str:
-    """Remove the socket file left by a killed process; return a reason if the path is in use."""
+    """Remove a socket file left behind by a killed process; return a reason if it is in use."""
     if not path.exists():
         return ""
     if not path.is_socket():

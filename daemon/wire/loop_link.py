@@ -1,4 +1,4 @@
-"""Connect the loop and the gateway with a socket pair; define the messages and the loop's end.
+"""Connect the loop and the gateway with a socket pair, and define their messages.
 
 Each message is a msgpack list whose first element is the message kind. Sending never blocks. If the
 socket buffer is full, the remaining bytes are sent later. While bytes remain, stream messages are
@@ -33,12 +33,12 @@ _FIRST, _AGAIN = (msgpack.packb("again") + msgpack.packb(again) for again in (Fa
 
 
 class Ask(NamedTuple):
-    """A client's request that satisfies all limits but has not been unpacked yet.
+    """Client request that has passed the gateway's limits but has not been unpacked yet.
 
     ``came`` is the arrival time according to `machine_time`. ``stops`` is the number of stops that
-    certainly arrived before the request. An ``urgent`` request looks like a stop. ``name`` is the
-    client name that belongs to the client's key. ``route`` is the return route for the reply. The
-    first part of the route identifies the connection.
+    are known to have arrived before the request. ``urgent`` is True if the packed request looks
+    like a stop. ``name`` is the client name that belongs to the client's key. ``route`` is the
+    return route of the reply; its first part identifies the connection.
     """
 
     came: float
@@ -55,7 +55,7 @@ def machine_time() -> float:
 
 
 def pair() -> tuple[socket.socket, socket.socket]:
-    """Create a socket pair and return both ends: the loop's and the gateway's."""
+    """Create a socket pair; return the loop's end and the gateway's end."""
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
     for end in ends:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_SIZE)
@@ -63,19 +63,19 @@ def pair() -> tuple[socket.socket, socket.socket]:
 
 
 def repeated(message: bytes) -> bytes:
-    """Return a stream message after setting its ``again`` field, if this field exists."""
+    """Return a stream message with its ``again`` field, if any, set to true."""
     return message.replace(_FIRST, _AGAIN, 1)
 
 
 class Channel:
-    """One end of the socket pair, non-blocking."""
+    """Non-blocking end of the socket pair."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
         self._end = end
         self._unsent = bytearray()
         self._unpacker = msgpack.Unpacker(max_buffer_size=_MESSAGE_SIZE_MAX)
-        self.over = False  # True once one of the two ends has been closed
+        self.over = False  # True once either end has been closed
 
     def fileno(self) -> int:
         return self._end.fileno()
@@ -87,7 +87,7 @@ class Channel:
             self.flush()
 
     def flush(self) -> bool:
-        """Send queued bytes; return True if the queue is then empty."""
+        """Send queued bytes; return True if the queue is empty afterwards."""
         try:
             while self._unsent:
                 del self._unsent[: self._end.send(self._unsent)]
@@ -115,17 +115,17 @@ class Channel:
 
 
 class Link:
-    """The loop's end. Only the loop's thread may call its methods, except for `offer`."""
+    """The loop's end of the socket pair. Other threads may call only `offer`."""
 
     def __init__(self) -> None:
         self.wanted = 0  # bit mask of topics with subscribers
-        self.refused = 0  # number of requests that the gateway's rate and queue limits refused
+        self.refused = 0  # number of requests refused by the gateway's rate and queue limits
         self.stops = 0  # number of stops so far
-        self.confirmed = 0  # stop count that the gateway stamps on new requests
+        self.confirmed = 0  # stop count with which the gateway stamps new requests
         self.asked: deque[Ask] = deque()  # received requests, with urgent requests first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # queued for a later tick
         self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # gateway warnings
-        # Last messages of each topic, for a restarted gateway.
+        # Last messages of each topic, which are repeated to a restarted gateway.
         self._kept: dict[int, deque[bytes]] = {}
         self._offered: Channel | None = None
         self._channel = Channel(socket.socket())  # replaced by `offer`
@@ -136,7 +136,7 @@ class Link:
         self._offered = channel
 
     def look(self) -> bool:
-        """Read the gateway's messages; return True if all bytes for the gateway have been sent."""
+        """Read the gateway's messages; return True if no bytes for the gateway remain queued."""
         if self._offered is not None:
             self.close()
             self._channel, self._offered = self._offered, None
@@ -158,9 +158,9 @@ class Link:
         return channel.flush()
 
     def fence(self) -> None:
-        """After a stop, refuse all requests that arrived earlier, except stop and status.
+        """Refuse all requests that arrived before a stop, except ``stop`` and ``status``.
 
-        The gateway receives the stop count with which it must stamp new requests.
+        The gateway receives the new stop count and stamps new requests with it.
         """
         self.stops += 1
         self._channel.send(FENCE, self.stops)

@@ -3,8 +3,8 @@
 Integers use the shortest msgpack format, so that JavaScript clients receive plain numbers wherever
 possible. Floats always take 64 bits.
 
-The gateway serves the subscribers, so slow or disconnected subscribers do not affect the loop. The
-gateway repeats the settings and the last events to late subscribers, with ``again`` set. Messages
+The gateway serves the subscribers, so slow or disconnected subscribers do not affect the loop. For
+late subscribers, the gateway repeats the settings and the last events with ``again`` set. Messages
 of topics without subscribers are not packed.
 """
 
@@ -38,9 +38,9 @@ def packer(topic: bytes) -> Callable[..., bytes]:
 
 
 def _packer(record: type[Any]) -> Pack:
-    """Return a function that packs a record's map from its source."""
-    # Every source except the first is derived from an earlier source, and each value comes from a
-    # single source.
+    """Return a function that reads a record's fields from its source and packs them as a map."""
+    # Each source after the first is derived from an earlier source. Each value is read from one
+    # source.
     sources: list[tuple[int, Getter]] = []
     found: dict[FieldSource[Any], int] = {}
 
@@ -89,7 +89,7 @@ _COMMANDS = bit(COMMAND)
 
 
 class Publisher:
-    """Publish states, tactile frames and events. Only the loop's thread may call its methods."""
+    """Publisher of all stream topics. Only the loop's thread may call its methods."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -102,7 +102,7 @@ class Publisher:
         return self._link.wanted
 
     def look(self) -> None:
-        """Read the gateway's messages, as the loop also does when it reads commands."""
+        """Read the gateway's messages."""
         self._link.look()
 
     def send(self, topic: bytes, *arguments: object) -> None:

@@ -17,15 +17,16 @@ if TYPE_CHECKING:
     from softfinger.daemon.wire.schema import FingerState, HandState, ObjectState, TactileFrame
 
 _COLOUR = "#0a8078"  # colour that is readable on light and on dark pages
-# Number of shades in a picture. More shades make the SVG longer without a visible difference.
+# Number of shades in a picture. More shades would make the SVG longer without a visible difference.
 _SHADES = 12
 _SIDE = 176  # longer side of a picture [px]
-# Minimum full scale of a picture [Pa], which keeps the noise of an unloaded tip faint.
+# The darkest shade stands for at least this pressure [Pa], so that the noise of an unloaded tip
+# stays faint.
 _FULL = 10e3
 
 
 def state_parts(state: HandState) -> list[str]:
-    """Return mode, tip forces, object angle and object width; in a fault, return mode and fault."""
+    """Return mode, tip forces, object angle and width; in a fault, return only mode and fault."""
     if state.fault:
         return [state.mode, state.fault]
     parts = [state.mode]
@@ -87,7 +88,7 @@ def _tilt(finger: FingerState) -> str:
 
 
 def state_html(state: HandState) -> str:
-    """Return an HTML table of both fingers, with a one-line summary of the state as its caption."""
+    """Return an HTML table of both fingers; the caption summarises the state in one line."""
     rows: dict[str, Callable[[FingerState], str]] = {
         "force [N]": lambda finger: _force(finger) if finger.contact else "",
         "d [mm]": lambda finger: _depth(finger) if finger.contact else "",
@@ -108,7 +109,7 @@ def state_html(state: HandState) -> str:
 
 
 def frame_html(frame: TactileFrame) -> str:
-    """Return the frame's text below an SVG picture of the pressures; row 0 is at the bottom."""
+    """Return an SVG picture of the pressures (row 0 at the bottom) and the frame's text."""
     aspect = frame.rows * frame.pitch_y / (frame.cols * frame.pitch or math.nan)
     if not 0.01 < aspect < 100.0:  # The values may be invalid, because the stream is not trusted.
         aspect = frame.rows / frame.cols

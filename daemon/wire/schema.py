@@ -1,9 +1,9 @@
-"""Define the stream schema, the only declaration of all topics and fields.
+"""Define the stream schema, which declares all topics and fields.
 
-Each topic is a record. Each field has a unit, a meaning and a source. The value of a field is
-either a function of the source or the source attribute with the field's name. The packers
-(`wire.publisher`), the records that clients read (`client.stream`), the ``STREAM.md`` page and the
-JSON Schemas of recordings (`wire.schema_docs`) are derived from these declarations.
+Each topic is a record. Each field has a unit, a meaning and a source. The value of a field is a
+function of the source or, by default, the source attribute of the same name. The packers
+(`wire.publisher`) and the clients' records (`client.stream`) use these declarations. The
+``STREAM.md`` page and the JSON Schemas of recordings (`wire.schema_docs`) are generated from them.
 
 New versions may add fields but never remove them. A float is always sent as a float. Values are in
 SI units.
@@ -75,7 +75,7 @@ TRUTH = b"hand/truth"
 
 NO_FRAME = Frame(0, t_sample=0.0, t_arrival=0.0, valid=False, data=np.zeros((0, 0), np.uint16))
 
-# Common first fields of several topics.
+# Fields with which several topics begin.
 _SCHEMA = "", "schema version; changes only if the meaning of a field changes"
 _SEQ = "", "sequence number of the tick, frame or event"
 _STEP = "", "decimation factor n: every n-th message is sent"

@@ -90,7 +90,7 @@ the repetition is rejected as `superseded`. `disarm` needs no key, because repea
 
 
 def json_schema(topic: bytes) -> dict[str, Any]:
-    """Return the JSON Schema of a topic's map: bytes are base64, NaN and infinity are null."""
+    """Return the JSON Schema of a topic's map, with base64 for bytes and null for NaN and ±∞."""
     schema: dict[str, Any] = {
         "title": topic.decode(),
         "description": TOPICS[topic].summary,

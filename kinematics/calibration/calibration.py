@@ -40,25 +40,24 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD_RESPONSE = 0.2  # fraction of the median response below which a cell counts as dead
+DEAD_RESPONSE = 0.2  # Cells below this fraction of the median response are dead.
 _EXPONENTS = (0.3, 3.0)
-_UNREST_SIGMA = 8.0  # multiple of the median noise above which a cell is unsteady
-# Minimum number of unsteady cells that makes a tare fail. A smaller number of unsteady cells may be
-# due to faulty cells.
+_UNREST_SIGMA = 8.0  # Cells above this multiple of the median noise are unsteady.
+# A tare fails if at least this many cells are unsteady. Fewer unsteady cells may merely be faulty.
 _UNREST_CELL_COUNT = 4
-_TILT_MIN = math.radians(3.0)  # minimum tilt range from which the rotation can be determined
+_TILT_MIN = math.radians(3.0)  # minimum range of the tilts for determining the rotation
 _UPRIGHT_ERROR = math.radians(0.5)
 _PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, as a multiple of the noise
 _LAG_MAX = 8  # maximum lag of the noise correlation, in cells
-_SIGNIFICANT_SIGMA = 4.0  # number of standard errors above which a result is significant
-# Minimum zero offset that is not affected by clipping at 0, in noise standard deviations.
+_SIGNIFICANT_SIGMA = 4.0  # Results above this number of standard errors are significant.
+# Clipping at 0 does not affect zero offsets above this number of noise standard deviations.
 _CLIPPED_SIGMA = 4.0
 _HOLD_RATIO_MIN = 2.0  # minimum hold time, as a multiple of the longest time constant
-_ITERATIONS = 25  # number of iterations that fit the term strengths and the press alternately
+_ITERATIONS = 25  # number of iterations that alternate between F∞ and the strengths
 
 
 class CalibrationError(SoftfingerError, ValueError):
-    """The data do not determine the result."""
+    """Error raised if the data do not determine a result."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +65,10 @@ class Tare:
     """Result of `tare`: zero offset and noise of the cells.
 
     ``zero`` and ``noise`` are the mean and the standard deviation of the unloaded counts, both
-    float64 [rows, cols]. ``correlation`` [k, m] is the noise correlation of two cells that are k
-    rows and m columns apart; the array is empty if the correlation is not significant. ``drift``
-    [counts] is the standard deviation of the drift common to all cells. ``excess`` [counts] is the
-    mean of max(reading − zero, 0).
+    float64 [rows, cols]. Element [k, m] of ``correlation`` is the noise correlation of two cells
+    that are k rows and m columns apart. The array is empty if no correlation is significant.
+    ``drift`` [counts] is the standard deviation of the drift that all cells share. ``excess``
+    [counts] is the mean of max(reading − zero, 0).
     """
 
     zero: FloatArray
@@ -82,8 +81,8 @@ class Tare:
 def tare(frames: ArrayLike) -> Tare:
     """Determine the zero offset and noise of each cell from unloaded frames [n, rows, cols].
 
-    Raises CalibrationError if several cells vary much more than other cells, because this indicates
-    a contact.
+    Raises CalibrationError if several cells vary much more than the other cells, which indicates a
+    contact.
     """
     stack = _stack(frames, "tare")
     if len(stack) < 2:
@@ -140,8 +139,8 @@ class Equilibration:
     """Result of `equilibrate`: cell gains.
 
     ``gain`` float64 [rows, cols] equalises the response of all cells; it is 0 for dead cells.
-    ``spread`` and ``residual`` are the cells' relative rms deviations from their mean, before and
-    after equilibration.
+    ``spread`` is the relative rms deviation of the cells from their mean before equilibration.
+    ``residual`` is the relative rms deviation after equilibration.
     """
 
     gain: FloatArray
@@ -150,11 +149,11 @@ class Equilibration:
 
 
 def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
-    """Determine the gains from frames [n, rows, cols] for each of several uniform pressures.
+    """Determine the gains of the cells from frames [n, rows, cols] at several uniform pressures.
 
-    The gain of a cell is the least-squares fit of its readings to the mean of all working cells.
-    Cells with less than a fifth of the median response are considered dead. Raises CalibrationError
-    if the frames show no pressure.
+    Each gain is the least-squares fit of a cell's readings to the mean of all working cells. Cells
+    with less than a fifth of the median response are considered dead. Raises CalibrationError if
+    the frames show no pressure.
     """
     if not loads:
         raise CalibrationError("equilibrate: expected at least one uniform pressure")
@@ -284,17 +283,17 @@ def _power(
 
 
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
-    """Set mean readings [rows, cols] over ``frames`` frames to 0 where they are within 4 σ of 0.
+    """Set mean readings [rows, cols] below 4 σ to 0; ``frames`` is the number of averaged frames.
 
-    Clipped noise has a positive mean. Summed over all cells, the mean of clipped noise may be as
-    large as the force of a contact.
+    Clipped noise has a positive mean. Summed over all cells, clipped noise may be as large as the
+    force of a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)
 
 
 def without_clipping(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray:
-    """Correct the mean counts of many frames for noise that is clipped at 0.
+    """Correct the mean counts of many frames for the bias of noise that is clipped at 0.
 
     ``zero`` and ``noise`` are the mean and the standard deviation of the tare counts. For
     max(x + n, 0) with Gaussian n, the mean, the standard deviation and their ratio all increase
@@ -321,8 +320,8 @@ def without_clipping(means: FloatArray, zero: FloatArray, noise: float) -> Float
 class Centre:
     """Result of `fit_centre`: the tip centre in sensor axes [m] and the rotation [rad].
 
-    ``rotation`` is None if no press was tilted. ``residual`` is the change in the last iteration
-    [m], and ``std`` is the standard deviation of the centre in x and in y [m].
+    ``rotation`` is None if no press was tilted. ``residual`` [m] is the change in the last
+    iteration. ``std`` [m] is the standard deviation of each coordinate of the centre.
     """
 
     centre: tuple[float, float]
@@ -340,11 +339,11 @@ def fit_centre(
     noise: float,
     active: NDArray[np.bool_] | None = None,
 ) -> Centre:
-    """Determine centre and rotation from presses at known tilts ``theta`` [n] [rad].
+    """Determine tip centre and sensor rotation from presses at known tilts ``theta`` [n] [rad].
 
     The tilts are in the finger's plane. The fit uses all cells of the ``frames`` [n, rows, cols]
-    [Pa]. For a spring tip, a known modulus is not required. Raises CalibrationError if a frame does
-    not show a contact, or if all tilts are equal but nonzero.
+    [Pa]. The modulus of a spring tip need not be known. Raises CalibrationError if a frame does not
+    show a contact, or if all tilts are equal but nonzero.
     """
     stack = _stack(frames, "centre")
     s = np.sin(np.asarray(theta, np.float64))
@@ -375,8 +374,8 @@ def fit_centre(
 class Modulus:
     """Result of `fit_modulus` for the model F(d − d₀, θ).
 
-    ``modulus`` is E [Pa], ``offset`` is d₀ [m], ``errors`` [n] are the relative force errors, and
-    ``trend`` contains the value of E from each individual load.
+    ``modulus`` is E [Pa], and ``offset`` is d₀ [m]. ``errors`` [n] are the relative force errors.
+    ``trend`` contains the value of E from each load.
     """
 
     modulus: float
@@ -387,10 +386,10 @@ class Modulus:
 
 
 def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip) -> Modulus:
-    """Fit a constant modulus of ``tip`` and the zero offset of d to a compression run.
+    """Fit the constant modulus of a tip and the zero offset of d to a compression run.
 
-    The fit minimises the squared relative errors. ``d`` [m], ``theta`` [rad] and ``force`` [N], the
-    force measured by the sensor, have shape [n]. Raises CalibrationError if there are too few
+    The fit minimises the squared relative errors. ``d`` [m], ``theta`` [rad] and ``force`` [N] have
+    shape [n]. ``force`` is measured by the sensor. Raises CalibrationError if there are too few
     points, or if the force does not increase with d.
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
@@ -422,13 +421,13 @@ class Relaxation:
     """Result of `fit_relaxation`: F = c F∞ (1 + Σ r_i (1 − h_i/F∞)), ḣ_i = (F∞ − h_i)/τ_i.
 
     The strengths are r_i. ``residual`` is the rms relative error of F during the hold, and
-    ``elastic`` is the same error without relaxation.
+    ``elastic`` is the error of a fit without relaxation.
     """
 
     strengths: tuple[float, ...]
     residual: float
     elastic: float
-    model: FloatArray  # fitted F during the hold, measured F during the press [N]
+    model: FloatArray  # F [N]: measured during the press, fitted during the hold
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
@@ -443,10 +442,10 @@ def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
 
 
 def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
-    """Fit non-negative relaxation strengths to the force of a press and the following hold.
+    """Fit non-negative relaxation strengths to the force during a press and the hold after it.
 
-    F∞ is constant during the hold. During the press, F∞ follows from F and the strengths. The fit
-    therefore alternates between F∞ and the strengths.
+    F∞ is constant during the hold. During the press, F∞ is computed from F and the strengths. The
+    fit therefore updates F∞ and the strengths alternately.
 
     Parameters
     ----------
@@ -480,7 +479,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
         memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
         columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
         fits = []
-        # Try every subset of the terms, and keep the best subset with positive strengths.
+        # Try every subset of the terms. Keep the best subset with non-negative strengths.
         for chosen in itertools.product((False, True), repeat=len(told)):
             used = np.flatnonzero((True, *chosen))
             found = np.linalg.lstsq(columns[:, used], load[held:], rcond=None)[0]

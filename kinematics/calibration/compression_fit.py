@@ -1,8 +1,8 @@
-"""Fit a tip's material law to the displacement and force measured by a testing machine.
+"""Fit a tip's material law to displacement and force from a testing machine.
 
 The machine presses a platen onto the tip along the platen's normal. The tip sticks to the platen,
-so the measured force is ∂U/∂d. Three quantities of each run are initially unknown: the zero offsets
-of d and F, and the toe of the curve, where an uneven surface makes first contact.
+so the measured force is ∂U/∂d. In each run, the zero offsets of d and F are unknown. The toe of the
+curve, in which an uneven surface makes first contact, is also unknown.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _SLACK = 0.02  # maximum reversal of d due to encoder noise, relative to the ran
 _TURNS = 5  # minimum number of rows per reversal of d; fewer rows mean a wrong row order
 _DEEP = 0.9  # minimum peak of a full-depth branch, as a fraction of the range of d
 TOE = 0.1  # half width of the toe around the first contact, as a fraction of the depth
-# Fraction of the maximum force above which points are used for extrapolating to zero force.
+# Points above this fraction of the maximum force are used to extrapolate to zero force.
 _STEEP = 0.2
-_POWER = 0.55  # exponent that makes F(d) of springs and solid rubber nearly linear
+_POWER = 0.55  # F to this power is nearly linear in d, for springs and for solid rubber
 _FEWEST = 6  # minimum number of fitted rows per run
 _LOADED = 20.0  # minimum force range of a run, as a multiple of the noise
 # Minimum noise due to rounding and interpolation, as a fraction of the maximum force.
@@ -40,11 +40,11 @@ _ROUNDS = 60
 _CLIP = 0.02  # maximum change in the zero offset of d per iteration, as a fraction of the depth
 _STEP = 1e-8  # step for numerical derivatives [m]
 _TOLERANCE = 1e-7  # relative tolerance of the tables
-_EDGE = 1.0 - 1e-4  # usable fraction of a table's range; the remainder is for the derivative step
+_EDGE = 1.0 - 1e-4  # usable fraction of a table's range; the derivative step needs the rest
 _TOO_DEEP = "the run exceeds the depth or tilt range of the model's data"
 _NO_BEGINNING = "no zero offset of d fits the run: the run must include the onset of contact"
-# Higher-order coefficients of three material laws. The forces for σ = c_1 ε + c_2 ε² + c_3 ε³ are
-# linear combinations of the forces for the three laws.
+# Coefficients c_2, c_3 of three material laws with c_1 = 1. The force for σ = c_1 ε + c_2 ε² + c_3
+# ε³ is a linear combination of the forces for these laws.
 _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
 
 
@@ -52,9 +52,9 @@ _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), F
 class Run:
     """Loading branch of one compression at a fixed tilt.
 
-    ``theta`` is in rad, ``d`` [n] in m and ``force`` [n] in N; d and force have unknown zero
-    offsets. ``begin`` [m] is the value of d at which the curve begins. ``dropped`` is the number of
-    rows that belong to other branches.
+    ``theta`` is in rad. ``d`` [n] [m] and ``force`` [n] [N] have unknown zero offsets. ``begin``
+    [m] is the value of d at which the curve begins. ``dropped`` is the number of rows that belong
+    to other branches.
     """
 
     theta: float
@@ -76,21 +76,21 @@ class Run:
 
     @property
     def before(self) -> NDArray[np.bool_]:
-        """Rows before the contact."""
+        """Mask of the rows before the contact."""
         return self.d < self.begin - self.toe
 
     @property
     def pressed(self) -> NDArray[np.bool_]:
-        """Rows beyond the toe."""
+        """Mask of the rows beyond the toe."""
         return self.d > self.begin + self.toe
 
 
 def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
-    """Find the loading branch of a test, and the d at which the curve begins.
+    """Find the loading branch of a test, and the displacement at which the curve begins.
 
-    If there are several cycles, the last cycle that reaches the full depth is used, because rubber
-    softens in its first cycles (Mullins, 1948). The branch ends as soon as d is within 0.5 % of its
-    maximum, so that it does not include a hold.
+    Rubber softens in its first cycles (Mullins, 1948). The last cycle that reaches the full depth
+    is therefore used. The branch ends when d is within 0.5 % of its maximum, and thus excludes a
+    hold.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
 
 
 def rising(d: FloatArray) -> tuple[slice, int]:
-    """Return the rows of the last branch that reaches full depth, and the number of such branches.
+    """Return the rows of the last full-depth branch, and the number of full-depth branches.
 
     Raises CalibrationError in the same cases as `loading`.
     """
@@ -150,7 +150,7 @@ def rising(d: FloatArray) -> tuple[slice, int]:
 
 
 def _turning_points(d: FloatArray, slack: float) -> list[int]:
-    """Return the indices of the first row, the last row, and ``d`` reversals above ``slack``."""
+    """Return the indices of the first row, the last row and each ``d`` reversal above ``slack``."""
     turns, extreme, way = [0], 0, 0
     for k in range(1, d.size):
         moved = d[k] - d[extreme]
@@ -167,9 +167,9 @@ def _turning_points(d: FloatArray, slack: float) -> list[int]:
 
 
 def _begin(d: FloatArray, force: FloatArray) -> float:
-    """Return the d at which a line fitted to the steep part of the curve reaches zero force.
+    """Extrapolate the steep part of the curve to zero force; return the d at that point.
 
-    The line is fitted to a power of the force that is linear in d.
+    A line is fitted to a power of the force that is nearly linear in d.
     """
     zero = float(np.median(force[: max(1, force.size // 50)]))
     rise = force - zero
@@ -202,15 +202,15 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class CompressionFit:
-    """Fit of one material law to testing machine runs.
+    """Fit of one material law to runs of a testing machine.
 
-    ``factors`` [k] [Pa] multiply the powers 1 to k of the strain or, if k = 1, the shape ``law``.
-    ``std`` is the maximum relative standard deviation of the force above a quarter of the maximum
-    d; for k = 1, this is also the relative standard deviation of the modulus. For each run,
-    ``zeros`` contains the zero offsets of d [m] and F [N] and their standard deviations.
-    ``residual`` [N] is the rms residual. ``chi2`` is the squared residual divided by the squared
-    scatter about a smooth curve. ``score`` is the Bayesian information criterion; the best law has
-    the lowest score.
+    If k > 1, ``factors`` [k] [Pa] are the coefficients of the powers 1 to k of the strain. If k =
+    1, the single factor multiplies the shape ``law``. ``std`` is the maximum relative standard
+    deviation of the force for d above a quarter of its maximum. For k = 1, ``std`` is also the
+    relative standard deviation of the modulus. Each row of ``zeros`` contains a run's zero offsets
+    of d [m] and F [N], and their standard deviations. ``residual`` [N] is the rms residual.
+    ``chi2`` is the squared ratio of ``residual`` to the scatter about a smooth curve. ``score`` is
+    the Bayesian information criterion; the best law has the lowest score.
     """
 
     tip: Fingertip
@@ -234,7 +234,7 @@ class CompressionFit:
         return np.asarray(self.modulus * self.law.stress(strain))
 
     def force(self, run: Run, zeros: FloatArray) -> FloatArray:
-        """Return the modelled force of a run [N], given the run's row in ``zeros``."""
+        """Return the modelled force [N] of a run; ``zeros`` contains the run's zero offsets."""
         tables = _tables(self.tip, self.law if len(self.factors) == 1 else None)
         theta = np.full(len(run.d), run.theta)
         return np.asarray(_shapes(tables, run.d - zeros[0], theta)[0] @ self.factors + zeros[1])
@@ -246,9 +246,9 @@ def _power_law(factors: FloatArray, strain: ArrayLike, derivative: int = 0) -> F
 
 
 def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -> CompressionFit:
-    """Fit a law to runs by least squares, together with the zero offsets of d and F in each run.
+    """Fit a law, and the zero offsets of d and F in each run, by least squares.
 
-    Correlated residuals increase the standard deviations.
+    The standard deviations account for correlated residuals.
 
     Parameters
     ----------
@@ -320,11 +320,11 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
 def compare_laws(
     runs: Sequence[Run], radius: float, poisson: float, material: Material
 ) -> tuple[list[CompressionFit], list[str]]:
-    """Fit spring and solid rubber models to runs; return the fits, best first, and notes.
+    """Fit spring and solid rubber models to runs; return the fits (best first) and notes.
 
-    Springs are fitted with a constant modulus, with a strain-dependent modulus and, if ``material``
-    is nonlinear, with the shape of the material's law. The Poisson's ratio of solid rubber is not
-    fitted, because F(d) does not determine it.
+    Springs are fitted with a constant and with a strain-dependent modulus. If ``material`` is
+    nonlinear, springs are also fitted with the shape of its law. The Poisson's ratio of solid
+    rubber is not fitted, because F(d) does not determine it.
     """
     springs, solid = Fingertip(radius), Fingertip(radius, "solid", poisson)
     tried: list[tuple[str, Fingertip, Material | None]] = [("springs", springs, _UNIT)]
@@ -348,7 +348,7 @@ def compare_laws(
 
 
 def _end(table: ContactTable, tip: Fingertip, theta: float) -> float:
-    """Return the maximum d [m] of a table at a tilt, or 0 if the tilt is outside the table."""
+    """Return a table's maximum d [m] at ``theta``, or 0 if ``theta`` is outside the table."""
     if tip.physics == "solid":
         return _EDGE * table.header.deepest if theta <= table.header.tilt else 0.0
     return _EDGE * tip.radius * min(7.0 / 8.0, 1.0 - math.sin(theta))
@@ -364,7 +364,7 @@ def _tables(tip: Fingertip, law: Material | None) -> list[ContactTable]:
 def _shapes(
     tables: Sequence[ContactTable], d: FloatArray, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the normal force for each power of the strain, and its d derivative, both [n, k]."""
+    """Return the normal forces for the powers of the strain, and their ∂/∂d, both [n, k]."""
     touching, depth = d > 0.0, np.maximum(d, _STEP)
 
     def forces(at: FloatArray) -> FloatArray:
@@ -392,7 +392,7 @@ def _force_std(
 
 
 def _noise(runs: Sequence[Run]) -> float:
-    """Return the scatter of the force about a smooth curve through each run [N]."""
+    """Return the scatter [N] of the force about a smooth curve through each run."""
     squares, freedom, most = 0.0, 0, 0.0
     for run in runs:
         d, force = run.d[run.pressed], run.force[run.pressed]

@@ -14,18 +14,18 @@ FloatArray = NDArray[np.float64]
 
 DURATION_MAX = 3600.0  # maximum recording time [s], which limits the memory use
 _STEP = 0.01  # step of the time grid for motion and torque [s]
-_WINDOW = 6  # half width of the window that fits velocity and acceleration, in steps
-_GAP_MAX = 0.035  # maximum gap in the data across which values are interpolated [s]
-# Minimum speed at which static friction has mostly vanished [rad/s]. For the XL330, a speed of 0.12
-# rad/s is sufficient.
+_WINDOW = 6  # half width of the window for velocity and acceleration, in steps
+_GAP_MAX = 0.035  # maximum gap that is interpolated [s]
+# Static friction has mostly vanished above this speed [rad/s]. For the XL330, a speed of 0.12 rad/s
+# is sufficient.
 _SLIDING_SPEED = 0.2
-# Speed below which a joint counts as stationary [rad/s]: one count of 1.5 mrad in 0.08 s.
+# A joint is stationary below this speed [rad/s], which is one encoder count (1.5 mrad) in 0.08 s.
 _REST_SPEED = 0.02
-# Minimum rotation from standstill at break-away [rad]: three counts, or ten times the elastic
+# Minimum rotation at break-away [rad]. The value is three encoder counts, or ten times the elastic
 # deflection of the gears.
 _BREAK_AWAY_DISTANCE = 5e-3
-# Maximum goal velocity at break-away [rad/s], and number of steps for which the velocity is
-# limited. The velocity limit keeps the inertial torque small.
+# Maximum goal velocity at break-away [rad/s], and number of steps over which it is averaged. The
+# limit keeps the inertial torque small.
 _BREAK_AWAY_RATE = 0.1, 20
 _MOTION_TIME_MIN = 0.5  # minimum motion time in each direction [s]
 _CORRELATION_TIME = 0.2  # correlation time of the residuals [s]
@@ -61,10 +61,10 @@ def fit_friction(
 
         torque = F sign(q̇) + b q̇ + J q̈ + c0 + c1 q + c2 q²
 
-    where F is the Coulomb friction and b ≥ 0 the viscous friction. The polynomial models torques
-    that do not depend on the direction of motion, i.e. weight, cables and the current offset. The
-    break-away friction is the maximum torque during a start from standstill towards a slowly moving
-    goal.
+    where F is the Coulomb friction and b ≥ 0 is the viscous friction. The polynomial in q models
+    the torques that do not depend on the direction of motion: weight, cables and the current
+    offset. The break-away friction is the maximum torque while the joint starts from standstill to
+    follow a slowly moving goal.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def fit_friction(
     place, rate, acceleration = _motion(shown)
     after = np.clip(np.searchsorted(at, grid, "right"), 1, at.size - 1)
     whole = at[after] - at[after - 1] < _GAP_MAX
-    # Use only times at which the direction of motion is constant throughout the smoothing window.
+    # Use a sample only if the direction of motion is constant throughout its smoothing window.
     closes, opens = (_throughout(whole & (sign * rate > _SLIDING_SPEED)) for sign in (1.0, -1.0))
     seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
     if min(seconds) < _MOTION_TIME_MIN:
@@ -115,7 +115,7 @@ def fit_friction(
 
 
 def duration_error(seconds: float) -> str:
-    """Return the error message for a recording that is too long at ``seconds``."""
+    """Return the error message for a recording whose duration ``seconds`` is too long."""
     return f"found {seconds:.0f} s of data, expected at most {DURATION_MAX:g} s"
 
 
@@ -137,7 +137,7 @@ def _motion(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _throughout(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask that is True if the condition holds throughout the window around an instant."""
+    """Return a mask of the instants around which ``holds`` is True throughout the window."""
     size = 2 * _WINDOW + 1
     return np.convolve(np.pad(holds, _WINDOW), np.ones(size), "valid") > size - 0.5
 
@@ -160,8 +160,7 @@ def _least_squares(
     std = np.sqrt(np.diag(covariance))
     if found[1] < 0.0:  # b cannot be negative, so use the solution for b = 0
         found = found - covariance[:, 1] * (found[1] / covariance[1, 1])
-    # At a constant current, the quantisation error is also constant, so averaging does not reduce
-    # the error.
+    # At a constant current, the quantisation error is constant, so averaging does not reduce it.
     std[0] = math.hypot(float(std[0]), math.sqrt(rounding))
     return found, std
 
@@ -169,8 +168,8 @@ def _least_squares(
 def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatArray) -> FloatArray:
     """Return the torque and its standard deviation for each slow start from standstill, [n, 2].
 
-    The goal and the torque increase in whole counts, so the break-away torque lies between the
-    highest torque reached and the torque one step earlier.
+    The goal and the torque increase in whole counts. The break-away torque is therefore between the
+    highest torque and the torque one step earlier.
     """
     found = []
     speed, steps = _BREAK_AWAY_RATE

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
 
-_PRIOR_STD = (0.4, 0.4, 3.0)  # prior σ of rise (relative), time (relative), ambient [°C]
-# Standard deviation of the reading error, including rounding to whole degrees [°C].
+_PRIOR_STD = (0.4, 0.4, 3.0)  # prior σ of rise and time (relative) and of ambient [°C]
+# Standard deviation of a reading [°C], including the rounding to whole degrees.
 _READING_ERROR = 0.4
 _STEP = 1.0  # s
 _RISE_MIN = 8.0  # minimum temperature rise of the case [°C]
@@ -19,7 +19,7 @@ _ITERATIONS = 12
 
 
 class HeatFit(NamedTuple):
-    """Factors for the model's ``rise`` and ``time``, their standard deviations and the residual."""
+    """Factors that scale the ``rise`` and ``time`` of the model, with standard deviations."""
 
     rise: float
     rise_std: float
@@ -37,10 +37,10 @@ def forecast(
     start: float,
     ambient: float,
 ) -> NDArray[np.float64]:
-    """Predict the case temperature [°C] from squared currents [A²] sampled every _STEP.
+    """Predict the case temperature [°C] from squared currents [A²] sampled at intervals of _STEP.
 
-    The model is defined in `hand.servo_heat`. Winding and case start at ``start`` [°C]. ``rise``
-    and ``time`` scale the model constants.
+    The model is defined in `hand.servo_heat`. The winding and the case start at the temperature
+    ``start`` [°C]. ``rise`` and ``time`` scale the model constants.
     """
     winding = case = start
     heating, inner, outer = law.heating * rise / time, law.winding_time * time, law.case_time * time
@@ -57,8 +57,9 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
     """Fit the thermal model to a hold that starts at room temperature.
 
     ``current`` [A] and ``reading`` [°C] are sampled at the times ``t`` [s]. ``law`` contains the
-    constants of the servo model, known to within 40 %. Gauss-Newton fits the logarithms of the
-    factors. Raises CalibrationError if the case temperature rises by less than 8 °C.
+    constants of the servo model, which are known to within 40 %. The Gauss-Newton method fits the
+    logarithms of the factors. Raises CalibrationError if the case temperature rises by less than 8
+    °C.
     """
     at, square, shown = (np.asarray(each, np.float64) for each in (t, np.square(current), reading))
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
@@ -73,8 +74,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
 
     def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
         case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
-        # Equal readings share one rounding error, so all readings of the same degree together have
-        # the weight of one reading.
+        # Equal readings share one rounding error, so all equal readings together have the weight of
+        # one reading.
         weight = np.sqrt(warmed / grid.size) / _READING_ERROR
         return np.concatenate([(case - readings) * weight, (x - prior) / _PRIOR_STD])
 

@@ -1,4 +1,4 @@
-"""Measure the latency of tactile frames, i.e. the delay of the measured d after joint motion."""
+"""Measure the latency of tactile frames: the delay between joint motion and the measured d."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from softfinger.kinematics.calibration.friction_fit import DURATION_MAX, duratio
 
 FloatArray = NDArray[np.float64]
 
-_STEP = 1e-3  # step of the time grid and of the initial delays [s]
+_STEP = 1e-3  # step of the time grid and of the delays that are tried first [s]
 _DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # range of latencies to search [s]
 # Minimum closing speed in a ramp [m/s], and averaging time of the speed [s].
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
-_RAMP_MARGIN = 0.2  # extension of a ramp at both ends [s]
-_CLOSING_MIN = 8e-4  # minimum closing distance in a ramp [m], seven encoder counts
+_RAMP_MARGIN = 0.2  # time added to both ends of a ramp [s]
+_CLOSING_MIN = 8e-4  # minimum closing distance in a ramp [m]; equal to seven encoder counts
 _FRAME_COUNT_MIN = 8  # minimum number of frames
 _TIME_ERROR = 1e-3  # standard deviation of the times of ticks, readings and frames [s]
 # Apparent widening of a growing footprint; see `perception.frame_channels`.
@@ -27,11 +27,11 @@ _ITERATIONS = 3  # number of iterations that alternately estimate the first cont
 
 
 class LatencyFit(NamedTuple):
-    """Frame delay beyond the configured latency, and its standard deviation [s]."""
+    """Frame delay [s] in addition to the configured latency, and its standard deviation [s]."""
 
     delay: float
     std: float
-    scale: float  # ratio of the d from frames to the d from joint angles
+    scale: float  # ratio of d from the frames to d from the joint angles
     residual: float  # rms residual of d [m]
     ramps: int
 
@@ -43,17 +43,19 @@ def fit_latency(
     latency: float,
     response: float = 0.0,
 ) -> LatencyFit:
-    """Fit the frame delay to the ramps k of a grip, in which the force rises or falls.
+    """Fit the frame delay to the ramps of a grip, in which the force rises or falls.
+
+    The model for ramp k is
 
         d(t) = scale · closing(t − delay) + offset_k
 
-    Cells with a response time show the closing with a first-order lag. The footprint appears wider
-    while it grows.
+    Cells with a response time measure the closing with a first-order lag. A growing footprint
+    appears too wide, and the fit corrects d accordingly.
 
     Parameters
     ----------
     frames
-        Times [s], d [m] and its noise standard deviation [m].
+        Times [s], d [m], and standard deviation of the noise of d [m].
     joints
         Times [s] and closing of the joints [m], measured from any origin.
     errors
@@ -90,14 +92,14 @@ def fit_latency(
         shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # At standstill, the encoder error is constant. Half of the encoder error shifts the ramp.
+    # At standstill, the encoder error is constant, and half of this error shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))
 
 
 class _Ramps(NamedTuple):
-    """Frames in the ramps: times, d, standard deviations, and ramp numbers."""
+    """Frames in the ramps: times, d, standard deviations, and a mask for each ramp."""
 
     t: FloatArray
     d: FloatArray
@@ -176,10 +178,10 @@ def _rate(closing: FloatArray) -> FloatArray:
 def _ramps(
     t: FloatArray, grid: FloatArray, closing: FloatArray, rate: FloatArray
 ) -> tuple[NDArray[np.bool_], float]:
-    """Return a mask of the frames in each ramp, [n, ramps], and the maximum closing [m]."""
+    """Return a mask [n, ramps] of the frames in each ramp, and the maximum closing [m]."""
     window = np.ones(2 * round(_RAMP_MARGIN / _STEP) + 1)
     near = np.convolve(np.abs(rate) > _CLOSING_SPEED_MIN, window, "same") > 0.5
-    # Ramp number, or 0 outside ramps.
+    # Number of the ramp at each time of the grid, or 0 outside ramps.
     number = np.cumsum(near & ~np.append(False, near[:-1])) * near
     index = np.clip(np.searchsorted(grid, t), 0, grid.size - 1)
     widths = {

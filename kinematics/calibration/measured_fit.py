@@ -19,7 +19,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 _PRESS_COUNT_MIN = 6  # minimum number of presses
 _UPRIGHT_TILT = math.radians(1.0)
 _TILTED_MIN = math.radians(5.0)
-_CURVE_ERROR_MAX = 0.05  # maximum curve error, relative to the force and to the radius
+_CURVE_ERROR_MAX = 0.05  # maximum error of the curves, relative to the force or the radius
 _STAGE_ERROR = 2e-3  # assumed relative error of the test stage and its force sensor
 
 
@@ -29,12 +29,12 @@ class CurvesError(SoftfingerError, ValueError):
 
 @dataclass(frozen=True)
 class PressSums:
-    """Presses at known d [m] and θ [rad], both [n], in the finger's plane.
+    """Presses at known d [n] [m] and θ [n] [rad], with tilts in the finger's plane.
 
     ``frames`` contains the frames [k, rows, cols] [Pa] of each press, processed as in the daemon.
-    ``pressures`` [n, rows, cols] are the mean frames, corrected for the bias of noise clipped at 0.
-    ``rest`` [rows, cols] is the bias without contact. ``gain`` is the ratio of the true force to
-    the sensor's force.
+    ``pressures`` [n, rows, cols] are the mean frames without the bias of noise that is clipped at
+    zero. ``rest`` [rows, cols] is the bias of a tip without contact. ``gain`` is the ratio of the
+    true force to the sensor's force.
     """
 
     d: FloatArray
@@ -47,7 +47,7 @@ class PressSums:
 
 
 def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:
-    """Fit the curves of a tip of ``radius``, and the tip position on the ``grid``.
+    """Fit the curves of a tip, and the position of the tip on the sensor ``grid``.
 
     Raises CurvesError.
     """
@@ -145,13 +145,13 @@ def _excess_error(misses: FloatArray, noise: FloatArray, smallest: float) -> flo
 
 
 def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -> FloatArray:
-    """Return the sums of each press minus the unloaded sums, [4, presses]."""
+    """Return the four sums of each press minus the sums without load, [4, presses]."""
     means = np.stack([each.mean(axis=0) for each in frames]) - rest
     return np.asarray(weights @ means.reshape(len(frames), -1).T)
 
 
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
-    """Return the covariance [4, 4] of one frame's sums, from the frames of each press."""
+    """Estimate the covariance [4, 4] of one frame's sums from the scatter within each press."""
     if min(map(len, frames)) < 5:
         raise CurvesError(
             "expected at least five frames for each press, so that the noise can be measured"

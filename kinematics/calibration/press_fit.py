@@ -1,6 +1,6 @@
 """Fit a tip's physics, modulus and position to presses at known depths and tilts.
 
-A least-squares fit of the tip's forward model uses all cells of all frames.
+The tip's forward model is fitted to all cells of all frames by least squares.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _UNIT_MATERIAL = Material.constant(1.0)
 _STEP = 1e-5  # step for numerical derivatives [m]
-_PLACE_STEP = 2e-4  # position step [m]; larger, because rim cells change by whole sample points
+_PLACE_STEP = 2e-4  # position step [m]; large, because rim cells change by whole sample points
 _ROTATION_STEP = 1e-4  # rad
 _ROTATION_STARTS = 8  # number of initial rotations to try
 _GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
 _POISSON_TOLERANCE = 4e-3  # tolerance of ν
-# Presses with smaller differences in d and θ [rad] count as repetitions.
+# Presses whose d [m] and θ [rad] differ by less than this count as repetitions.
 _REPEATED_D, _REPEATED_THETA = 5e-5, 0.009
 _DRIFT_MIN = 0.02  # minimum significant drift of E, given the accuracy of presses and tables
 
@@ -36,9 +36,9 @@ _DRIFT_MIN = 0.02  # minimum significant drift of E, given the accuracy of press
 class Presses:
     """Frames of presses at known d and θ.
 
-    ``frames`` are float64 [n, rows, cols] [Pa], ``d`` [n] is in m, and ``theta`` [n] is in rad in
-    the finger's plane. ``noise`` [Pa] is the standard deviation of a cell in these frames. ``used``
-    [n, rows, cols] excludes dead and saturated cells.
+    ``frames`` are float64 [n, rows, cols] [Pa], at the displacements ``d`` [n] [m]. The tilts
+    ``theta`` [n] [rad] are in the finger's plane. ``noise`` [Pa] is the standard deviation of a
+    cell in these frames. ``used`` [n, rows, cols] excludes dead and saturated cells.
     """
 
     frames: FloatArray
@@ -50,7 +50,7 @@ class Presses:
     def of(
         self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT_MATERIAL
     ) -> FloatArray:
-        """Return the modelled pressures of the presses for a modulus of 1 Pa, [used cells]."""
+        """Return the modelled pressures of all used cells for a modulus of 1 Pa."""
         made = [
             grid.pressure(tip, law, float(depth), float(tilt))
             for depth, tilt in zip(np.maximum(d, 1e-9), self.theta, strict=True)
@@ -60,10 +60,10 @@ class Presses:
 
 @dataclass(frozen=True)
 class Trend:
-    """Modulus E [n] [Pa] of each press versus d [n] [m], to check that one value fits all presses.
+    """Modulus E [n] [Pa] of each press at d [n] [m], and the drift of E with d.
 
-    ``drift`` is the relative change of a fitted line from the minimum to the maximum d, and ``std``
-    is its standard deviation, derived from the scatter about the line.
+    A line is fitted to E. ``drift`` is the relative change of the line from the minimum to the
+    maximum d. ``std`` is the standard deviation of ``drift``, based on the scatter about the line.
     """
 
     d: FloatArray
@@ -73,7 +73,7 @@ class Trend:
 
     @property
     def drifts(self) -> bool:
-        """True if E drifts by more than its scatter, i.e. if the model does not fit the tip."""
+        """True if the drift of E is significant, i.e. if the model does not fit the tip."""
         return abs(self.drift) > max(2.0 * self.std, _DRIFT_MIN)
 
     @property
@@ -100,11 +100,11 @@ def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
 
 
 def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | None:
-    """Return the mean relative excess force of first presses compared with their repetitions.
+    """Compare first presses with their repetitions; return the mean relative excess force.
 
     Filled rubber softens over its first cycles (Mullins, 1948), so one fit cannot describe both
-    first and repeated presses. The mean is taken over all pairs of ``d`` [n] [m] and ``theta`` [n]
-    [rad] that are pressed more than once. The result is None if no pair is repeated.
+    first and repeated presses. The mean is taken over the poses (``d`` [n] [m], ``theta`` [n]
+    [rad]) that occur more than once. The result is None if no pose is repeated.
     """
     poses = np.round(np.stack([d / _REPEATED_D, theta / _REPEATED_THETA], axis=1))
     _, which = np.unique(poses, axis=0, return_inverse=True)
@@ -119,11 +119,11 @@ class TipFit:
 
     ``law`` is the material law for a modulus of 1 Pa at zero strain. The fit determines ``modulus``
     [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the mean
-    squared residual per cell divided by the noise variance. The errors below are the estimator's
-    errors for this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors. ``force_error``
-    is the rms difference between the estimated force and the frame sum, divided by the rms frame
-    sum. The errors include only frames with a valid estimate; ``valid`` is the fraction of such
-    frames. ``trend`` contains the value of E from each individual press.
+    squared residual per cell divided by the noise variance. ``d_error`` [m] and ``theta_error``
+    [rad] are the estimator's rms errors for this tip. ``force_error`` is the relative rms
+    difference between the estimated force and the frame sum. The errors include only frames with a
+    valid estimate; ``valid`` is the fraction of such frames. ``trend`` contains the value of E from
+    each press.
     """
 
     tip: Fingertip
@@ -175,11 +175,11 @@ def compare_tips(
     active: NDArray[np.bool_],
     material: Material = _UNIT_MATERIAL,
 ) -> list[TipFit]:
-    """Fit spring and solid models of the tip and return the fits, best first.
+    """Fit spring and solid models of the tip; return the fits, best first.
 
-    Springs are fitted with a constant modulus and, if ``material`` is nonlinear, also with its law.
-    Solid rubber is fitted with ν as a free parameter: first with a frictionless face for both base
-    types, and then with a sticking face for the better base type.
+    Springs are fitted with a constant modulus. If ``material`` is nonlinear, springs are also
+    fitted with its law. For solid rubber, ν is a free parameter. Both base types are fitted with a
+    frictionless face. The better base type is then also fitted with a sticking face.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
     if not material.is_linear:
@@ -203,7 +203,7 @@ def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
 
 
 def golden_section(cost: Callable[[float], float], low: float, high: float, within: float) -> float:
-    """Return the minimiser of ``cost`` on [low, high], to the tolerance ``within``."""
+    """Minimise ``cost`` on [low, high] by golden-section search, to the tolerance ``within``."""
     left, right = high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low)
     at_left, at_right = cost(left), cost(right)
     while high - low > within:
@@ -221,7 +221,7 @@ def golden_section(cost: Callable[[float], float], low: float, high: float, with
 def _with_errors(
     presses: Presses, fit: TipFit, grid: SensorGrid, active: NDArray[np.bool_]
 ) -> TipFit:
-    """Return the fit with the estimator's errors added."""
+    """Return a copy of the fit that includes the estimator's errors."""
     table = ContactTable.build(fit.tip, fit.material)
     estimator = ContactEstimator(fit.tip, fit.material, grid, presses.noise, active=active)
     area = math.prod(grid.pitches)
@@ -261,9 +261,9 @@ def fit_place(
 ) -> tuple[SensorGrid, float, float]:
     """Fit the tip centre and, if ``rotate`` is True, the sensor rotation.
 
-    The tilts are known. The Gauss-Newton method fits the position, the rotation, the depth of each
-    press (starting from ``presses.d``) and, for springs, the modulus. Returns the grid, the last
-    step [m] and the standard deviation of the centre [m].
+    The tilts are known. The Gauss-Newton method also fits the modulus of a spring tip and the depth
+    of each press. The initial depths are ``presses.d``. Returns the grid, the last step [m] and the
+    standard deviation of the centre [m].
     """
     gain, free_gain = 1.0, tip.physics == "springs"
     readings = presses.frames[presses.used] / material.reference_modulus
@@ -314,6 +314,6 @@ def fit_place(
 
 
 def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:
-    """Return d [m] of an upright tip at ``force`` [N] from its contact table."""
+    """Look up the displacement d [m] of an upright tip at ``force`` [N] in its contact table."""
     d = np.linspace(0.0, 0.4 * tip.radius, 401)
     return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)

@@ -1,4 +1,4 @@
-"""Compilation and caching of kernels, and their record types.
+"""Compile and cache kernels, and define the record types for their arguments.
 
-The package does not depend on what the kernels compute.
+The package is independent of the computations in the kernels.
 """

@@ -1,25 +1,25 @@
 """Compile and cache kernels with Numba, using its private interfaces.
 
-No other module uses Numba's private interfaces. This module is imported only with tested Numba
-versions; otherwise `plain` replaces it.
+Only this module uses Numba's private interfaces. With Numba versions that have not been tested,
+`plain` replaces this module.
 
 `KernelCompiler` runs only the passes that kernels need. The compiler omits the passes for closures,
-`with` statements and parallel loops. `KernelCompiler` also omits the pruning of constant branches,
-which LLVM performs anyway, and the type annotations, which would fill the cache. The compiler
-caches the result types of operations and the sizes of LLVM types. Without these caches, Numba would
-search dozens of candidates for each operation and let LLVM parse a module for each size.
+`with` statements and parallel loops. The compiler does not prune constant branches, because LLVM
+prunes them anyway. Type annotations are not stored, because they would fill the cache. The compiler
+caches the result types of operations and the sizes of LLVM types. Without the cache, Numba would
+search dozens of candidates for each operation, and LLVM would parse a module for each size.
 
-A `BitcodeKernel` can be called only by other kernels and is compiled to LLVM bitcode, never to
-machine code. By default, Numba compiles each function called by a kernel as if Python might call
-it. Numba then optimises the function together with its callees, compiles it to machine code, adds
-two wrappers and caches it. The callers link the bitcode and repeat the optimisation and
-compilation. Stopping at bitcode reduces the compile time by a third and the cache size to a
-quarter.
+A `BitcodeKernel` is compiled to LLVM bitcode but not to machine code. Only other kernels can call a
+`BitcodeKernel`. By default, Numba compiles each function that a kernel calls as if Python might
+call it, too. Numba then optimises the function together with its callees, compiles it to machine
+code, adds two wrappers and caches the result. The callers link the bitcode and repeat the
+optimisation and compilation. Stopping at bitcode reduces the compile time by a third and the cache
+size by three quarters.
 
-`KernelCache` stores the machine code of a kernel but not its bitcode. A kernel that calls the
-stored kernel needs the bitcode and therefore compiles the stored kernel again. Before loading a
-stored kernel, Numba normally imports all its implementations of Python and NumPy functions, which
-takes a third of a second and 50 MB. `KernelCache` skips this import.
+`KernelCache` stores the machine code of a kernel but not its bitcode. A caller of the stored kernel
+needs the bitcode, so Numba compiles the stored kernel again for the caller. Normally, Numba imports
+all its implementations of Python and NumPy functions before it loads a stored kernel. `KernelCache`
+skips this import, which takes a third of a second and 50 MB.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class KernelCompiler(CompilerBase):
 
     def define_pipelines(self) -> list[Any]:
         """Return the compiler passes in the order of execution."""
-        # Branches such as `if blur is None` cannot be typed for some arguments, so prune these
+        # For some arguments, Numba cannot type branches such as `if blur is None`, so prune these
         # branches.
         nones = types.none in self.state.args
         passes: list[Any] = [TranslateByteCode, FixupArgs, IRProcessing]
@@ -106,7 +106,7 @@ class KernelCompiler(CompilerBase):
 
 
 class _Arguments(tuple[Any, ...]):
-    """Argument types without the long string form that Numba would build in every pass."""
+    """Argument types with a short string form; Numba would build a long form in every pass."""
 
     __slots__ = ()
 
@@ -116,7 +116,7 @@ class _Arguments(tuple[Any, ...]):
 
 @contextmanager
 def _with_cached_lookups(flags: Any) -> Iterator[None]:
-    """Cache the signatures of Numba's functions and its type sizes within this context."""
+    """Cache the signatures of operations and the sizes of LLVM types within this context."""
     arithmetic = frozenset(flags.fastmath.flags), flags.error_model
 
     def signature(function: Any, context: Any, arguments: Any, named: Any) -> Any:
@@ -170,7 +170,7 @@ class BitcodeKernel(plain.InnerKernel):
 
     @property
     def _numba_type_(self) -> Any:
-        """Numba type of the kernel, requested by compiled callers."""
+        """Numba type of the kernel, which Numba requests when it compiles a caller."""
         return self.dispatcher._numba_type_
 
 
@@ -178,8 +178,7 @@ class _Bitcode(JITCodeLibrary):
     """Code library that is linked into its callers and never compiled to machine code."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        # Repeat Numba's finalisation of its own libraries, including functions that are only
-        # declared here.
+        # Do what Numba's own libraries do, but skip functions that are only declared here.
         ll_module.data_layout = self._codegen._data_layout
         for function in ll_module.functions:
             if not function.is_declaration:
@@ -196,7 +195,7 @@ class _Bitcode(JITCodeLibrary):
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _InnerLowering(NativeLowering):
-    """Lowering into a bitcode library, with a null entry point as a placeholder for the kernel."""
+    """Lowering to a bitcode library, with a null entry point in place of machine code."""
 
     _name = "inner_lowering"
 
@@ -249,11 +248,11 @@ class KernelFolder:
         """Do nothing, because `kernel_folder` has already created and checked the folder."""
 
     def get_source_stamp(self) -> str:
-        """Return the digest of the kernel's own file; the folder name covers all other files."""
+        """Return a digest of the kernel's own file; the folder name depends on all other files."""
         return hashlib.sha256(text(Path(self._py_file))).hexdigest()
 
     def get_disambiguator(self) -> str:
-        """Return a string that distinguishes kernels with equal kernel and module names."""
+        """Return a string that distinguishes kernels with the same kernel and module name."""
         file = Path(self._py_file)
         inside = file.is_relative_to(ROOT)
         place = file.relative_to(ROOT).parent if inside else file.parent
@@ -293,7 +292,7 @@ class _Files:
 
 
 class KernelCache(FunctionCache):
-    """Numba cache that stores only machine code; raises RuntimeError without a cache folder."""
+    """Numba cache that stores only machine code. Raises RuntimeError if no folder is available."""
 
     _impl_class = _MachineCode
 
@@ -312,7 +311,7 @@ class KernelCache(FunctionCache):
 
 @cache
 def _add_symbols() -> None:
-    """Register with LLVM the Numba memory functions that the machine code calls."""
+    """Register Numba's memory functions with LLVM, because the machine code calls them."""
     for name, address in nrt._nrt.c_helpers.items():  # type: ignore[attr-defined]
         _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
@@ -326,8 +325,8 @@ def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     try:
         dispatcher._cache = KernelCache(function)
     except RuntimeError:
-        pass  # There is no folder, and `kernel_folder` has already issued a warning.
-    called = inner(function, options).dispatcher  # The cache does not store bitcode.
+        pass  # Without a folder, kernels are not stored. `kernel_folder` has issued a warning.
+    called = inner(function, options).dispatcher  # Callers need bitcode, which is not cached.
     dispatcher.get_call_template = called.get_call_template
     dispatcher.get_overload = called.get_overload
     return dispatcher

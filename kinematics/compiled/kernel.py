@@ -1,10 +1,10 @@
 """Decorators for compiled kernels.
 
 A kernel is a pure function of arrays, records and scalars. A function decorated with ``kernel`` can
-be called from Python. Numba compiles the function on the first call, together with all functions
-that it calls, and stores the code in the folder given by `compiled.kernel_folder`. An
-``inner_kernel`` (also ``fast_inner_kernel`` and ``inlined_kernel``) can be called only from other
-kernels, and is compiled in a fraction of the time.
+be called from Python. When the function is first called, Numba compiles it together with all
+functions that it calls. Numba stores the code in the folder that `compiled.kernel_folder` selects.
+Functions decorated with ``inner_kernel``, ``fast_inner_kernel`` or ``inlined_kernel`` can be called
+only from other kernels, but compile in a fraction of the time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from softfinger.kinematics.compiled import plain
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Minor versions of Numba that were tested with `compiler`, which uses private interfaces.
+# Minor versions of Numba whose private interfaces were tested with `compiler`.
 TESTED_NUMBA = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
 # index(k) converts k to an unsigned index. Negative indices count from the end, so Numba tests the
@@ -34,11 +34,11 @@ _SUMS = {"reassoc", "contract", "nsz", "arcp"}
 
 
 class JitDisabled(SoftfingerError):
-    """Numba's JIT compilation is disabled."""
+    """Error raised if Numba's JIT compilation is disabled."""
 
 
 def _chosen_compiler() -> tuple[ModuleType, str]:
-    """Return the compiler module, and the reason if `plain` is used (otherwise an empty string)."""
+    """Return the compiler module and a reason, which is empty unless the module is `plain`."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         raise JitDisabled(
             "NUMBA_DISABLE_JIT is set, but the kernels must be compiled; unset this variable"
@@ -81,7 +81,7 @@ def fast_inner_kernel(function: Function) -> Function:
 
 
 def inlined_kernel(function: Function) -> Function:
-    """Compile an :func:`inner_kernel` inline into its callers; products and sums may be fused.
+    """Compile an inlined :func:`inner_kernel`, whose products and sums may be fused.
 
     Use this decorator for the innermost functions of a hot path, where a call costs as much as the
     function body. The code is repeated in each caller, so it should be short.

@@ -1,9 +1,10 @@
-"""Manage the cache folders for compiled kernels, one for each version of sources and compiler.
+"""Manage the cache folders for compiled kernels, one per version of the sources and compiler.
 
-The folder name is a digest of all sources that a kernel may depend on, the versions of Python,
-Numba, llvmlite and NumPy, and the processor. Outdated kernels are therefore never loaded. The files
-are unpickled and executed, so the folder is used only if no other user can modify it. Each file
-begins with a digest of its content; corrupted files are compiled again.
+The folder name is a digest of all sources that may affect a kernel. The digest also includes the
+processor and the versions of Python, Numba, llvmlite and NumPy. Outdated kernels are therefore
+never loaded. The files are unpickled and executed, so the folder is used only if no other user can
+modify it. Each file begins with a digest of its content. If a file is corrupted, its kernel is
+compiled again.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
 # Number of other cache folders to keep, for example those of other checkouts or the previous
 # release.
 _FOLDERS_MAX = 4
-_RECENT = 600.0  # age below which a folder may still be in use and is not removed [s]
+_RECENT = 600.0  # minimum age of a removed folder [s]; newer folders may be in use
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",
@@ -48,7 +49,7 @@ _KERNEL, _MARK = ".kernel", ".built"
 
 @cache
 def kernel_folder() -> OwnFolder | None:
-    """Return the current cache folder, created if needed; on failure, warn and return None."""
+    """Return the current cache folder (create it if needed); on failure, warn and return None."""
     try:
         return find_kernel_folder()
     except (OSError, RuntimeError) as error:
@@ -62,7 +63,7 @@ def kernel_folder() -> OwnFolder | None:
 
 
 def find_kernel_folder() -> OwnFolder:
-    """Return the current folder in NUMBA_CACHE_DIR if set, otherwise in the user's cache directory.
+    """Return the current folder in NUMBA_CACHE_DIR or, by default, in the user's cache directory.
 
     Raises the exceptions of :class:`OwnFolder`, or RuntimeError if there is no home directory.
     """
@@ -145,7 +146,7 @@ def mark(folder: OwnFolder, part: str) -> None:
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove other cache folders, except for the few newest and all recently used folders."""
+    """Remove other cache folders, except for the newest ones and those used recently."""
     oldest = time.time() - _RECENT
     others = [
         each
@@ -160,7 +161,7 @@ def _prune(base: Path, current: Path) -> None:
 
 @cache
 def digest() -> str:
-    """Return a digest of the sources, Python, Numba, llvmlite, NumPy and the processor."""
+    """Return the digest in the folder name; the module docstring lists its inputs."""
     state = hashlib.sha256()
     packages = (numba.__version__, llvmlite.__version__, np.__version__)
     versions = (sys.version, *packages, platform.machine())

@@ -18,8 +18,8 @@ A record is declared once as a class. Python code and kernels then access the sa
         deeper(tip, more)     # an inner kernel takes the record itself
 
 A field is a `float`, an `int` (64 bit), a `bool`, another record, or an array of fixed shape
-declared with :data:`Annotated`. Arrays whose size depends on a grid cannot be fields, because
-kernels would have to be compiled again for each size.
+declared with :data:`Annotated`. Arrays whose size depends on a grid cannot be fields, because each
+size would require another compilation.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _SCALARS: dict[Any, Any] = {float: np.float64, int: np.int64, bool: np.bool_}
 
 
 class Records(Protocol, Generic[Each]):
-    """Type of a structured array of records, for indexing in kernels."""
+    """Type of a structured array; kernels index its records."""
 
     def __getitem__(self, index: int, /) -> Each: ...
     def __setitem__(self, index: int, record: Any, /) -> None: ...  # copies the record
@@ -103,7 +103,7 @@ class _Views(dict[str, Any]):
 
 
 class _Many(list[Any]):
-    """Views of a record array inside a record, and the array itself for kernels."""
+    """Views of the records in an array field; ``array`` is the array that kernels take."""
 
     def __init__(self, kind: type[Record], array: Any) -> None:
         super().__init__(kind(array[k : k + 1]) for k in range(len(array)))
@@ -152,5 +152,5 @@ def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
     inner = base.__args__[-1]
     if isinstance(inner, type) and issubclass(inner, Record):
         return inner, inner.dtype, shape
-    # The type argument of NDArray is dtype[float64], or float64 since NumPy 2.5.
+    # The type argument of NDArray is dtype[float64] before NumPy 2.5, and float64 since then.
     return None, getattr(inner, "__args__", (inner,))[0], shape

@@ -1,8 +1,8 @@
 """Check that only the current user can modify a folder, and write files atomically.
 
-A user who can write to a parent folder can replace the folder, even after the folder has been
-checked. Therefore, all parent folders are checked, the folder is opened once, files are read
-through its descriptor, and the owner of each file is checked.
+A user who can write to a parent folder can replace the folder, even after the check. All parent
+folders are therefore checked, too. The folder is opened once, and files are read through its
+descriptor. The owner of each file is also checked.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import stat
 from functools import cache
 from pathlib import Path
 
-# Windows has no owner or mode bits to check, and a folder cannot be held open. The access control
-# lists of the user profile protect the folder instead.
+# Windows has no owner or mode bits to check and cannot keep a folder open. The access control lists
+# of the user profile protect the folder instead.
 HAS_OWNERS = hasattr(os, "geteuid")
 NO_FOLLOW: int = getattr(os, "O_NOFOLLOW", 0)
 _PLAIN: int = NO_FOLLOW | getattr(os, "O_BINARY", 0)
@@ -30,7 +30,7 @@ def fault(path: Path, found: os.stat_result) -> str:
     """Return the reason why other users can modify ``path``, or "" if they cannot modify it.
 
     ``found`` is the stat result for the path. The owner must be this user or root. Folders with the
-    sticky bit, such as /tmp, are allowed: only the owner of an entry can replace it.
+    sticky bit, such as /tmp, are allowed, because only an entry's owner can replace the entry.
     """
     if not HAS_OWNERS:
         return ""
@@ -53,7 +53,7 @@ def _written_by_others(path: Path, found: os.stat_result) -> str:
 
 @cache
 def _alone_in(group: int) -> bool:
-    """Return True if the group is this user's private group: same name and no other members."""
+    """Return True if the group has this user's name and no other members."""
     import grp
     import pwd
 
@@ -96,7 +96,8 @@ def write_whole(
 ) -> None:
     """Write a file atomically, using a temporary file in the same directory.
 
-    If an open directory ``folder`` is given, ``path`` is relative to it. Raises OSError.
+    If the descriptor ``folder`` of an open directory is given, ``path`` is relative to it. Raises
+    OSError.
     """
     part = f"{path}.{os.getpid()}.part"
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _PLAIN
@@ -159,7 +160,7 @@ class OwnFolder:
             return file.read()
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file atomically, readable only by this user. Raises OSError."""
+        """Atomically write a file that only this user can read. Raises OSError."""
         write_whole(self._at(name), data, 0o600, self.descriptor)
 
     def remove(self, name: str) -> None:

@@ -1,9 +1,8 @@
-"""Replacement for `compiler` that uses only Numba's public interface and works with any version.
+"""Replacement for `compiler` that works with any Numba version, using only public interfaces.
 
-Kernels compiled by either module return identical results. The first start takes twice as long, and
-later starts import Numba's implementations of Python and NumPy functions. Numba stores the kernels
-in the same folder, but without a digest; the folder name depends on the sources and the Numba
-version.
+Kernels compiled by either module return identical results. With this module, the first start takes
+twice as long. Later starts import Numba's implementations of Python and NumPy functions. Numba
+stores the kernels in the same folder, but without a digest of the content.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _config: Any = config
 
 
 class InnerKernel:
-    """Inner kernel as a Python object: Numba can compile it, but calling it from Python fails."""
+    """Inner kernel as a Python object, which Numba can compile but Python cannot call."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         self.py_func = function
@@ -33,7 +32,7 @@ class InnerKernel:
         self._register(options)
 
     def _register(self, options: dict[str, Any]) -> None:
-        """Register the kernel's type with Numba for compiled callers."""
+        """Register the kernel's type with Numba, so that compiled kernels can call it."""
         _overload(self, jit_options=options, strict=False)(lambda *_: self.py_func)
 
     def __call__(self, *values: Any) -> Any:

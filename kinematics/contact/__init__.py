@@ -1,4 +1,4 @@
 """Contact of one soft tip with a plane: material laws, closed forms, integrals, lookup tables.
 
-The package covers the tip and its material. The sensor under the tip is in `kinematics.sensing`.
+The package covers the tip and its material. `kinematics.sensing` models the sensor under the tip.
 """

@@ -1,15 +1,15 @@
-"""Exact contact formulas for a soft hemispherical fingertip with constant modulus on a plane.
+"""Exact formulas for the contact of a soft hemispherical tip, of constant modulus, with a plane.
 
 The module defines the fingertip's geometry and computes force, energy and partial derivatives. The
-tip is a hemisphere of radius a on a rigid base. Each point of the base carries an independent
-spring that is normal to the base. The object's face is displaced by d along the face's normal,
-which is tilted by θ from the base normal. With h = a − d:
+tip is a hemisphere of radius a on a rigid base. An independent spring, normal to the base, stands
+on every point of the base. The object's face is displaced by d along the face's normal, which is
+tilted by θ from the base normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
-The formulas are exact: on the spherical cap, strain × area is an axisymmetric measure about the
-face's normal, so all its moments are elementary. Beyond the limit on θ, the face touches the base
-plate.
+The formulas are exact. On the spherical cap, strain × area is an axisymmetric measure about the
+face's normal. The moments of this measure are elementary functions. Beyond the limit on θ, the face
+touches the base plate.
 """
 
 from __future__ import annotations
@@ -97,11 +97,11 @@ class Fingertip:
     def theta_limit(self, d: ArrayLike) -> FloatArray:
         """Return the maximum |θ| [rad] at d [m]: asin((a − d)/a), π/2 for d ≤ 0, 0 for d ≥ a.
 
-        The result is a scalar or an array, matching ``d``.
+        The result is a scalar or an array, like ``d``.
         """
         h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
-        # cos θ is the footprint radius divided by a. Unlike asin(h/a), this form is accurate for
-        # small d.
+        # At the limit, cos θ is the footprint radius divided by a. Unlike asin(h/a), this form is
+        # accurate for small d.
         depth = np.clip(d, 0.0, self.radius)
         limit: FloatArray = np.arctan2(h, np.sqrt(depth * (self.radius + h)))
         return limit
@@ -143,9 +143,9 @@ _quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 
-    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN input.
-    The formulas are valid up to the limit on θ. Beyond the limit, the function still evaluates the
-    same formulas.
+    ``d`` [m] and ``theta`` [rad] are broadcast. The results are zero for d ≤ 0 and NaN for NaN
+    input. The formulas are valid up to the limit on θ. Beyond the limit, the function still
+    evaluates the same formulas.
     """
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)

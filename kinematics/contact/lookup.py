@@ -1,14 +1,14 @@
 """Lookup kernels for contact tables, and the table format of spring tips.
 
-A spring tip's table stores the ratio of each quantity to its closed form for the modulus at zero
-strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, the ratios
-are exactly 1 and the table has no coefficients.
+The table of a spring tip stores ratios. Each quantity is divided by its closed form for the modulus
+at zero strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, the
+ratios are exactly 1 and the table has no coefficients.
 
-The ratios are analytic up to the edges of the domain in two coordinates: the height h = (a − d)/a,
-and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The coordinate y is even in θ. The value of y is 1 at θ
-= 0 and 0 at the limit on θ. The peak strain is 1 − u. The domain is divided into slabs of h, 16 per
-octave, and each slab into as many pieces of y as the tolerance requires. The domain ends at h =
-1/8, because the ratios diverge as log h for h → 0.
+The coordinates are the height h = (a − d)/a, and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The
+footprint radius is ρ. In these coordinates, the ratios are analytic up to the edges of the domain.
+The coordinate y is even in θ. The value of y is 1 at θ = 0 and 0 at the limit on θ. The peak strain
+is 1 − u. The domain has 16 slabs per octave of h. Each slab is divided into as many pieces of y as
+the tolerance requires. The domain ends at h = 1/8, because the ratios diverge as log h for h → 0.
 
 The kernels accept the record of any tip. Solid and measured tips are evaluated by `solid_lookup`.
 """
@@ -49,11 +49,11 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bit pattern of the smallest numb
 
 @inlined_kernel
 def _slab(h: float) -> tuple[int, float]:
-    """Return the slab index of h in (H_END, 1] and the position of h within the slab, −1 to 1.
+    """Return the slab index of h, and the position of h in the slab, from −1 to 1.
 
-    The index and the position are computed from the bits of h: the exponent gives the octave, and
-    the mantissa gives the slab and the position. Each slab includes its upper end but not its lower
-    end.
+    h must be in (H_END, 1]. The index and the position are computed from the bits of h. The
+    exponent determines the octave. The mantissa determines the slab and the position. Each slab
+    includes its upper end but not its lower end.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
     fraction = ((number << SLAB_BITS) & _FRACTION) | _ONE
@@ -142,7 +142,7 @@ def normal_at(
 
 @inner_kernel
 def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
-    """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m]; solid tips use Hertz's theory.
+    """Return ∂F/∂d [N/m] of an upright tip at ``depth`` [m]; for solid tips, use Hertz's theory.
 
     ``scale`` is 2πE [Pa], where E is the modulus at zero strain.
     """

@@ -1,6 +1,6 @@
 """Stress-strain laws of tip materials.
 
-A law σ(ε) is a single polynomial on the strain range ε ∈ [0, 1], with σ(0) = 0 and a positive slope
+A law σ(ε) is a single polynomial for strains ε from 0 to 1. σ(0) is 0, and the slope is positive
 everywhere. The law is smooth and monotonic, so numerical integration converges quickly.
 """
 
@@ -84,11 +84,12 @@ class Material:
         """Return a smooth law for the polyurethane measured in Table I of the paper.
 
         The paper gives slopes of the stress-strain curve ('Young's modulus, which corresponds to
-        the slope'). The slopes are used as the tangent modulus dσ/dε: 0.135 MPa at zero strain,
-        then 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at strains of 20 to 100 %. The modulus is
-        interpolated by the lowest-degree polynomial with zero slope at zero strain, because the
-        paper calls the first value the smallest. The interpolating polynomial increases on [0, 1].
-        The largest modulus in the paper, 0.304 MPa, occurs above 100 % strain and is not used.
+        the slope'). The slopes are used as the tangent modulus dσ/dε. The modulus is 0.135 MPa at
+        zero strain, and 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at strains of 20 to 100 %. The
+        modulus is interpolated by the lowest-degree polynomial with zero slope at zero strain. The
+        zero slope is required because the paper calls the first value the smallest. The
+        interpolating polynomial increases on [0, 1]. The largest modulus in the paper, 0.304 MPa,
+        occurs above 100 % strain and is not used.
         """
         return cls(tuple(map(Fraction, _TABLE_I.split())), name="table_i")
 
@@ -129,7 +130,7 @@ class Material:
         return 0.0 if self.misfits is None else float(self.misfits[1].max())
 
     def force_error(self, ratio: ArrayLike) -> FloatArray:
-        """Return the relative force error of an upright tip due to the misfit of the law.
+        """Return the relative force error that the misfit of the law causes for an upright tip.
 
         The force is F = 2π h² ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d. The force error is
         the same integral over the misfits, divided by F. The misfits are interpolated linearly,
@@ -163,7 +164,7 @@ class Material:
         return len(self.coefficients)
 
     def stress(self, strain: ArrayLike) -> FloatArray:
-        """Return σ(ε) [Pa] of a number or an array; 0 for ε ≤ 0, linear above 1, NaN for NaN."""
+        """Return the stress σ(ε) [Pa]: 0 for ε ≤ 0, linear for ε > 1, NaN for NaN."""
         return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:
@@ -171,7 +172,7 @@ class Material:
         return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:
-        """Return the law's expansions divided by E₀, for the quadrature, float64 [7, order].
+        """Return expansions of the law, divided by E₀, for `quadrature`: float64 [7, order].
 
         Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. With X_1
         = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε, the rows are S_1, W_1, T_1, S_2, S_2′, T_2 and
@@ -191,7 +192,7 @@ class Material:
 
 
 def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
-    """Return ``law`` at ``strain``: 0 below 0, and a Taylor series up to ``order`` above 1.
+    """Evaluate ``law`` at ``strain``: 0 below 0, and a Taylor series up to ``order`` above 1.
 
     The result has the shape of ``strain``; for a number it is a NumPy scalar.
     """

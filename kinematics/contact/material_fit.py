@@ -1,4 +1,4 @@
-"""Fit a smooth, monotonic stress-strain law, or a modulus, to measured points.
+"""Fit a smooth, monotonic stress-strain law to measured points.
 
 The tangent modulus is a Bernstein polynomial on [0, 1], fitted by bounded least squares. The
 polynomial's coefficients are positive, so the modulus is positive everywhere.
@@ -20,13 +20,13 @@ __all__ = ["MaterialError"]
 
 MIN_POINTS = 4
 _DEGREES = range(11)  # polynomial degrees of the modulus, in the order in which they are tried
-_NEGLIGIBLE_MISFIT = 1e-9  # misfit that is negligible, relative to the maximum stress
-# Maximum misfit of a lower degree that is accepted, as a multiple of the smallest misfit.
+_NEGLIGIBLE_MISFIT = 1e-9  # negligible misfit, relative to the maximum stress
+# A lower degree is accepted if its misfit is at most this multiple of the smallest misfit.
 _MISFIT_RATIO_MAX = 1.5
 _MISFIT_MAX = 0.05  # maximum misfit of a successful fit, relative to the maximum stress
 _MODULUS_MIN = 1e-3  # minimum modulus, relative to the mean modulus
 _EXTENSION_WEIGHT = 0.1  # weight of the points that extend the curve
-_SMOOTHING = 1e-7  # weight of the modulus's second differences, which prevents oscillation
+_SMOOTHING = 1e-7  # weight of the second differences of the modulus, to prevent oscillation
 
 
 class MaterialError(SoftfingerError, ValueError):
@@ -110,8 +110,8 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Extend the points to strain 1 using their slope at the end."""
     if x[-1] > 0.95:
         return x, y
-    # Fit a parabola to the last third of the points. Limit the final slope of the parabola to 0.5
-    # to 2 times the mean slope of the last quarter.
+    # Fit a parabola to the last third of the points. Limit its final slope to between 0.5 and 2
+    # times the mean slope of the last quarter.
     last = max(3, x.size // 3)
     back = x[-last:] - x[-1]
     slope = float(np.polyfit(back, y[-last:], 2)[1])
@@ -123,7 +123,7 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
-    """Fit the modulus' Bernstein coefficients (lower bound _MODULUS_MIN) to the points."""
+    """Fit the Bernstein coefficients of the modulus to the points, with a positive lower bound."""
     matrix = _integrals(x, degree) * weights[:, None]
     smooth = np.zeros((max(degree - 1, 0), degree + 1))
     for i in range(degree - 1):
@@ -155,7 +155,7 @@ def _monomials(bernstein: list[Fraction]) -> list[Fraction]:
 
 
 def nonnegative(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve least squares subject to x ≥ 0 with the active-set method of Lawson and Hanson."""
+    """Solve a least-squares problem subject to x ≥ 0 by Lawson and Hanson's active-set method."""
     count = matrix.shape[1]
     x = np.zeros(count)
     free = np.zeros(count, dtype=np.bool_)

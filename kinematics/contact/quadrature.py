@@ -1,20 +1,20 @@
 """Reference integrals of force and energy for any material law.
 
-Contact tables are fitted to the integrals in this module and checked against them. The springs
-stand on the base plane, and the object's face cuts the spherical cap, so
+Contact tables are fitted to these integrals and checked against them. The springs stand on the base
+plane, and the object's face cuts the spherical cap, so
 
     F = ∬ σ(ε) dx dy,   U = ∬ z w(ε) dx dy,   ε = (n·P − h)/(z cos θ),   P = (x, y, z) on the cap.
 
 The coordinates are t = n·P and the angle φ about the normal n. With lengths divided by a, dx dy = z
 dt dφ. The integrals give the ratio of each quantity to its closed form for a constant modulus E₀.
-The ratio is 1 plus a term that describes the material's nonlinearity, so there is no cancellation
-as d → 0.
+The ratio is 1 plus a term for the nonlinearity of the material. This form avoids cancellation as d
+→ 0.
 
 The integral over φ is exact. The substitution ε dφ = (t − h)/(p cos θ) dχ with p = √(t² − sin² θ)
-makes ε linear in cos χ, so a polynomial law needs few nodes. The integral over t is evaluated in y
-= √(t − sin θ); in this variable, the integrand is analytic except for poles at and near y = 0. The
-range is divided into pieces of at most one octave. The number of pieces grows logarithmically as
-the face approaches the rim.
+makes ε linear in cos χ. A polynomial law therefore needs few nodes. The integral over t is
+evaluated in y = √(t − sin θ). As a function of y, the integrand is analytic except for poles at and
+near y = 0. The range is divided into pieces of at most one octave. The number of pieces grows
+logarithmically as the face approaches the rim.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from softfinger.kinematics.contact.material import Material
 # Number of Gauss points per piece. With 14 points, ∂F/∂θ has an error of 1e-10. With 18 points,
 # only rounding errors remain.
 _NODES = 18
-# Number of points for laws above degree 8. With 18 points, their error can reach 1e-11.
+# Number of points for laws above degree 8, whose error with 18 points can reach 1e-11.
 _NODES_HIGH_DEGREE = 26
-_PIECE_MIN = 2.0**-14  # minimum size of a graded piece, relative to the scale of the singular point
+_PIECE_MIN = 2.0**-14  # minimum size of the first piece, relative to min(y1, √h)
 
 
 def gauss_rule(nodes: int = _NODES) -> FloatArray:
@@ -46,7 +46,7 @@ def gauss_rule(nodes: int = _NODES) -> FloatArray:
 
 
 def circle_rule(degree: int) -> FloatArray:
-    """Return the nodes cos χ and sin² χ [2, m] of the equal-weight rule, exact up to ``degree``."""
+    """Return cos χ and sin² χ [2, m] of an equal-weight rule that is exact up to ``degree``."""
     count = max(1, degree // 2 + 1)
     angles = np.pi * (np.arange(count) + 0.5) / count
     return np.stack([np.cos(angles), np.sin(angles) ** 2])
@@ -84,10 +84,10 @@ def _ratios(
 
     The integrals run over v from 0 to 1. The variables t and y are related by t = sin θ + y².
 
-    ``gauss`` [2, n] contains points and weights on [0, 1], ``circle`` [2, m] the values cos χ and
-    sin² χ at equidistant angles, and ``polynomials`` the expansions of the law. delta = d/a is in
-    (0, 1]; h = 1 − delta is a separate argument, to keep full precision. s = |sin θ| ≤ h, and c =
-    cos θ.
+    ``gauss`` [2, n] contains points and weights on [0, 1]. ``circle`` [2, m] contains cos χ and
+    sin² χ at equidistant angles. ``polynomials`` contains the expansions of the law. delta = d/a is
+    in (0, 1]. To keep full precision, h = 1 − delta is a separate argument. s = |sin θ| ≤ h, and c
+    = cos θ.
     """
     # For h near 1, compute h − s from h² − s² = c² − ρ² to avoid cancellation.
     gap = h - s if h < 0.5 else (c * c - delta * (1.0 + h)) / (h + s)
@@ -95,7 +95,7 @@ def _ratios(
     if gap > 0.0:
         y0 = math.sqrt(gap)
     else:
-        # θ is at its limit, to within rounding.
+        # To within rounding, θ is at its limit.
         s = h
         c = math.sqrt(delta * (1.0 + h))
     y1 = math.sqrt(c * c / (1.0 + s))
@@ -168,7 +168,7 @@ def ratios_at(
     gauss: FloatArray, circle: FloatArray, polynomials: FloatArray,
     delta: FloatArray, h: FloatArray, s: FloatArray, c: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Evaluate :func:`_ratios` at each of δ, h, s and c [n] into ``out`` [5, n]."""
+    """Evaluate :func:`_ratios` for arrays δ, h, s and c [n], and write to ``out`` [5, n]."""
     for i in range(delta.shape[0]):
         out[0, i], out[1, i], out[2, i], out[3, i], out[4, i] = _ratios(
             gauss, circle, polynomials, delta[i], h[i], s[i], c[i]
@@ -203,7 +203,7 @@ def integrate(
 ) -> ClosedForms:
     """Integrate force, energy and first partials for any material, with a relative error of 1e-14.
 
-    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. The results are NaN
+    ``d`` [m] and ``theta`` [rad] are broadcast. The results are zero for d ≤ 0. The results are NaN
     outside the domain, which ends at d = a and at the limit on θ. ``nodes`` is as in
     :func:`ratios`.
     """

@@ -1,7 +1,7 @@
 """Precomputed finite element data for a solid rubber tip: energy and base pressure.
 
-The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², where
-μ = E/(2 + 2ν) and κ = E/(3 − 6ν) are the small-strain moduli. Contact is computed in the deformed
+The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)². The
+small-strain moduli are μ = E/(2 + 2ν) and κ = E/(3 − 6ν). Contact is computed in the deformed
 configuration.
 
 The data file contains dimensionless polynomials in t = √(d/a), sin² θ and Poisson's ratio ν. The
@@ -13,12 +13,13 @@ energy is U = E a³ t⁵ g(t, sin² θ). The partials of U are the force along t
     p(r, φ) = F/a² B_0(r) + N/a² Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r).
 
 Without friction, F = N cos θ. A sticking face holds each point of the tip at the position where the
-point first touched it. The plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ
-is the tilt derivative of the energy for straight presses. A shear force T = −N sin θ cos θ q_0
-pulls the tip up the slope. Therefore, F = N cos θ (1 − sin² θ q_0).
+point first touched it. The plane moves straight along its normal. N = ∂U/∂d still holds. ∂U/∂θ is
+the derivative of the energy of straight presses with respect to tilt. A shear force T = −N sin θ
+cos θ q_0 pulls the tip up the slope, so that F = N cos θ (1 − sin² θ q_0).
 
-A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). The shear force T is
-assumed to act at the height a above the base, so its moment about the base centre is T·a.
+A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T) to the base pressure. The
+shear force T is assumed to act at a height of one radius a above the base. Its moment about the
+base centre is therefore T·a.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ _FILE = Path(__file__).with_name("solid_tip.npz")
 
 @dataclass(frozen=True, eq=False)
 class SolidData:
-    """Data for a solid tip at one ν, scaled to E = a = 1.
+    """Data for a solid tip at one value of ν, scaled to E = a = 1.
 
-    The polynomial coefficients [i, j] belong to power i of x = 2 t/``root`` − 1 and power j of y =
+    Element [i, j] of a polynomial is the coefficient of x^i y^j, with x = 2 t/``root`` − 1 and y =
     2 sin² θ/``square`` − 1.
     """
 
@@ -124,6 +125,6 @@ def to_powers(count: int) -> FloatArray:
 
 
 def _slope(rising: FloatArray) -> FloatArray:
-    """Return the derivatives of polynomials stored in columns, padded to the same length."""
+    """Return the derivatives of the polynomials in the columns, padded to the same length."""
     factors = np.arange(1.0, len(rising))[:, None]
     return np.concatenate([rising[1:] * factors, np.zeros((1, rising.shape[1]))])

@@ -1,8 +1,9 @@
 """Contact tables for solid and measured tips, and the lookup kernels for these tables.
 
-All six outputs follow from the energy U = E a³ t⁵ g (see `solid_data`), where g(t, sin² θ) is a
-polynomial and t = √(d/a). The outputs are therefore consistent with each other to within rounding.
-For a sticking face, a second polynomial q_0 describes the reduction of the base force.
+All six outputs are derived from the energy U = E a³ t⁵ g (see `solid_data`). The function g(t, sin²
+θ) is a polynomial in t = √(d/a) and sin² θ. The outputs are therefore consistent with each other to
+within rounding. For a sticking face, a second polynomial q_0 describes the reduction of the base
+force.
 """
 
 from __future__ import annotations
@@ -69,7 +70,10 @@ def _table(radius: float, root: float, square: float, energy: FloatArray) -> Tab
 
 @inlined_kernel
 def normal_force(table: Table, t: float, square: float) -> Lanes:
-    """Return N/a² [Pa], its partials in d and sin² θ, U/a³ [Pa] and its partial in sin² θ."""
+    """Return the normal force N, the energy U and their partials.
+
+    The values are N/a² [Pa], ∂/∂d and ∂/∂sin² θ of N/a², U/a³ [Pa], and ∂/∂sin² θ of U/a³.
+    """
     place = t * table.by_root - 1.0, square * table.by_square - 1.0
     g, g_t, g_tt, g_s, g_ts = lanes(table, ENERGY, *place)
     size = table.modulus * t * t * t
@@ -93,8 +97,8 @@ def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
 def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate `lookup.lookup`.
 
-    If |θ| is beyond the range of the data, the energy is assumed not to depend on θ, and the
-    partials are those of this energy. The force continues to vary with cos θ.
+    If |θ| is beyond the range of the data, the energy is assumed to be independent of θ. The
+    partials are consistent with this assumption. The force still varies with cos θ.
     """
     within = abs(theta) <= table.tilt
     inside = within and d <= table.deepest

@@ -1,7 +1,7 @@
-"""Contact tables: fast lookup of force, energy and their partials within a certified tolerance.
+"""Contact tables for fast lookup of force, energy and partials within a certified tolerance.
 
-A table for any tip model is a single `table_record.Table` record. The `table_build` module builds
-the tables of spring tips and bounds their error; `lookup` evaluates tables.
+For every tip model, a table is a single `table_record.Table` record. The `table_build` module
+builds the tables of spring tips and bounds their error. The `lookup` module evaluates tables.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ _numbers: Any = tuple.__new__
 
 _EDGE_FACTOR = 1.0 - 1e-12  # factor that keeps edge points inside the domain despite rounding
 
-_LAW_ERROR = 0.05  # relative force error due to the law's misfit, above which `build` warns
+_LAW_ERROR = 0.05  # `build` warns if the law's misfit causes a larger relative force error.
 
 
 class ContactTable:
@@ -118,7 +118,7 @@ class ContactTable:
 
     @classmethod
     def build(cls, tip: Fingertip, material: Material, tolerance: float = 1e-9) -> ContactTable:
-        """Build the smallest table that meets a relative ``tolerance`` on all outputs.
+        """Build the smallest table that meets a relative ``tolerance`` for all outputs.
 
         Parameters
         ----------
@@ -185,8 +185,8 @@ class ContactTable:
         Parameters
         ----------
         d, theta
-            Numbers or arrays, which broadcast. If d and theta are numbers, the results are numbers.
-            Results are zero for d ≤ 0 and NaN for NaN input.
+            Numbers or arrays, which are broadcast. If both are numbers, the results are numbers.
+            The results are zero for d ≤ 0 and NaN for NaN input.
         edge
             If True, clamp points outside the domain without a RuntimeWarning. Regardless of
             ``edge``, ``inside`` is False for clamped points.
@@ -215,7 +215,7 @@ class ContactTable:
         return numbers
 
     def _warn(self, d: FloatArray, theta: FloatArray) -> None:
-        """Issue a RuntimeWarning in the caller's code for points outside the domain, except NaN."""
+        """Issue a RuntimeWarning about points outside the domain. NaN causes no warning."""
         within = np.empty(d.size, dtype=np.bool_)
         lookups(self.data, d * _EDGE_FACTOR, theta * _EDGE_FACTOR, np.empty((6, d.size)), within)
         outside = np.flatnonzero(~(within | np.isnan(d) | np.isnan(theta)))

@@ -3,7 +3,7 @@
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
 higher coefficients, and rounding. The bound assumes that the reference integrals have only rounding
-errors, and that the higher coefficients continue to decrease. Both assumptions hold for all
+errors, and that the higher coefficients continue to decrease. The assumptions hold for all
 supported laws, because each law is a single polynomial. Pieces are halved until the bound is within
 the tolerance.
 """
@@ -39,9 +39,9 @@ from softfinger.kinematics.contact.table_record import (
 
 # Rounding error of the closed forms and of the final products in the kernel.
 _ROUNDING = 16.0 * np.finfo(float).eps
-# Bound on the relative rounding error of a piece. An error analysis of the pieces of seven laws of
-# degree 7 to 11 gives at most 3.5e-13. The largest part of the error comes from y², because cos² θ
-# − ρ² cancels near the limit on θ.
+# Bound on the relative rounding error of a piece. An error analysis of seven laws of degree 7 to 11
+# yields at most 3.5e-13 for any piece. The largest part arises in y², because the terms of cos² θ −
+# ρ² cancel near the limit on θ.
 _PIECE_ROUNDING = 1e-12
 # Number of additional Chebyshev coefficients in h and y that are computed but not stored.
 _EXTRA_V, _EXTRA_U = 4, 6
@@ -128,11 +128,11 @@ def _bound(values: FloatArray, lost: FloatArray, h: FloatArray, y: FloatArray) -
     """Return the bound on a piece's relative error and the approximate location of the maximum.
 
     ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` contains the Chebyshev
-    coefficients of the difference between ratios and table. The sum of the magnitudes of these
-    coefficients bounds the difference. Higher coefficients, which are not computed, contribute less
-    than twice the last two coefficients in each direction, because each coefficient is less than
-    half of its predecessor. The coefficients decrease this fast because the ratios are analytic
-    well beyond the piece.
+    coefficients of the difference between ratios and table. The difference is at most the sum of
+    the magnitudes of the coefficients. Higher coefficients are not computed. Each coefficient is
+    less than half of its predecessor, because the ratios are analytic well beyond the piece. In
+    each direction, the higher coefficients therefore contribute less than twice the last two
+    coefficients.
     """
     everywhere = _dense_nodes(len(h)) @ _terms(values) @ _dense_nodes(len(y)).T
     size = np.abs(everywhere)
@@ -150,7 +150,7 @@ def _bound(values: FloatArray, lost: FloatArray, h: FloatArray, y: FloatArray) -
 
 
 def _terms(values: FloatArray) -> FloatArray:
-    """Return the Chebyshev coefficients [5, i, j] of ``values`` [5, i, j] given at the nodes."""
+    """Convert ``values`` [5, i, j] at the nodes to Chebyshev coefficients [5, i, j]."""
     in_x, in_y = _nodes(values.shape[1])[1], _nodes(values.shape[2])[1]
     return np.asarray(np.einsum("ai,bj,kij->kab", in_x, in_y, values, optimize=True))
 
@@ -165,7 +165,7 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def _dense_nodes(count: int) -> FloatArray:
-    """Evaluate ``count`` Chebyshev polynomials at points that are dense enough to resolve them."""
+    """Evaluate the first ``count`` Chebyshev polynomials at four times as many points."""
     return np.asarray(chebyshev.chebvander(np.cos(np.linspace(np.pi, 0.0, 4 * count)), count - 1))
 
 
@@ -179,7 +179,7 @@ def _ratios_at(material: Material, h: FloatArray, y: FloatArray) -> FloatArray:
     """Return the ratios [5, …] at broadcast coordinates h in (0, 1) and y in [0, 1]."""
     h, y = np.broadcast_arrays(h, y)
     delta = 1.0 - h
-    # Compute 1 − u² for u = h y in a form without cancellation for h and y near 1.
+    # Compute 1 − u², where u = h y, in a form without cancellation for h and y near 1.
     complement = (1.0 - y + delta * y) * (1.0 + h * y)
     c = np.sqrt(delta * (1.0 + h) / complement)
     s = h * np.sqrt((1.0 - y) * (1.0 + y) / complement)

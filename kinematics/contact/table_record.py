@@ -1,8 +1,8 @@
-"""Record type of contact tables, and the evaluation of their polynomials.
+"""Define the record type of contact tables, and evaluate their polynomials.
 
-A table consists of pieces. Each piece has five polynomials in two variables. These polynomials (the
-lanes) are evaluated together. The meaning of the polynomials and of their variables depends on the
-tip model; see `lookup` and `solid_lookup`.
+A table consists of pieces. Each piece has five polynomials (lanes) in two variables. The lanes are
+evaluated together. The meaning of the polynomials and of their variables depends on the tip model;
+see `lookup` and `solid_lookup`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ThreeFloats: TypeAlias = tuple[float, float, float]
 LANES = 5
 POWERS_U, POWERS_V = 12, 6  # terms in each variable
 PIECE = POWERS_V * POWERS_U * LANES  # coefficients per piece
-OCTAVES = 3  # number of octaves in h that the pieces of a spring tip's table cover
+OCTAVES = 3  # number of octaves of h in the table of a spring tip
 SLAB_BITS = 4  # Each octave has 2^4 slabs.
 SPLITS_MAX = 4  # maximum number of pieces per slab
 PIECES = OCTAVES * 2**SLAB_BITS * SPLITS_MAX
@@ -46,9 +46,9 @@ class Table(Record):
     tilt: float  # maximum |θ| of a solid tip [rad]
     by_root: float  # 2/(maximum t)
     by_square: float  # 2/(maximum sin² θ)
-    at_first: float  # g at t = 0, from Hertz theory
+    at_first: float  # g at t = 0, from Hertz's theory
     tolerance: float
-    max_error: float  # bound on the relative error, or relative data error of a solid tip
+    max_error: float  # bound on the relative error; for a solid tip, relative error of its data
     worst_d: float  # d at which the error is largest [m]
     worst_theta: float  # θ at which the error is largest [rad]
     coefficients: Annotated[FloatArray, PIECES * PIECE]
@@ -79,7 +79,7 @@ def lanes(table: Table, piece: int, u: float, v: float) -> Lanes:
 
 
 def set_piece(table: Table, piece: int, powers: FloatArray) -> None:
-    """Store the polynomials of a piece, given as ascending powers [lanes, u, v]."""
+    """Store the polynomials of a piece; ``powers`` [lanes, u, v] are ascending coefficients."""
     count, in_u, in_v = powers.shape
     place = table.coefficients[piece * PIECE : (piece + 1) * PIECE]
     place.reshape(POWERS_V, POWERS_U, LANES)[:in_v, :in_u, :count] = powers.T

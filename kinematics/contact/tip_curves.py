@@ -1,4 +1,4 @@
-"""Measured tip model: polynomial curves fitted to calibration presses, and their contact table.
+"""Measured tip model, which consists of polynomial curves fitted to calibration presses.
 
 With t = √(d/a) and q = sin² θ, each curve is a polynomial Σ c_ij t^i q^j:
 
@@ -7,8 +7,8 @@ With t = √(d/a) and q = sin² θ, each curve is a polynomial Σ c_ij t^i q^j:
     lever    frame centroid along the tilt direction, divided by sin θ [m]
     extent   mean squared radius of the frame [m²]
 
-The lowest power of t in ``push`` is 3, so the energy U = ∫ N dd has the same polynomial form as for
-a solid tip.
+The lowest power of t in ``push`` is 3. The energy U = ∫ N dd therefore has the same polynomial form
+as for a solid tip.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ Curve: TypeAlias = tuple[tuple[float, ...], ...]  # c [POWERS][SQUARES]
 
 @dataclass(frozen=True)
 class TipCurves:
-    """Measured curves of one tip on its sensor; see the module docstring for the four curves.
+    """Measured curves of one tip on its sensor; the module docstring defines the curves.
 
     The curves are valid up to ``deepest`` [m] and ``tilt`` [rad]. ``centre`` [m] and ``rotation``
     [rad] locate the tip on the sensor, as in `SensorGrid`. ``presses`` is the number of presses
-    used. Four sums describe a frame: the force [N], the first moments in x and y [N·m] and the
-    second moment [N·m²]. The sums are taken over the cell forces, i.e. pressure times area.
-    ``rest`` contains the sums of an unloaded tip, and ``noise`` [4][4] is the covariance of one
-    frame's sums. ``force_error`` (relative, for push and shown) and ``lever_error`` [m] are the
-    residuals of the curves. Raises ValueError if the curves are invalid.
+    used. Four sums over the cell forces describe a frame: the force [N], the first moments in x and
+    y [N·m] and the second moment [N·m²]. A cell force is pressure times area. ``rest`` contains the
+    sums of an unloaded tip, and ``noise`` [4][4] is the covariance of one frame's sums.
+    ``force_error`` is the relative residual of ``push`` and ``shown``. ``lever_error`` [m] is the
+    residual of the frame centroid. Raises ValueError if the curves are invalid.
     """
 
     radius: float
@@ -85,7 +85,7 @@ class TipCurves:
         return math.sin(self.tilt) ** 2
 
     def at(self, curve: Curve, d: ArrayLike, theta: ArrayLike) -> FloatArray:
-        """Evaluate one of the curves at d [m] and θ [rad], which broadcast."""
+        """Evaluate one of the curves at d [m] and θ [rad], which are broadcast."""
         t, q = np.sqrt(np.asarray(d) / self.radius), np.sin(theta) ** 2
         return np.asarray(_value(*np.broadcast_arrays(t, q), np.array(curve)))
 
@@ -104,7 +104,7 @@ class TipCurves:
 
 
 def _shifted_polynomial(count: int, end: float) -> FloatArray:
-    """Return the powers of u = end/2 (1 + x) as polynomials in x, [power of u, power of x]."""
+    """Expand the powers of u = end/2 (1 + x) in powers of x: [power of u, power of x]."""
     return np.array(
         [[(0.5 * end) ** i * math.comb(i, k) for k in range(count)] for i in range(count)]
     )
