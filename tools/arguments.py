@@ -86,7 +86,7 @@ def own_runtime_folder() -> Path | None:
 
 
 def client_keys(folder: Path | None) -> ClientKeys | None:
-    """Load the client keys from ``--keys``, to be applied to a socket before it connects.
+    """Load the client keys from ``--keys``, which a socket requires before it connects.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def addresses(text: str) -> tuple[str, str]:
 def waiting(address: str, folder: Path | None) -> str:
     """Return the message for a client that waits for the stream, with a hint if keys are missing.
 
-    To a client without keys, a daemon that requires keys appears unreachable.
+    A daemon that requires keys appears unreachable to a client without keys.
     """
     return f"waiting for a stream from {address}{_hint(folder)}"
 
@@ -238,7 +238,7 @@ def add_stream(
     kind: Callable[[str], Any] = stream_address,
     client: bool = False,
 ) -> None:
-    """Add a subscriber's arguments: those of `add_daemon`, ``--no-wait`` and ``--duration``."""
+    """Add a subscriber's arguments: the `add_daemon` arguments, ``--no-wait``, ``--duration``."""
     add_daemon(parser, kind, client)
     parser.add_argument(
         "--no-wait",

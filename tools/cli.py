@@ -1,9 +1,9 @@
 """Parse the command line and run the selected subcommand.
 
 Each subcommand is a module in a ``tools/`` package and is imported only when called. The module
-defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user
-can correct, the module raises SettingsError (exit status 2), or another SoftfingerError or an
-OSError (exit status 1).
+defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For invalid settings, the
+module raises SettingsError (exit status 2). For other errors that the user can correct, the module
+raises another SoftfingerError or an OSError (exit status 1).
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ interrupted by Ctrl-C. The help of a subcommand lists its additional exit status
 
 
 def _open_standard_streams() -> None:
-    """Open /dev/null for closed standard streams, so that other files cannot get their descriptors.
+    """Open /dev/null for closed standard streams, so that no other file gets descriptors 0 to 2.
 
     Also replace characters that a terminal or pipe cannot encode, such as θ.
     """

@@ -39,14 +39,14 @@ class TrueStates:
 
 
 class SimulatedDaemon:
-    """Daemon in virtual time whose simulated hand can be observed. Raises SettingsError."""
+    """Daemon that runs in virtual time, with an observable simulated hand. Raises SettingsError."""
 
     def __init__(
         self,
         sections: dict[str, dict[str, Any]],
         hand: dict[str, dict[str, Any]] | None = None,
     ) -> None:
-        """Build the daemon; ``hand`` contains the hand's settings, by default the daemon's."""
+        """Build the daemon; the settings in ``hand`` default to the daemon's ``sections``."""
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self.events: list[Event] = []
         real = None if hand is None else checked(hand | {"loop": {"clock": "virtual"}})

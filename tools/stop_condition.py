@@ -93,11 +93,11 @@ class StopCondition:
 
 
 class Interrupted(BaseException):
-    """A signal arrived before the daemon was running; deliberately not an `Exception` subclass."""
+    """Raised if a signal arrives before the daemon runs; deliberately not an `Exception`."""
 
 
-# By default, these signals end the process immediately, and only the servo watchdog would then
-# switch torque off. SIGHUP means that the terminal was closed.
+# By default, these signals end the process immediately. Only the servo watchdog would then switch
+# torque off. SIGHUP means that the terminal was closed.
 _TERMINATING = available_signals("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
 
 

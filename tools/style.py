@@ -1,7 +1,7 @@
 """Plot style: sizes for print, and lines that can be distinguished without colour.
 
 Ordered families of lines (by displacement or angle) use colours of decreasing lightness. The order
-remains visible in greyscale and to colour-blind readers. Each line also has its own dash pattern.
+remains visible in greyscale and for colour-blind readers. Each line also has its own dash pattern.
 Unordered categories use the colours of Okabe and Ito.
 """
 
@@ -77,7 +77,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def ordered(count: int) -> list[dict[str, Any]]:
-    """Return colours and dashes for an ordered family of lines, from light to dark, solid first."""
+    """Return colours and dashes for an ordered family of lines; the first is light and solid."""
     import matplotlib
 
     shades = matplotlib.colormaps["viridis"](np.linspace(0.72, 0.0, count))

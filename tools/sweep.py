@@ -33,7 +33,8 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-# In a checkout, the last three folders are links, which a search of the first one does not follow.
+# In a checkout, the last three folders are links. A search of the first folder does not follow
+# links.
 _SOURCES = tuple(Path(__file__).parents[1] / n for n in ("", "daemon", "kinematics", "tools"))
 _CONNECT_TIMEOUT = 10.0  # time limit for connecting to the scheduler [s]
 _REDRAW_INTERVAL = 0.1  # time between two updates of a progress bar [s]
@@ -210,7 +211,7 @@ class Sweep(Generic[Case, Result]):
 
 
 def _digest_of(work: object, cases: Sequence[object]) -> str:
-    """Return a digest of the sweep and of all sources, so that different code is not mixed."""
+    """Return a digest of the sweep and of all source files; the journal stores the digest."""
     state = hashlib.sha256(pickle.dumps((work, list(cases))))
     for folder in _SOURCES:
         for file in sorted(folder.rglob("*.py")):

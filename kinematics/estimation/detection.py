@@ -1,7 +1,7 @@
 """Fast contact detection and outlier rejection in a frame.
 
-The kernels use only the readings and their noise; no fit is needed. Single cells whose reading is
-too high for any contact are masked as outliers.
+The kernels use only the readings and the noise level, without a fit. If a single cell reads far
+more than its neighbours, it is masked as an outlier.
 """
 
 from __future__ import annotations
@@ -21,20 +21,22 @@ from softfinger.kinematics.estimation.state import (
 )
 from softfinger.kinematics.sensing.footprint import Grid, line_span, set_around, set_face, steps
 
-# Levels of the activity test, in noise standard deviations. Common errors and correlated noise
-# raise the second level.
+# Thresholds of the activity test, in noise standard deviations. The second threshold is raised for
+# common errors and correlated noise.
 PEAK_LEVEL, PATCH_LEVEL = 3.0, 4.9
-OUTLIERS_MAX = 6  # maximum number of outliers that are excluded from a frame
-# Ratio of the detection level during a contact to the level before contact. A ratio below 1
-# prevents the detection from toggling.
+OUTLIERS_MAX = 6  # maximum number of outliers excluded from a frame
+# Factor on the detection threshold during a contact. A factor below 1 prevents toggling.
 _HYSTERESIS = 0.5
-_NOISE_RATIO = 1.75  # minimum ratio of measured noise to noise setting in a noisy frame
+_NOISE_RATIO = 1.75  # minimum ratio of measured to configured noise in a noisy frame
 _SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviations
 
 
 @fast_inner_kernel
 def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
-    """Return Σ p, Σ p² and the maximum of 0 and all p. A non-finite cell makes Σ p non-finite."""
+    """Return the sum, the sum of squares and the maximum of the readings.
+
+    The maximum is at least 0. A reading that is not finite makes the sum non-finite.
+    """
     total = 0.0
     energy = 0.0
     peak = np.int64(0)
@@ -51,7 +53,7 @@ def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
 
 @inner_kernel
 def next_above(frame: FloatArray, height: FloatArray, start: int, last: int, level: float) -> int:
-    """Return the first cell in start..last with a reading ≥ ``level``, or ``last`` if none."""
+    """Return the first cell from ``start`` on that reads at least ``level``, or ``last``."""
     while start < last and not (frame[start] >= level and height[start] >= 0.0):
         start += 1
     return start
@@ -61,9 +63,9 @@ def next_above(frame: FloatArray, height: FloatArray, start: int, last: int, lev
 def neighbourhood(frame: FloatArray, height: FloatArray, grid: Grid, at: int) -> float:
     """Return the weighted sum of the 24 neighbours of cell ``at``, in standard deviations.
 
-    The weights of the 5 × 5 window are (1, 2, 2, 2, 1) in both directions; the cell itself is
-    excluded. The standard deviation assumes a cell noise of 1. Cells with negative ``height``
-    (see `state.Cells`) are excluded as well.
+    The weights of the 5 × 5 window are (1, 2, 2, 2, 1) along each axis. The cell itself and cells
+    with a negative ``height`` (see `state.Cells`) are excluded. The standard deviation is computed
+    for a cell noise of 1.
     """
     cols = grid.cols
     i = at // cols
@@ -84,13 +86,14 @@ def neighbourhood(frame: FloatArray, height: FloatArray, grid: Grid, at: int) ->
 def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> None:
     """Test the frame for contact and store the result in ``state.signal``.
 
-    A contact is detected if a cell reads at least `PEAK_LEVEL` · noise and the weighted sum of
-    its neighbours exceeds ``patch_level`` standard deviations. A single outlying cell is therefore
-    not detected as a contact. A cell and its neighbours are statistically independent. At levels of
-    3 and 4.9, the false alarm rate for white noise on 788 cells is therefore 788 · 1.35e-3 · 4.8e-7
-    = 5.1e-7 per frame. With a noise of 0.2 % of the modulus, a contact of d = 0.2 mm is detected in
-    99.98 % of frames (150 000 simulated frames, all azimuths, tilts up to 30°, positions between
-    cells).
+    A contact is detected at a cell that meets two conditions. The cell must read at least
+    `PEAK_LEVEL` · noise. The weighted sum of the cell's neighbours must exceed ``patch_level``
+    standard deviations. A single outlier is therefore not detected as a contact.
+
+    White noise in a cell is independent of the noise in its neighbours. For 788 cells and
+    thresholds of 3 and 4.9, the false alarm rate is 788 · 1.35e-3 · 4.8e-7 = 5.1e-7 per frame. In a
+    simulation, 99.98 % of contacts with d = 0.2 mm were detected. The noise was 0.2 % of the
+    modulus. The 150 000 frames covered all azimuths, tilts up to 30° and positions between cells.
     """
     signal = state.signal
     grid = state.grid
@@ -118,11 +121,11 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
 
 @inner_kernel
 def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
-    """Return True if the cells of a frame without contact scatter by more than the expected noise.
+    """Return True if the readings of a frame without contact scatter more than the noise explains.
 
-    Only cells above a central reading are used, because readings may be clipped at 0. The central
-    reading is the mean, or 0 if more than a quarter of the cells read 0. If half of 788 cells are
-    above the central reading, the standard deviation of the noise estimate is 4 %.
+    Only readings above a central value are used, because readings may be clipped at 0. The central
+    value is the mean, or 0 if more than a quarter of the cells read 0. With half of 788 readings
+    above the central value, the noise estimate has a standard deviation of 4 %.
     """
     signal = state.signal
     if not (signal.is_finite and signal.peak > signal.mean + _SUSPECT_PEAK * signal.noise):
@@ -142,13 +145,13 @@ def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bo
 
 @inner_kernel
 def shows_pattern(state: EstimatorState, frame: FloatArray, cells: Cells) -> bool:
-    """Return True if a solid tip's frame matches the contact pattern significantly.
+    """Return True if the contact pattern is significant in a solid tip's frame.
 
-    A solid tip spreads much of its pressure over the base. A weak contact is therefore detectable
-    in the sum over all cells long before it is detectable in the neighbourhood of a cell. The
-    pattern has zero mean and unit norm, so a common zero offset and noise clipped at 0 are not
-    detected as a contact. The threshold is ``patch_level`` noise standard deviations, or half this
-    value if the last frame contained a contact.
+    A solid tip spreads much of its pressure over the base. The sum over all cells therefore detects
+    a weaker contact than the neighbourhood of one cell does. The pattern has unit norm and zero
+    mean. Because of the zero mean, a common zero offset or noise clipped at 0 is not detected as a
+    contact. The threshold is ``patch_level`` times the noise's standard deviation. If the last
+    frame contained a contact, the threshold is halved.
     """
     projection = 0.0
     for k in range(frame.shape[0]):
@@ -163,9 +166,9 @@ def presses_outside(
 ) -> bool:
     """Return True if a group of cells outside the footprint reads at least ``level``.
 
-    The footprint is extended by two cells and three standard deviations of the blur. ``level`` is
-    in frame units. The weighted mean of a cell's neighbours must exceed a third of ``level``, so a
-    single cell is not sufficient.
+    The footprint is widened by two cell diagonals plus three standard deviations of the blur.
+    ``level`` is in counts. The weighted mean of a cell's neighbours must exceed a third of
+    ``level``, so a single high cell is ignored.
     """
     grid = state.grid
     a = grid.radius
@@ -183,7 +186,7 @@ def presses_outside(
         start = i * cols
         at = next_above(frame, height, start, start + cols, level)
         while at < start + cols:
-            # In a full neighbourhood, Σ w = 60 and √Σ w² = 13.4.
+            # The limit corresponds to a weighted mean of level/3 (Σ w = 60 and √Σ w² = 13.4).
             if not first <= at - start < last and (
                 neighbourhood(frame, height, grid, at) > 1.5 * level
             ):
@@ -196,7 +199,7 @@ def presses_outside(
 def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
     """Return True if the largest reading exceeds its neighbours by too much to be a contact.
 
-    A contact that is about as wide as a cell reads at most ``signal.narrow_contact_max``. In a
+    A contact about as wide as a cell causes readings of at most ``signal.narrow_contact_max``. In a
     wider contact, each cell reads less than twice the mean of its neighbours.
     """
     rows = state.grid.rows

@@ -1,4 +1,4 @@
-"""Error budget: propagate errors other than white cell noise into the covariance of an estimate.
+"""Propagate errors other than white cell noise into the covariance of an estimate.
 
 White noise of variance σ² gives the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit.
 Errors other than white noise are propagated linearly:
@@ -12,17 +12,17 @@ Errors other than white noise are propagated linearly:
                        C = (JᵀJ)⁻¹ JᵀRJ (JᵀJ)⁻¹, at zero tilt         (`widen_covariance`)
     smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement                 (`undetected_misfit`)
 
-The patterns q describe errors that are the same in every frame: a shift of all cells, its slopes in
-x and y, the tip centre in x and y, the pitch, and the modulus or gain. ``size`` is the standard
-deviation of each error. Patterns that move the tip relative to the cells are computed from pressure
-differences between neighbouring cells.
+Each pattern q describes an error that is the same in every frame. The errors of the zero offset are
+a shift of all cells and slopes in x and y. The other errors are the tip position in x and y, the
+pitch, and the modulus or gain. ``size`` is the standard deviation of an error. The patterns for tip
+position and pitch are computed from pressure differences between neighbouring cells.
 
-R is the noise correlation as a function of the lag, as measured by `calibrate`. The widening due to
-R depends on the footprint size and is tabulated. W² contains the fractions of a smooth error's
-energy that appear as a change in d and gain, and as a tilt. The fractions are small because the
-errors of real cells are nearly as symmetric as the pressure. r_k are the residuals. For independent
-noise, the products of neighbouring residuals average to zero, whereas a misfit that is smooth over
-the footprint contributes fully to the sum.
+R is the noise correlation that `calibrate` measures as a function of the distance between cells.
+The factors by which R widens the covariance are tabulated over d. W² contains the fractions of a
+smooth error's energy that appear in d, in the gain and in the tilts. The fractions are small,
+because the errors of real cells are nearly as symmetric as the pressure distribution. The r_k are
+the residuals. For independent noise, the products of neighbouring residuals average to zero. A
+misfit that is smooth over the footprint contributes fully to the sum of the products.
 """
 
 from __future__ import annotations
@@ -55,20 +55,20 @@ _NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # 
 _NEIGHBOURS[2, 2] = 0.0
 _NOISE_PEAK = 4.5  # maximum reading that noise alone causes, in standard deviations
 _CELL_COUNT_MIN = 48.0  # minimum number of cells for separating smooth and rough misfits
-# Fractions of a smooth error's energy that appear in d (and in the gain), in each tilt, and in the
-# residuals. Curve errors, hysteresis and crosstalk are nearly as symmetric as the pressure.
+# Fractions of a smooth error's energy that change d (and the gain), each tilt, and the residuals.
+# Curve errors, hysteresis and crosstalk are nearly as symmetric as the pressure distribution.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_IN_RESIDUALS = 0.15, 0.06, 0.2
-# Relative tilt error of the solid model, divided by d/a. A comparison with frames from independent
-# finite-element models up to 20° and 7 mm gave an error of 4 % for a bonded tip and a negligible
-# error for a tip that lies on its sensor.
+# Relative tilt error of the solid model, divided by d/a. The model was compared with frames from
+# independent finite-element models, for tilts up to 20° and displacements up to 7 mm. The error was
+# 4 % for a bonded tip, and negligible for a tip that lies on its sensor.
 _SOLID_TILT_ERROR = 0.1
-# Threshold for products of neighbouring residuals, in noise standard deviations.
+# Threshold for the sum of products of neighbouring residuals, in noise standard deviations.
 _PRODUCT_SIGMA = 6.0
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard deviations of the sensor's common errors, and its noise correlation.
+    """Standard deviations of the errors that all frames share, and the noise correlation.
 
     Parameters
     ----------
@@ -79,13 +79,13 @@ class Uncertainty:
     pitch, modulus, gain
         Relative errors of the cell pitch, the tip's modulus and the common gain of all cells.
     correlation
-        Noise correlation of two cells by their distance in rows and columns, [rows, cols], with 1
-        at [0, 0]. The correlation is 0 at larger distances. None means white noise.
+        Noise correlation of two cells, indexed by their distance [rows, cols]. The value at [0, 0]
+        is 1. At distances outside the array, the correlation is 0. None means white noise.
     slope
-        Change of the zero offset from the tip centre to its rim, in x and in y [Pa].
+        Change of the zero offset [Pa] from the tip's centre to its rim, in x and in y.
     smooth
-        Relative pressure error that neighbouring cells share, due to curve errors, hysteresis or
-        crosstalk.
+        Relative pressure error shared by neighbouring cells. The causes are curve errors,
+        hysteresis and crosstalk.
     rotation
         Rotation error of the sensor [rad].
 
@@ -126,11 +126,11 @@ def set_budget(
     material: Material,
     pattern: FloatArray | None,
 ) -> None:
-    """Set the error budget, and raise the activity test threshold above the common errors.
+    """Set the error budget, and raise the threshold of the activity test above the common errors.
 
-    The material's ``fit_error`` [Pa], the maximum difference between the law and the fitted points,
-    acts like a zero shift of the pressed cells. ``pattern`` [rows, cols] is the pattern used to
-    detect the contact of a solid tip.
+    The material's ``fit_error`` [Pa] is the largest difference between the material law and the
+    fitted points. The error budget treats ``fit_error`` as a zero shift of the pressed cells.
+    ``pattern`` [rows, cols] is used to detect contacts of a solid tip.
     """
     budget, options = state.budget, state.options
     modulus = 0.0 if options.free_gain else math.hypot(known.modulus, known.gain)
@@ -160,25 +160,27 @@ def set_budget(
         (variance, with_centre), _ = quadratic(np.stack([weights, centre], axis=2), rho)
         variance -= with_centre**2
         level = (level * math.sqrt(max(variance, 0.0)) + _NOISE_PEAK * max(with_centre, 0.0)) / norm
-    # A zero shift of two standard deviations (``baseline``) must not be detected as a contact.
+    # A zero shift of 2 · ``baseline`` must not be detected as a contact.
     shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
     options.patch_level = level + max(shift, 0.0)
 
 
 def mirrored(correlation: FloatArray) -> FloatArray:
-    """Extend a correlation to positive and negative lags, [2 rows − 1, 2 cols − 1]."""
+    """Mirror a correlation to negative distances; the result has shape [2 rows − 1, 2 cols − 1]."""
     rows, cols = (np.abs(np.arange(1 - count, count)) for count in correlation.shape)
     return np.asarray(correlation[np.ix_(rows, cols)])
 
 
 def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
-    """Return Σ field_i · ρ · field_j over pairs of cells [n, n], for ``fields`` [rows, cols, n]."""
+    """Return the sums of field_i · ρ · field_j over all pairs of cells, [n, n].
+
+    ``fields`` has shape [rows, cols, n].
+    """
     shape = [n + m for n, m in zip(fields.shape[:2], rho.shape, strict=True)]
     kernel = np.zeros(shape)
     kernel[: rho.shape[0], : rho.shape[1]] = rho
     kernel = np.roll(kernel, (-(rho.shape[0] // 2), -(rho.shape[1] // 2)), (0, 1))
-    # A measured correlation may imply negative power at some frequencies, so clip the power at
-    # zero.
+    # The spectrum of a measured correlation may be negative at some frequencies; clip it at zero.
     power = np.maximum(np.fft.fft2(kernel).real, 0.0)
     waves = np.fft.fft2(fields, shape, axes=(0, 1))
     return np.asarray(np.einsum("xyi,xy,xyj->ij", waves.conj(), power, waves).real / power.size)
@@ -187,7 +189,7 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
 def _set_widening(
     state: EstimatorState, rho: FloatArray, grid: SensorGrid, tip: Fingertip, material: Material
 ) -> None:
-    """Tabulate the fit's degrees of freedom and the widening by correlated noise at zero tilt."""
+    """Tabulate how correlated noise changes the covariance and degrees of freedom at zero tilt."""
     options = state.options
     first = 0 if options.free_gain else 1
     step = 1e-3
@@ -225,7 +227,7 @@ def widen_covariance(state: EstimatorState) -> float:
 
 @fast_inner_kernel
 def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> tuple[float, float]:
-    """Return the sum [Pa²] and the count of the products of neighbouring residuals in a row.
+    """Sum the products of neighbouring residuals in a row; return the sum [Pa²] and the count.
 
     Only cells with a modelled pressure above ``lowest`` [Pa] are included.
     """
@@ -246,16 +248,16 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
     """Return the part of the squared misfit [Pa²] that is smooth over the footprint.
 
     The result is 0 if noise explains the misfit. ``beyond`` [Pa²] is the excess of the total misfit
-    over its expected value. If the footprint has only a few cells, the smooth part cannot be
-    separated; in this case, the whole excess is returned.
+    over its expected value. If the footprint has too few cells to separate the smooth part, the
+    whole excess is returned.
     """
     fit = state.fit
     variance = state.signal.variance
-    # Near the floor, clipping makes the mean reading exceed the pressure.
+    # Exclude cells near the floor, where clipping raises the mean reading above the pressure.
     lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip_noise
     first, last = index(fit.first_cell), index(fit.last_cell)
     total, number = _neighbours_products(cells, lowest, first, last)
-    # The residuals do not yet include the decrease due to the last step.
+    # The residuals were computed before the last step, so subtract the predicted decrease.
     total -= number * variance * state.budget.row_correlation + fit.decrement
     total = beyond if number < _CELL_COUNT_MIN else min(total, beyond)
     if total <= _PRODUCT_SIGMA * variance * math.sqrt(number * state.budget.cells_per_sample):
@@ -265,7 +267,7 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
 
 @fast_inner_kernel
 def product(a: FloatArray, b: FloatArray, first: int, last: int) -> float:
-    """Return the sum of products of two rows over a range of cells."""
+    """Return the dot product of two rows over a range of cells."""
     total = 0.0
     for k in range(first, last):
         total += a[k] * b[k]
@@ -274,10 +276,10 @@ def product(a: FloatArray, b: FloatArray, first: int, last: int) -> float:
 
 @fast_inner_kernel
 def _set_errors(state: EstimatorState, cells: Cells, first: int, last: int) -> None:
-    """Set the patterns of the common errors, as changes in the readings per unit error.
+    """Set the pattern of each common error, i.e. the change in the readings per unit error.
 
-    The patterns are in the order of `Budget.sizes`. Differences between neighbours are not
-    available in the first two and last two rows.
+    The patterns are in the order of `Budget.sizes`. Patterns that use differences between
+    neighbours are zero in the first two and last two rows.
     """
     one = index(1)
     two = index(2)
@@ -309,7 +311,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     """Set ``budget.shared``, the covariance of the fit parameters due to common errors.
 
     ``fit.inverse`` must be the covariance for white noise of variance 1 Pa². Returns the sum of
-    squared residuals [Pa²] for common errors of twice their standard deviations.
+    squared residuals [Pa²] due to common errors of two standard deviations.
     """
     fit = state.fit
     budget = state.budget

@@ -1,4 +1,4 @@
-"""Estimate displacement, tilt, gain and their covariance from a frame of a pressure grid.
+"""Estimate displacement, tilts and gain, with their covariance, from a pressure frame.
 
 This module contains `ContactEstimator` and its result `ContactEstimate`. Each frame is processed in
 one compiled call; see `frame_pipeline`.
@@ -62,17 +62,17 @@ class ContactEstimate:
     has_second_contact
         True if a second contact presses outside the footprint.
     misfit
-        True if χ² exceeds the value that noise alone reaches once in 3.5 million frames. A misfit
-        means that the model does not describe the contact well, or that the noise is larger than
-        specified.
+        True if χ² exceeds the value that noise alone reaches once in 3.5 million frames. Either the
+        model does not describe the contact well, or the noise is larger than specified.
     shear_x, shear_y
         Force along the face [N] of a solid tip; 0 for springs.
     cells_per_sample
         Number of cells per independent noise sample.
     covariance
-        Covariance of (d, tilt_x, tilt_y, gain) in m and rad. If the gain is fixed, its row is zero.
+        Covariance of (d, tilt_x, tilt_y, gain) in m and rad. The row of a fixed gain is zero.
     systematic
-        Part of the covariance that is common to all frames and is not reduced by averaging.
+        Part of the covariance due to errors that all frames share. Averaging does not reduce this
+        part.
 
     Notes
     -----
@@ -82,16 +82,16 @@ class ContactEstimate:
     - The model explains at least 80 % of the frame's squared pressure.
     - There is no second contact.
     - The smooth part of the residual could change d by at most 60 % (one standard deviation). If
-      the gain is outside the range 1/2 to 2, the limit is 3 % instead, because a gain error
-      together with a smooth residual indicates a different tip.
+      the gain is below 1/2 or above 2, a smooth residual indicates a different tip, so the limit is
+      3 %.
     - The standard deviation of d due to the known uncertainties is at most half of d.
 
-    The covariance includes the known uncertainties and the smooth residual, which occurs for
-    example on a curved face.
+    The covariance includes the known uncertainties and the smooth residual. A curved face, for
+    example, causes a smooth residual.
 
-    Without a contact, d and the tilts are 0, the estimate is valid, and ``d_std`` is the smallest
-    detectable d. Two errors cannot be detected from a single frame: a wrong modulus (if the gain is
-    fixed), and a displacement of the tip on the sensor.
+    An estimate without a contact is valid. Its d and tilts are 0, and its ``d_std`` is the smallest
+    detectable d. A displacement of the tip on the sensor cannot be detected from a single frame.
+    With a fixed gain, a wrong modulus cannot be detected from a single frame.
     """
 
     contact: bool = False
@@ -145,7 +145,7 @@ class ContactEstimate:
         return math.sqrt(self.covariance.item(10))
 
 
-# Frame types that are accepted, and the readings at which they saturate.
+# Accepted frame types, and the readings at which they saturate.
 _SATURATION_COUNTS = {
     np.dtype(np.uint8): 255.0,
     np.dtype(np.uint16): 65535.0,
@@ -161,11 +161,11 @@ class Readings:
     Parameters
     ----------
     saturation
-        Reading at which a cell saturates [counts, or Pa for float frames]. None means the integer
-        type's maximum.
+        Reading at which a cell saturates [counts, or Pa for float frames]. None means the maximum
+        of the integer type.
     threshold
-        Smallest nonzero count that the board sends; smaller readings are sent as 0. This threshold
-        applies to integer frames only.
+        Smallest nonzero count that the board sends; smaller readings are sent as 0. The threshold
+        applies only to integer frames.
     quantum
         Size of one count [Pa] if float frames were converted from counts clipped at 0, otherwise 0.
 
@@ -192,9 +192,9 @@ _RESULTS = (
     "rejected_count", "contact", "has_second_contact", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
-_TOLERANCE = 16.0  # squared ratio of step to noise floor below which the iteration ends
-# Minimum number of model points per tip radius, for linear and for nonlinear material laws. With a
-# noise of 0.2 % of the modulus and tilts of up to 25°, the bias is at most a quarter of the noise
+_TOLERANCE = 16.0  # the iteration ends below this squared ratio of step to noise floor
+# Minimum number of model points per tip radius, for linear and for nonlinear material laws. For
+# tilts up to 25° and a noise of 0.2 % of the modulus, the bias is at most a quarter of the noise
 # floor. Within 4° of the domain limit, the bias is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum values of d/a and sin θ in a spring fit
@@ -207,11 +207,11 @@ CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact an
 def cell_centres(
     grid: Grid, active: NDArray[np.bool_], radius: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return height, x and y of the cells as flat arrays; ``active`` [rows, cols] masks cells.
+    """Return height, x and y of the cells as flat arrays.
 
-    The height is √(a² − x² − y²) at the cell centre, or at the corner nearest to the tip centre if
-    the cell centre is outside the rim. The height is −∞ for inactive cells and for cells outside
-    the disc of ``radius`` [m] around the tip centre.
+    The height is √(a² − x² − y²) at the cell centre. For a cell centre outside the rim, the point
+    of the cell nearest to the tip centre is used. The height of unused cells is −∞. Unused cells
+    are outside the mask ``active`` [rows, cols] or farther than ``radius`` [m] from the tip centre.
     """
     a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
     x, y = np.meshgrid(*axes(grid))
@@ -227,11 +227,11 @@ def cell_centres(
 def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
     """Return a mask [rows, cols] of the cells inside a solid tip's rim.
 
-    The model may be inaccurate at the rim, where the stress of a bonded base is singular and
-    depends on the mesh. Compared with frames from independent finite elements, the model's rms
-    error is 3 % if the rim cells are included and 0.6 % otherwise. If a lying base is tilted, the
-    model predicts tension at the rim, where real rubber lifts off. The mask also takes the
-    uncertainty of the tip position into account.
+    At the rim of a bonded base, the stress is singular, and its computed value depends on the mesh.
+    Compared with independent finite-element models, the model has an rms error of 3 % with the rim
+    cells and 0.6 % without them. If a base that lies on the sensor is tilted, the model predicts
+    tension at the rim. Real rubber lifts off there. The mask also allows for the uncertainty of the
+    tip position.
     """
     margin = max(_RIM_WIDTH[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
     x, y = (
@@ -242,7 +242,7 @@ def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> ND
 
 
 class ContactEstimator:
-    """Estimator for the contact under one tip, using frames from a pressure grid.
+    """Estimate the contact of one tip from the frames of a pressure grid.
 
     Parameters
     ----------
@@ -252,20 +252,20 @@ class ContactEstimator:
         Standard deviation of a cell's noise [Pa].
     free_gain
         If True, also estimate the gain, the ratio of measured to modelled pressure. If False, the
-        gain is 1. The default is True for springs and False for solid tips: the shape of a solid
+        gain is 1. The default is True for springs and False for solid tips. The shape of a solid
         tip's frame hardly depends on d, so d can only be determined from the force.
     active
         Mask of working cells, bool [rows, cols]; None uses all cells.
     readings
         Range and resolution of the readings.
     known
-        Other uncertainties of the sensor. The uncertainties, together with the material's
-        ``fit_error``, widen the covariance and reduce the sensitivity of the contact detection.
+        Other uncertainties of the sensor. The uncertainties and the material's ``fit_error`` widen
+        the covariance and make the contact detection less sensitive.
 
     Attributes
     ----------
     saturation
-        Reading at which a cell saturates, as in `Readings`. Update it when the zero offset that is
+        Reading at which a cell saturates, as in `Readings`. Update this value when the zero offset
         subtracted from the readings changes.
 
     Raises
@@ -275,8 +275,8 @@ class ContactEstimator:
 
     Notes
     -----
-    Tilts of a spring tip are estimated up to 71.57° (tan θ = 3), and tilts of a solid tip up to the
-    limits of its data.
+    For a spring tip, tilts are estimated up to 71.57° (tan θ = 3). For a solid tip, tilts are
+    estimated up to the maximum tilt of its data.
     """
 
     def __init__(
@@ -315,8 +315,7 @@ class ContactEstimator:
         state = self.state = EstimatorState()
         options = self._options = state.options
         self.noise = noise
-        # Counts are rounded, so readings down to half a count below the smallest count are
-        # included.
+        # Counts are rounded, so the floor is half a count below the smallest count sent.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.patch_level = _TOLERANCE, PATCH_LEVEL
@@ -332,7 +331,7 @@ class ContactEstimator:
         tabulate_moments(state.moments, grid, tip, material, options.deepest)
         records: Any = state.estimate.array
         self._estimate = records
-        self._results = self._estimate[list(_RESULTS)]  # The result is a view of the estimate.
+        self._results = self._estimate[list(_RESULTS)]  # a view of the estimate, not a copy
         self._seq: int | None = None
         self._last = ContactEstimate(
             cells_per_sample=state.budget.cells_per_sample,
@@ -347,7 +346,7 @@ class ContactEstimator:
         return f"ContactEstimator: {rows} × {cols} cells, noise {self.noise:g} Pa, {gain} gain"
 
     def _lay_out(self, tip: Fingertip, material: Material, alive: NDArray[np.bool_]) -> None:
-        """Set the window of cells that a contact can press, the cell arrays and the model."""
+        """Set up the model, the cell arrays, and the window of cells that a contact can press."""
         grid, state, options = self.grid, self.state, self.state.options
         reach = cell_centres(grid.on(tip), alive, tip.radius + 3.0 * grid.blur)[0] >= 0.0
         rows, cols = (np.flatnonzero(reach.reshape(grid.shape).any(axis=k)) for k in (1, 0))
@@ -383,7 +382,7 @@ class ContactEstimator:
         self._arrays = self._rows, pixels, weights.array, *points
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:
-        """Set a solid tip's contact pattern [rows, cols] from its dominant image, and return it."""
+        """Compute, store and return a solid tip's contact pattern [rows, cols]."""
         pattern = self.grid.images(tip)[0].reshape(self.grid.shape) * alive
         pattern = np.where(alive, pattern - pattern.sum() / alive.sum(), 0.0)
         pattern /= math.sqrt((pattern**2).sum())
@@ -391,7 +390,7 @@ class ContactEstimator:
         return np.asarray(pattern)
 
     def _smallest_detectable_d(self, tip: Fingertip, material: Material) -> float:
-        """Return the smallest d [m] of an upright contact that the activity test detects."""
+        """Return the smallest d [m] at which the activity test detects an upright contact."""
         high = min(self._options.deepest, D_MAX * tip.radius)
         low = 1e-6 * high
         for _ in range(14):
@@ -442,8 +441,8 @@ class ContactEstimator:
         pascal_per_count
             Conversion factor from readings to Pa.
         seq
-            Sequence number. If the sequence number equals the last frame's number, the last result
-            is returned.
+            Sequence number. If the number equals that of the last frame, the last result is
+            returned.
 
         Returns
         -------
@@ -491,10 +490,10 @@ class ContactEstimator:
 
 
 def _with_data_errors(known: Uncertainty, tip: Fingertip, free_gain: bool) -> Uncertainty:
-    """Add a solid tip's data errors, as determined by independent finite element analysis.
+    """Add the data errors of a solid tip, found by independent finite-element analysis.
 
     The pressure error is included only if the gain is free. The pressure error is as symmetric as
-    the pressure itself, so it hardly affects d if the gain is known.
+    the pressure itself. With a fixed gain, a symmetric error hardly affects d.
     """
     data = solid_data(tip)
     smooth = data.pressure_error if free_gain else 0.0

@@ -1,6 +1,6 @@
-"""Process one pressure frame; this module contains the estimator's only compiled entry point.
+"""Process one pressure frame in the estimator's only compiled entry point.
 
-The steps are the activity test, the outlier rejection, and a maximum likelihood fit. The fit starts
+The steps are the activity test, the outlier rejection, and a maximum-likelihood fit. The fit starts
 from the last estimate, or from an initial estimate based on the frame alone.
 """
 
@@ -36,12 +36,12 @@ from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 # Signal level in noise standard deviations. If a solid tip's signal exceeds the level but lacks the
 # contact pattern, the frame is faulty.
 _STRONG_SIGNAL = 6.0
-# Increase in the detection level if noise is clipped at 0. Clipping raises the sums over
-# neighbourhoods. The increase restores the false alarm rate.
+# Increase in the detection threshold if noise is clipped at 0. Clipping raises the sums over
+# neighbourhoods, and the increase restores the false alarm rate.
 CLIPPED_LEVEL_INCREASE = 0.5
-GAIN_MIN, GAIN_MAX = 0.05, 20.0  # range of the gain for a contact of the configured tip
+GAIN_MIN, GAIN_MAX = 0.05, 20.0  # valid range of the gain for a contact of the configured tip
 D_MAX = 0.75  # maximum valid d, relative to the radius
-R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
+R_SQUARED_MIN = 0.8  # a valid estimate explains at least this fraction of the squared pressure
 # Maximum relative error of d that a smooth misfit may cause. The limit allows for the curved face
 # of a disc, because the covariance includes the resulting error. If the gain is far from 1, a
 # smooth misfit indicates a different tip. The covariance does not cover a different tip, so a
@@ -49,9 +49,9 @@ R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a v
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
-# The sensor needs a tare if at least ABOVE_FRACTION of the cells under the tip exceed both levels.
-# The first level is relative to the noise. The second level is relative to the peak. A solid tip
-# loads all cells, but 5 % of these cells read less than 0.32 of the peak.
+# The sensor needs a tare if more than ABOVE_FRACTION of the cells under the tip read high. A high
+# reading exceeds both ABOVE_NOISE · noise and ABOVE_PEAK · peak. A solid tip loads all cells, but
+# 5 % of the cells read less than 0.32 of the peak.
 ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among the cells above half the peak
 ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for linear error propagation
@@ -60,9 +60,10 @@ SHARED_MAX = 0.5  # maximum standard deviation of d due to known uncertainties, 
 
 @inner_kernel
 def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Fit by maximum likelihood.
+    """Fit the contact to a frame by maximum likelihood.
 
-    The fit starts from the last estimate or, if this fails, from the frame alone.
+    The fit starts from the last estimate. If the fit fails, it is repeated from an initial estimate
+    based on the frame alone.
     """
     estimate = state.estimate
     options = state.options
@@ -83,8 +84,8 @@ def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Ce
             if estimate.r_squared < R_SQUARED_MIN:
                 reason = Invalid.MODEL_MISMATCH
                 continue
-            # Search for a second contact only if the residual exceeds the noise and a small
-            # fraction of the energy. Solid tips load their whole base, so skip the search for them.
+            # Search for a second contact only if the misfit exceeds the noise plus a small fraction
+            # of the energy. Skip the search for solid tips, which load their whole base.
             if not options.is_solid and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
@@ -115,7 +116,7 @@ def _check_fit_of_tip(state: EstimatorState) -> Invalid:
 def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
     """Set r², the fraction of the frame's squared pressure (minus noise) that the model explains.
 
-    Returns the unexplained part [Pa²] and the scatter of the noise.
+    Returns the unexplained part and the scatter of the noise, both in Pa².
     """
     energy = squared_sum(state)
     budget = state.budget
@@ -171,7 +172,7 @@ def _set_results(state: EstimatorState) -> None:
 def _fault_in_readings(
     state: EstimatorState, frame: FloatArray, height: FloatArray, reason: Invalid
 ) -> Invalid:
-    """Return the fault in the readings that explains a failed estimate, or else ``reason``."""
+    """Return the fault in the readings that made the estimate fail, or else ``reason``."""
     signal = state.signal
     level = max(ABOVE_NOISE * signal.noise, ABOVE_PEAK * signal.peak)
     above = pressed = full = 0
@@ -187,13 +188,13 @@ def _fault_in_readings(
 
 @inner_kernel
 def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Estimate the contact in a frame; return the reason if the estimate is invalid."""
+    """Estimate the contact in a frame; return why the estimate is invalid, or ``NONE``."""
     fit = state.fit
     reason = _fit_frame(state, model, frame, cells)
     _set_results(state)
     if state.options.is_solid and reason == Invalid.NOT_CONVERGED:
-        # If the tip is in contact, the fit either converges within the data range or matches the
-        # frame at the limit of the range.
+        # For a real contact, the fit converges within the data range or matches the frame at the
+        # limit of the range.
         unexplained = fit.misfit > (1.0 - R_SQUARED_MIN) * fit.readings
         reason = Invalid.MODEL_MISMATCH if unexplained or not fit.is_limited else reason
     if reason != Invalid.NONE:
@@ -203,7 +204,7 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 
 @inner_kernel
 def _reset_results(state: EstimatorState, scale: float, step: float, saturation: float) -> None:
-    """Set the frame unit and clear all previous results except the contact."""
+    """Set the unit and noise of the frame, and clear all results except the last contact."""
     options = state.options
     signal = state.signal
     grid = state.grid
@@ -215,8 +216,8 @@ def _reset_results(state: EstimatorState, scale: float, step: float, saturation:
     signal.saturation = saturation * scale
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
-    # A contact no wider than a cell causes a strain of at most about pitch²/2a². The bound allows
-    # for a gain of up to 3.
+    # A contact no wider than a cell causes a strain of at most about pitch²/2a². The maximum
+    # reading allows for a gain of up to 3.
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate
@@ -238,10 +239,10 @@ def estimate_frame(
 ) -> None:  # fmt: skip
     """Estimate the contact in one frame and store the result in the state (compiled entry point).
 
-    ``frame`` is float64 [cells] in counts, ``scale`` is in Pa per count, ``step`` is the quantum
-    size [Pa] or 0, and cells saturate at ``saturation`` counts. ``rows`` stores the `state.Cells`.
-    ``pixels`` and ``weights`` are the images of a solid tip. The remaining arguments are the
-    `SpringPoints` of a spring tip.
+    ``frame`` [cells] is float64 in counts, and ``scale`` is in Pa per count. ``step`` is the size
+    of a quantum [Pa], or 0. Cells saturate at ``saturation`` counts. ``rows`` stores the
+    `state.Cells`. ``pixels`` and ``weights`` are the images of a solid tip. The remaining arguments
+    are the `SpringPoints` of a spring tip.
     """
     state = states[0]
     cells = cells_in(rows, state.grid)
@@ -254,8 +255,8 @@ def estimate_frame(
     rejected = without_outliers(state, frame, cells.height)
     strong = False
     if state.options.is_solid and signal.is_finite:
-        # Every contact of a solid tip matches the pattern, so a strong signal without the pattern
-        # is not a contact of this tip. A small common zero offset does not count as a signal.
+        # Every contact of a solid tip matches the pattern. A strong signal without the pattern is
+        # therefore not a contact. A small common zero offset does not count as a signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > _STRONG_SIGNAL * signal.noise
         signal.contact = shows_pattern(state, frame, cells)

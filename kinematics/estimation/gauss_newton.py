@@ -1,7 +1,7 @@
 """Kernels for the Gauss-Newton fit of a contact to one pressure frame.
 
-The parameters are the gain, d, n_x, n_y and, for solid tips, the shear force on the face along x
-and y. Each step uses the pressures and partials from the tip's forward model.
+The parameters are the gain, d, n_x and n_y. For solid tips, the shear force along x and y is fitted
+as well. Each step uses the pressures and partials from the tip's forward model.
 """
 
 from __future__ import annotations
@@ -35,22 +35,24 @@ from softfinger.kinematics.sensing.solid_pressure import own_shear, press_solid
 from softfinger.kinematics.sensing.springs_pressure import press_springs
 
 # If the gain is free, the covariance is multiplied by 1 + _GAIN_CURVATURE (σ_d/d)². The factor was
-# determined by comparing squared errors with the linear prediction, using simulated frames over the
-# operating range.
+# fitted to simulated frames over the operating range. The fit compared squared errors with the
+# linear prediction.
 _GAIN_CURVATURE = 6.0
 _ITERATIONS = 20
 _HALVINGS_MAX = 5
-_SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear force, relative to its normal force
+# Prior standard deviation of a solid tip's shear force, relative to its normal force.
+_SHEAR_PRIOR = 0.1
 _LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of the model
 # Minimum pivot of a scaled normal matrix. For a 2 × 2 matrix, the pivot is the determinant divided
-# by the product of the diagonal elements, with a rounding error of 1e-12.
+# by the product of the diagonal elements. The rounding error of a pivot is 1e-12.
 _PIVOT_MIN = 1e-11
 
-# A cell that cannot read below its floor (0, or the smallest count sent) has a mean reading above
-# the true pressure. At a pressure z standard deviations above the floor, the mean reading exceeds
-# the pressure by E[max(z + e, 0)] − z = E[max(e − z, 0)] standard deviations with e ~ N(0, 1). The
-# excess is approximated to within 3e-4 by (1 − z/CLIP_END)² times the polynomial with coefficients
-# CLIP. Cells more than CLIP_BELOW below the floor carry almost no information.
+# A cell cannot read below its floor, which is 0 or the smallest count sent. Clipping at the floor
+# raises the mean reading above the true pressure. At z standard deviations above the floor, the
+# excess is E[max(z + e, 0)] − z = E[max(e − z, 0)] standard deviations with e ~ N(0, 1). The
+# product of (1 − z/CLIP_END)² and the polynomial with coefficients CLIP approximates the excess to
+# within 3e-4. Cells more than CLIP_BELOW standard deviations below the floor provide almost no
+# information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
@@ -77,11 +79,11 @@ def press(state: EstimatorState, model: Model, cells: Cells) -> tuple[int, int]:
 
 @inner_kernel
 def free_noise(square: float, floor: float) -> float:
-    """Return a cell's noise σ [Pa] from the mean ``square`` [Pa²] of unloaded cells.
+    """Return a cell's noise σ [Pa]; ``square`` [Pa²] is the mean squared reading of unloaded cells.
 
-    Unloaded cells read 0 below ``floor`` [Pa], so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. For a
-    floor of 0, E[y²] is half the variance. If all cells read below the floor, the result is
-    slightly less than a third of the floor.
+    Readings below ``floor`` [Pa] are sent as 0, so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. For
+    a floor of 0, E[y²] is half the variance. If all unloaded cells read 0, the result is slightly
+    less than a third of the floor.
     """
     if not floor > 0.0:
         return math.sqrt(2.0 * square)
@@ -101,7 +103,7 @@ def free_noise(square: float, floor: float) -> float:
 
 @inner_kernel
 def squared_sum(state: EstimatorState) -> float:
-    """Return Σ p² [Pa²] over all cells."""
+    """Return the sum of squared readings [Pa²] of all cells."""
     energy: float = state.signal.energy * state.signal.scale * state.signal.scale
     return energy
 
@@ -110,9 +112,9 @@ def squared_sum(state: EstimatorState) -> float:
 def _clip_noise(
     state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int
 ) -> float:
-    """Use the unloaded cells to estimate the noise [Pa] of cells clipped at the floor.
+    """Estimate the noise [Pa] of cells clipped at the floor from the unloaded cells.
 
-    If the unloaded cells do not show noise, a correction is not needed.
+    The result is at most the expected noise.
     """
     signal = state.signal
     energy = number = 0.0
@@ -130,11 +132,12 @@ def _clip_noise(
 
 @fast_inner_kernel
 def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
-    """Compute the model, residual and response of each cell, and their sums.
+    """Compute the model, residual and response of each cell, and the sums of squares.
 
-    A cell never reads below the floor, and never below 0, even if the rubber is in tension there. A
-    saturated cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the
-    noise is clipped at the floor; otherwise, cells with a model below the floor are excluded.
+    A cell never reads below 0 or below the floor, even where the rubber is in tension. A saturated
+    cell is used only if the modelled pressure is below saturation. If ``fit.clip_noise`` is
+    positive, the noise is clipped at the floor. Otherwise, cells with a modelled pressure below the
+    floor are excluded.
     """
     fit = state.fit
     gain, shear_x, shear_y = fit.contact[GAIN], fit.contact[SHEAR_X], fit.contact[SHEAR_Y]
@@ -156,7 +159,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
         reading = max(raw, floor)
         residual = reading - pressure
         if clipped:
-            # The excess over max(pressure, floor) is symmetric about the floor.
+            # The mean reading minus max(pressure, floor) is symmetric about the floor.
             depth = (pressure - floor) * per_clip
             z = min(abs(depth), CLIP_END)
             above = 1.0 - z * (1.0 / CLIP_END)
@@ -226,9 +229,9 @@ def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 
 @inner_kernel
 def solve(fit: Fit, first: int, last: int) -> bool:
-    """Solve the normal equations for parameters first to last; set step, inverse and decrement.
+    """Solve the normal equations for a range of parameters; set step, inverse and decrement.
 
-    Returns False if a pivot of the scaled matrix is too small, i.e. if the frame does not determine
+    Returns False if a pivot of the scaled matrix is too small. The frame then does not determine
     all parameters.
     """
     normal = fit.normal
@@ -241,7 +244,8 @@ def solve(fit: Fit, first: int, last: int) -> bool:
         scale[i] = 1.0 / math.sqrt(normal[i, i])
         for j in range(first, i + 1):
             inverse[i, j] = inverse[j, i] = normal[i, j] * scale[i] * scale[j]
-    # Sweeping the matrix on each diagonal element replaces the matrix by its negative inverse.
+    # The sweep operator, applied to each diagonal element, replaces the matrix by its negative
+    # inverse.
     for k in range(first, last):
         pivot = inverse[k, k]
         if not pivot > _PIVOT_MIN:
@@ -367,12 +371,12 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
 def fit(
     state: EstimatorState, model: Model, frame: FloatArray, cells: Cells, tolerance: float
 ) -> bool:
-    """Run the Gauss-Newton method from the guess in ``state.estimate``; store the result there.
+    """Run the Gauss-Newton method; ``state.estimate`` contains the guess and receives the result.
 
-    The iteration stops if the predicted decrement is below ``tolerance`` · variance, where
-    ``tolerance`` is the squared ratio of the step to the noise floor. Returns False if the frame
-    does not determine the contact, if the iteration does not converge, or if the contact is beyond
-    the limits of the model.
+    The iteration stops if the predicted decrement is at most ``tolerance`` · variance.
+    ``tolerance`` is the squared ratio of the step to the noise floor. Returns False if the
+    iteration does not converge, or if the frame does not determine a contact within the limits of
+    the model.
     """
     fit = state.fit
     variance = state.signal.variance

@@ -10,8 +10,8 @@ __all__ = ["Invalid"]
 class Invalid(IntEnum):
     """Reason why an estimate is invalid, or ``NONE`` if it is valid.
 
-    ``text`` is the message for users. If several reasons apply, a fault in the readings takes
-    precedence over problems of the fit.
+    ``text`` is the message for users. A fault in the readings takes precedence over a problem of
+    the fit.
     """
 
     text: str

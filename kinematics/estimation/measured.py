@@ -1,6 +1,6 @@
 """Estimate a contact using the measured curves of a tip.
 
-The force follows from the frame sum, the tilt from the centroid, and d from the force. The method
+The sum of the frame gives the force, the force gives d, and the centroid gives the tilt. The method
 does not need a model of the pressure distribution and takes about 0.1 ms.
 """
 
@@ -33,9 +33,10 @@ def sum_weights(
     radius: float,
     active: NDArray[np.bool_],
 ) -> FloatArray:
-    """Return the weights of the frame sums [4, cells]: area, and area times x, y and r².
+    """Return the weights [4, cells] of the frame sums.
 
-    The weights are zero except for ``active`` cells under the tip. x and y are in finger axes.
+    The weights are the cell area, and the area times x, y and r². Cells that are not ``active`` or
+    not under the tip have zero weights. The x and y axes are the finger axes.
     """
     x, y = (
         pitch * (np.arange(count) - 0.5 * (count - 1)) - at
@@ -68,12 +69,12 @@ class MeasuredEstimator:
     tip
         Measured tip.
     grid
-        Sensor, with the tip position from the measured curves.
+        Sensor; its tip position must come from the measured curves.
     active
         Mask of working cells, bool [rows, cols]; None uses all cells.
     known
-        Sensor uncertainties: baseline and slope, and the changes in gain, centre and rotation since
-        the curves were measured.
+        Sensor uncertainties. For gain, centre and rotation, only changes since the measurement of
+        the curves count.
 
     Raises
     ------
@@ -82,8 +83,8 @@ class MeasuredEstimator:
 
     Notes
     -----
-    An estimate is ``valid`` if it is within the measured range of the curves, and if the frame's
-    extent is within 8 % of the value expected for the force.
+    A ``valid`` estimate is within the measured range of the curves. The extent of the frame is
+    within 8 % of the value expected for the force.
     """
 
     saturation: float | None = None  # Saturated cells are treated like all other cells.
@@ -111,13 +112,12 @@ class MeasuredEstimator:
         self._weights = sum_weights(grid, tip.radius, alive)
         self._used = self._weights[0] > 0.0
         self._zero_sums, self._noise = np.array(law.rest), np.array(law.noise)
-        # Sums due to a common shift of all cells, and moment due to a slope of the zero offset
-        # [N·m].
+        # Sums due to a common shift of all cells; moment [N·m] due to a slope of the zero offset.
         self._shift = known.baseline * self._weights.sum(axis=1)
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
         sum_std = math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
         self._contact_threshold = _CONTACT_SIGMA * sum_std
-        # Maximum d that is not detected. At this d, the force equals the contact threshold.
+        # Largest undetected d, at which the force equals the contact threshold.
         root = self._root_of(self._contact_threshold, 0.0, self._root_max)
         self._undetected_d = tip.radius * root**2
         self._seq: int | None = None
@@ -168,7 +168,7 @@ class MeasuredEstimator:
         self._seq = None
 
     def _root_of(self, force: float, q: float, t: float) -> float:
-        """Solve ``shown`` = ``force`` for t by Newton's method, starting at ``t``."""
+        """Solve the curve ``shown`` for a given ``force`` by Newton's method, starting at ``t``."""
         for _ in range(24):
             value, by_t, _ = _curve(self._law.shown, t, q)
             before = t
@@ -199,8 +199,8 @@ class MeasuredEstimator:
         n = s * direction
         inverse, errors = self._errors(t, n)
         std = math.sqrt(direction @ errors[1:, 1:] @ direction)
-        # Where the centroid barely determines the tilt, the tilt range of the calibration presses
-        # serves as a prior. As in a Kalman update, the prior pulls the tilt towards 0. The
+        # The tilt range of the calibration presses serves as a prior, which matters if the centroid
+        # barely determines the tilt. As in a Kalman update, the prior pulls the tilt towards 0. The
         # resulting error is common to all frames.
         prior = self._tilt_sine_max**2 * np.eye(2)
         pull = errors[:, 1:] @ np.linalg.inv(errors[1:, 1:] + prior)
@@ -225,11 +225,9 @@ class MeasuredEstimator:
         return Invalid.NONE if agrees else Invalid.MODEL_MISMATCH
 
     def _errors(self, t: float, n: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the partials of (d, n_x, n_y) with respect to the sums.
+        """Return the partials ∂(d, n_x, n_y)/∂(sums), and the covariance of (d, n_x, n_y).
 
-        The second result is the covariance of (d, n_x, n_y).
-
-        The covariance includes the noise of the sums and the errors that are common to all frames.
+        The covariance includes the noise of the sums and the errors that all frames share.
         """
         law, known, q = self._law, self._known, float(n @ n)
         shown, shown_t, shown_q = _curve(law.shown, t, q)

@@ -47,7 +47,7 @@ class Signal(Record):
     """Unit, noise and limits of one frame, and the result of the activity test."""
 
     scale: float  # Pa per count
-    variance: float  # noise of a cell [Pa²]
+    variance: float  # noise variance of a cell [Pa²]
     noise: float  # standard deviation of a cell [counts]
     narrow_contact_max: float  # maximum reading of a contact that is as wide as a cell [counts]
     patch_level: float
@@ -88,7 +88,7 @@ class Estimate(Record):
     undetected: float  # relative error of d that a smooth misfit may cause
     shared: float  # relative standard deviation of d due to known errors
     covariance: Matrix  # covariance of (d, tilt_x, tilt_y, gain)
-    systematic: Matrix  # part of the covariance that is common to all frames
+    systematic: Matrix  # part of the covariance due to errors that all frames share
 
 
 class Moments(Record):
@@ -140,9 +140,9 @@ class Budget(Record):
     tilt_error: float  # relative tilt error of a solid tip per d/a
     row_correlation: float  # correlation of neighbouring cells in a row
     cells_per_sample: float  # Σρ², the number of cells per independent noise sample
-    has_common_errors: bool  # True for any error other than correlated noise
+    has_common_errors: bool  # True if there are errors other than correlated noise
     is_correlated: bool
-    # Factors for the four standard deviations, and number of degrees of freedom used.
+    # Factors that widen the four standard deviations, and the number of degrees of freedom used.
     widening: Annotated[FloatArray, DEPTHS, 5]
     response: Column  # Jᵀq, multiplied by the size of the pattern q
     displacement: Column  # change in the fit parameters due to one pattern
@@ -163,7 +163,7 @@ class EstimatorState(Record):
 
 
 class Cells(NamedTuple):
-    """Arrays over the cells of `EstimatorState.grid`, float64 [cells] or [·, cells]."""
+    """Float64 arrays [cells] or [·, cells], with one column per cell of `EstimatorState.grid`."""
 
     sensitivity: FloatArray  # pressure at a gain of 1, ∂/∂parameters, shear images [PARAMETERS, ·]
     planes: FloatArray  # the first four rows of ``sensitivity``, [4, rows, cols]

@@ -1,20 +1,20 @@
 """Planar geometry of two rotational fingers and the object between them.
 
-The origin of the hand plane is midway between the pivots. x points from the left pivot to the right
-pivot, and y points away from the palm. The pivots are at (∓B, 0), and positive joint angles q close
-the fingers. The tip centres are
+The origin of the hand plane is midway between the pivots. The x axis points from the left pivot to
+the right pivot, and the y axis points away from the palm. The pivots are at (∓B, 0), and positive
+joint angles q close the fingers. The tip centres are
 
     O1 = (−B + L sin q1 + e cos q1,  L cos q1 − e sin q1)       O2 is its mirror image
 
 where L is the finger length and e the finger offset (towards the object at q = 0). The object has
-centre G, width W and angle φ; n = (cos φ, sin φ) points from its left face to its right face, and
-t = (−sin φ, cos φ). For tips of radius a, the contact variables are
+centre G, width W and angle φ. The vector n = (cos φ, sin φ) points from its left face to its right
+face, and t = (−sin φ, cos φ) is perpendicular to n. For tips of radius a, the contact variables are
 
     d1 = a + W/2 + (O1 − G)·n     θ1 = φ + q1     s1 = (O1 − G)·t
     d2 = a + W/2 − (O2 − G)·n     θ2 = φ − q2     s2 = (O2 − G)·t
 
-where d is the normal displacement (positive during contact), θ the tilt of the object relative to
-the tip, and s the tip position along the face.
+where d is the normal displacement (positive during contact), θ is the tilt of the object relative
+to the tip, and s is the tip position along the face.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class HandGeometry:
 def vector(values: ArrayLike, length: int, name: str) -> FloatArray:
     """Return ``values`` as a float64 vector.
 
-    Raises ValueError unless the vector has this ``length``.
+    Raises ValueError unless the vector has ``length`` elements.
     """
     out = np.asarray(values, dtype=np.float64)
     if out.shape != (length,):

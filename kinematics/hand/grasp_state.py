@@ -1,14 +1,14 @@
 """Kernels for an object held by two rotational fingers: motion, holding torques and load.
 
-Coordinates and signs follow :mod:`hand.geometry`. The tips roll without slipping, and the joints
-are at standstill. Because a pressure grid cannot measure shear, the load along the faces is
-estimated from the joint torques. The contributions of the normal forces and of the tips' turning
-moments ∂U/∂θ are subtracted from the torques. The residual is the shear force times its moment arm
-about the pivot.
+:mod:`hand.geometry` defines the coordinates and signs. The kernels assume that the tips roll
+without slipping and that the joints are at standstill. Because a pressure grid cannot measure
+shear, the load along the faces is estimated from the joint torques. First, the contributions of the
+normal forces and of the tips' turning moments ∂U/∂θ are subtracted from the torques. The residual
+is the shear force times its moment arm about the pivot.
 
-The object's faces may be inclined by a taper α, which is positive if the object is wider at the
-palm. With this taper, θ = φ + q1 − α/2 at the left tip and θ = φ − q2 + α/2 at the right tip, where
-the bisector of the faces is at angle φ.
+The object's faces may form an angle α, the taper. The taper is positive if the object is wider at
+the palm. The tilt is then θ = φ + q1 − α/2 at the left tip and θ = φ − q2 + α/2 at the right tip.
+The bisector of the faces has the angle φ.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 FloatPair = tuple[float, float]  # (left, right)
 Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
 
-_SHEAR_STEPS = 3  # number of fixed-point iterations for the shear forces; each adds two digits
+_SHEAR_STEPS = 3  # number of iterations for the shear forces; each iteration adds two digits
 
 
 @kernel
 def total_tilt(tilt_x: float, tilt_y: float) -> float:
-    """Return the angle θ between normal and tip axis: sin² θ = sin² tilt_x + sin² tilt_y."""
+    """Return the angle θ between normal and tip axis, using sin² θ = sin² tilt_x + sin² tilt_y."""
     return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
 
 
@@ -45,8 +45,8 @@ def held_motion(
     """Return (arm1, arm2, turn1, turn2, slide, width, across) of a held object.
 
     ``lengths`` [m] are half the pivot separation, the finger length, the finger offset and the tip
-    radius. v_i is the derivative of tip position i with respect to q_i. If the tips roll without
-    slip and both displacements change by the same amount,
+    radius. The vector v_i is the derivative of tip position i with respect to q_i. If the tips roll
+    without slip and both displacements change by the same amount,
 
         φ̇ = turn1 q̇1 − turn2 q̇2      turn_i W = a − d_i − v_i·t/cos(α/2)
         ḋ1 + ḋ2 = arm1 q̇1 + arm2 q̇2 + slide φ̇
@@ -55,13 +55,13 @@ def held_motion(
 
     where n and t belong to the bisector's ``angle`` φ, and α is the ``taper`` [rad]. The object
     moves along t as the tips roll and approach each other. For parallel faces, arm [m] is the
-    moment arm of the normal force about the pivot. In the symmetric grasp, turn1 + turn2 equals
-    2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m], and
-    ``width`` is W cos(α/2), the distance between the contacts along n.
+    moment arm of the normal force about the pivot. In a symmetric grasp, turn1 + turn2 equals 2 (a
+    − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m]. The
+    distance between the contacts along n is ``width`` = W cos(α/2).
 
-    In turn_i, W is limited to at least half the tip radius. Without the limit on W, the prediction
-    would diverge for thinner objects. In reality, inertia and the tips' shear compliance make thin
-    objects rotate more slowly than in ideal rolling.
+    In turn_i, W is at least half the tip radius, because the prediction would diverge for thinner
+    objects. In reality, inertia and the shear compliance of the tips slow the rotation of thin
+    objects.
     """
     q1, q2 = q
     d1, d2 = d
@@ -122,18 +122,18 @@ def holding_moment_arms(
 ) -> tuple[float, float, float, float, float]:
     """Return (τ1/F, τ2/F, T, N1, N2) of an object held in equilibrium.
 
-    The torques are the energy gradient along the rolling motion, where ``motion`` is the result of
+    The torques are the gradient of the energy along the rolling ``motion`` from
     :func:`held_motion`:
 
         τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
 
     From the moment equilibrium of the object, T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2, where T is the
-    mean shear force. Tapered faces push the object out, so the shear force is T − N tan(α/2) at the
-    left tip and T + N tan(α/2) at the right tip; α is the ``taper`` [rad]. F is the mean contact
-    force of both tips, so a common modulus cancels in the moment arms τ/F [m]. N is the mean of the
-    normal forces N1 and N2 [N]. N1 and N2 differ if the surroundings exert friction on the object.
-    ``data1`` and ``data2`` are the contact table arrays. All results are zero unless both tips are
-    in contact.
+    mean shear force. Faces with a ``taper`` α [rad] push the object out. The shear force is
+    therefore T − N tan(α/2) at the left tip and T + N tan(α/2) at the right tip. F is the mean
+    contact force of both tips, so a common modulus cancels in the moment arms τ/F [m]. N is the
+    mean of the normal forces N1 and N2 [N]. N1 and N2 differ if the surroundings exert friction on
+    the object. ``data1`` and ``data2`` are the contact table arrays. All results are zero unless
+    both tips are in contact.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -222,22 +222,21 @@ def load_torques(
 ) -> tuple[float, float, float, float]:
     """Return the residual torques and the load model of a held object.
 
-    δ1 and δ2 [N·m] are the parts of the joint torques that can be caused only by a load along the
-    object's t axis. If each tip carries a force L [N], i.e. half of a total load of 2 L, the
-    torques are
+    δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t axis
+    can cause. If the total load is 2 L [N], half of it at each tip, the torques are
 
         τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
 
-    where n_i and t_i belong to the face at each tip. ``rolled`` [N] are the shear forces that
-    rolling, the turning moments and the ``taper`` [rad] cause without a load
-    (:func:`holding_moment_arms`). N and ∂U/∂θ include the effect of the shear forces. ``motion`` is
-    the result of :func:`held_motion`. For parallel faces, ±v_i·n equals arm_i and lever_i equals
-    W turn_i.
+    where n_i and t_i belong to the face at each tip. ``rolled`` [N] are the shear forces without a
+    load, computed by :func:`holding_moment_arms`. Without a load, rolling, the turning moments and
+    the ``taper`` [rad] cause the shear forces. N and ∂U/∂θ include the effect of the shear forces.
+    ``motion`` is the result of :func:`held_motion`. For parallel faces, ±v_i·n equals arm_i and
+    lever_i equals W turn_i.
 
     δ_i is the residual of τ_i at L = 0. For a load, (δ1 + δ2)/2 = moment_arm L + curvature L² holds
-    exactly. The function returns (δ1, δ2, moment_arm, curvature). The function returns zeros if a
-    tip is not in contact or if a load would not change the torques.
+    exactly. The function returns (δ1, δ2, moment_arm, curvature). All results are zero if a tip is
+    not in contact or if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -267,7 +266,8 @@ def load_torques(
 def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
     """Solve torque = moment_arm L + curvature L² [N·m]; return L [N] and the slope ∂torque/∂L [m].
 
-    Torques beyond the parabola's vertex cannot be caused by a load; the minimum slope is then used.
+    A load cannot cause a torque beyond the vertex of the parabola. The slope is at least the
+    minimum slope.
     """
     slope_min = _SLOPE_MIN * moment_arm
     slope = math.sqrt(

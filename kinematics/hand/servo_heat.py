@@ -4,12 +4,12 @@
     Ċ = s (W − C)/τ_w − g (C − A)/τ_c                 case, measured by the servo in steps of 1 °C
     A, k random walks                                 ambient; heating relative to the model
 
-Here r = R/C_w, s = C_w/C_c, τ_w = C_w R_wc and τ_c = C_c R_ca, where R is the electrical
-resistance, C_w and C_c are heat capacities, and R_wc and R_ca are thermal resistances. α is the
-temperature coefficient of copper, and g = ((C − A)/30 K)^(1/4) describes natural convection. If I²
-is known, the model is linear except for the terms with α and g, which are evaluated at the current
-estimate. A constant reading carries little information, but a step in the reading determines the
-case temperature accurately.
+Here r = R/C_w, s = C_w/C_c, τ_w = C_w R_wc and τ_c = C_c R_ca. R is the electrical resistance, C_w
+and C_c are heat capacities, and R_wc and R_ca are thermal resistances. The constant α is the
+temperature coefficient of copper, and g = ((C − A)/30 K)^(1/4) describes natural convection. The
+terms with α and g are evaluated at the current estimate. If I² is known, all other terms of the
+model are linear. A constant reading contains little information. A step in the reading determines
+the case temperature accurately.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ WINDING, CASE, AMBIENT, HEATING = range(4)
 COPPER = 0.0039  # temperature coefficient of the winding's resistance [1/K]
 TIME_MAX = 3600.0  # maximum reported time to a limit [s]
 _ROOM_TEMPERATURE = 25.0  # °C
-_CONVECTION_DIFFERENCE = 30.0  # temperature above ambient at which τ_c is defined [K]
+_CONVECTION_DIFFERENCE = 30.0  # temperature difference to ambient for which τ_c is defined [K]
 _INITIAL_STD = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
 _RANDOM_WALK = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
 _STEP_STD = 0.12  # standard deviation of the case temperature when the reading changes [°C]
 _STAY_STD = 6.0  # standard deviation of a reading that stays constant for 1 s [°C]
-_COUPLING = 0.25  # error in W due to the unobservable error in τ_w, as a fraction of W − C
+_COUPLING = 0.25  # error of W due to the unobservable error of τ_w, as a fraction of W − C
 
 
 class HeatLaw(Record):
@@ -83,7 +83,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
 
 @inner_kernel
 def _convection_factor(over: float) -> float:
-    """Return the convection factor g for a case ``over`` K above ambient; use at least 1 K."""
+    """Return the convection factor g for a case ``over`` K (at least 1 K) above ambient."""
     return math.sqrt(math.sqrt(max(over, 1.0) / _CONVECTION_DIFFERENCE))
 
 
@@ -145,8 +145,8 @@ def winding_std(states: Records[HeatState]) -> float:
 def time_to_limit(states: Records[HeatState], square: float, limit: float) -> float:
     """Return the time [s] until the case reaches ``limit`` [°C] at a mean squared current [A²].
 
-    The result is at most TIME_MAX. The winding temperature is integrated implicitly, so the time
-    steps may grow.
+    The result is at most TIME_MAX. The winding temperature is integrated implicitly, so large time
+    steps are stable.
     """
     s = states[0]
     law = s.law

@@ -2,10 +2,10 @@
 
 Two mirrored fingers hold an object of width W by its parallel faces. Each tip is displaced by d.
 The small antisymmetric motions are the object's angle φ and the antisymmetric joint angle δ = (q1 −
-q2)/2. These antisymmetric motions change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual
-spring k between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by
-kδ. For a normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ
-+ σ, where c is 2/3 for the paper's spring model. With b = k/(N B) and pivots 2B apart,
+q2)/2. Together, φ and δ change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual spring k
+between the fingers subtracts kδ from the torque of joint 1 and adds kδ to the torque of joint 2.
+For a normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ +
+σ. For the paper's spring model, c is 2/3. With b = k/(N B) and pivots 2B apart,
 
     T = N (φ − bδ)                                       the forces of both fingers are collinear
     W T = N ((W + 2(a − d))φ − 2ℓδ) + 2 ∂U/∂θ            moment balance of the object
@@ -18,8 +18,8 @@ q, so the result does not depend on the path. For an object whose angle is φ0 a
     D = 2ℓ + (1 − 2c)d − b(W − d)        M = a − d + ℓ + (1 + b)d/2
 
 The angle φ vanishes for D = 0. The spring b = (2ℓ + (1 − 2c)d)/(W − d) therefore keeps the object
-upright for any φ0. The model neglects all friction except at the tips. The model also neglects the
-tip tilt q relative to the faces, which is a second-order effect.
+upright for any φ0. The model neglects all friction except at the tips, and the second-order effect
+of the tip tilt q relative to the faces.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def upright_spring(
 ) -> float:
     """Return the joint spring k [N·m/rad] that keeps the object upright at joint angle ``q`` [rad].
 
-    ``d`` [m] and ``force`` [N] are averages of both tips, ``tilt_moment_ratio`` is the c of both
-    tips, and ``lengths`` [m] are defined in :func:`hand.grasp_state.held_motion`.
+    ``d`` [m] and ``force`` [N] are averages of both tips. ``tilt_moment_ratio`` is the constant c.
+    ``lengths`` [m] are the same as in :func:`hand.grasp_state.held_motion`.
     """
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)

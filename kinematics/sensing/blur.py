@@ -1,9 +1,9 @@
-"""Compute sample points of cells along one axis, and their weights in the cell mean.
+"""Compute the sample points of cells along one axis, and the weights for the mean of a cell.
 
-The elastomer over a sensor spreads pressure like a Gaussian blur. A Gaussian blur is separable: it
-is a weighted sum over neighbouring points along one axis, followed by a weighted sum along the
-other axis. The weights with which a cell averages its points therefore include the blur. Without
-blur, a cell averages its own points with equal weights.
+The elastomer over a sensor spreads pressure like a Gaussian blur. A Gaussian blur is a weighted sum
+of neighbouring points along one axis, followed by a weighted sum along the other axis. The weights
+for averaging the points of a cell therefore include the blur. Without blur, a cell averages its own
+points with equal weights.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _CUTOFF = 4.5  # truncation of the Gaussian, in standard deviations
 def axis_points(
     start: float, pitch: float, number: int, count: int, blur: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the positions of points [count, cells] and their weights in the mean of one cell.
+    """Return the positions of points [count, cells], and the weights for the mean of a cell.
 
-    The axis has ``number`` cells of width ``pitch``, and the first cell begins at ``start``. On
-    both sides, cells within the range of the blur are added. The value of cell j is the sum of
-    weights[m, q] times point m of cell j + q, over all m and q.
+    The axis has ``number`` cells of width ``pitch``, and the first cell begins at ``start``. Cells
+    within the range of the blur are added at both ends. The mean of cell j is the sum of weights[m,
+    q] times point m of cell j + q, over all m and q.
     """
     mean = np.convolve(stencil(blur * count / pitch), np.full(count, 1.0 / count))
     half = (len(mean) - count) // 2
@@ -40,10 +40,10 @@ def axis_points(
 
 
 def cell_means(points: FloatArray, along: FloatArray, across: FloatArray) -> FloatArray:
-    """Return the means [rows, cols] of cells over ``points`` [lines, points per line].
+    """Average ``points`` [lines, points per line] over each cell; the result is [rows, cols].
 
-    The weights along y, the weights ``across`` along x, and the order of the points are those of
-    :func:`axis_points`. The points of a cell are consecutive.
+    :func:`axis_points` defines the weights ``along`` (for y) and ``across`` (for x), and the order
+    of the points. The points of a cell are consecutive.
     """
     for weights in (across, along):
         count, reach = weights.shape
@@ -54,11 +54,12 @@ def cell_means(points: FloatArray, along: FloatArray, across: FloatArray) -> Flo
 
 
 def stencil(width: float) -> FloatArray:
-    """Return the blur weights [2 n + 1] over neighbouring points, for a ``width`` w in points.
+    """Return the weights [2 n + 1] of neighbouring points for a blur with a ``width`` of w points.
 
-    The weights are samples of the Gaussian (trapezoid rule); their error decreases as exp(−2π² w²).
-    For widths below 0.75 points, five weights match the Gaussian's moments up to the fifth, so the
-    weights are exact for polynomials up to degree five. Without blur, the only weight is 1.
+    The weights are samples of the Gaussian (trapezoid rule). The error of the samples decreases as
+    exp(−2π² w²). For widths below 0.75 points, five weights match the Gaussian's moments up to the
+    fifth. The five weights are exact for polynomials up to degree five. Without blur, the only
+    weight is 1.
     """
     if width == 0.0:
         return np.ones(1)

@@ -1,15 +1,16 @@
 """Kernels for the outline of the footprint on a grid of cells.
 
-The forward model and the estimator share the geometry in this module. Lengths are in m, in sensor
-axes, relative to the tip centre. The object's face is the plane ``n·(x, y, z) = h`` with ``h = a −
-d``. Above the base point (x, y), the height of the face is ``z = u − v x − w y``, where
+The forward model and the estimator share the geometry in this module. Lengths are in m. Positions
+are in sensor axes, relative to the tip centre. The object's face is the plane ``n·(x, y, z) = h``
+with ``h = a − d``. Above the base point (x, y), the height of the face is ``z = u − v x − w y``,
+where
 
     u = h/n_z,  v = n_x/n_z,  w = n_y/n_z,
 
 and the spring strain at this point is ``ε = 1 − (u − v x − w y)/√(a² − x² − y²)`` (eq. 2 of the
-parallel-distributed model). The footprint {ε > 0} is the projection of a flat disc. The footprint
-is an ellipse or, beyond the model's domain, an ellipse truncated by the rim; both shapes are
-convex.
+parallel-distributed model). The footprint, where ε > 0, is the projection of a flat disc and
+therefore an ellipse. Beyond the model's domain, the rim truncates the ellipse. The footprint is
+always convex.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Face(Record):
 
 @inner_kernel
 def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
-    """Set the face for displacement ``d`` and the normal (n_x, n_y, n_z), where n_z > 0."""
+    """Set the face for displacement ``d`` and a normal (n_x, n_y, n_z) with n_z > 0."""
     n_z = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
     face.u = (a - d) / n_z
     face.v = n_x / n_z
@@ -61,7 +62,7 @@ def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def set_around(out: Face, face: Face, a: float, margin: float) -> None:
-    """Set ``out`` to a face parallel to ``face``, with a footprint larger by ``margin`` [m].
+    """Set ``out`` to a face parallel to ``face`` whose footprint is wider by ``margin`` [m].
 
     The enlarged footprint is limited to the tip's rim.
     """
@@ -77,8 +78,8 @@ def set_around(out: Face, face: Face, a: float, margin: float) -> None:
 def extremes(face: Face, a: float) -> Span:
     """Return the minimum and maximum y of the footprint, or (inf, −inf) if it is empty.
 
-    Beyond the model's domain, where the face cuts the base plane inside the rim, return the limits
-    of the rim.
+    Beyond the model's domain, the face cuts the base plane inside the rim. In this case, the result
+    is the y range of the rim.
     """
     u = face.u
     w = face.w
@@ -94,7 +95,7 @@ def extremes(face: Face, a: float) -> Span:
 
 @inner_kernel
 def line_span(face: Face, a: float, y: float) -> Span:
-    """Return the footprint's x range (left, right) on the line ``y``, or (inf, −inf) if empty."""
+    """Return the x range (left, right) of the footprint at ``y``, or (inf, −inf) if it is empty."""
     v = face.v
     rim = a * a - y * y
     if rim <= 0.0:
@@ -108,7 +109,8 @@ def line_span(face: Face, a: float, y: float) -> Span:
     root = math.sqrt(root)
     left = (v * q - root) / e
     right = (v * q + root) / e
-    # A root below the base plane is not a footprint edge. The footprint then ends at the rim.
+    # A root that lies below the base plane is not an edge of the footprint. The footprint then ends
+    # at the rim.
     return -edge if q < v * left else left, edge if q < v * right else right
 
 

@@ -1,8 +1,8 @@
 """Forward model of a pressure grid under a soft tip.
 
-`SensorGrid` describes the sensor geometry and renders the contact pressure on it. Each cell reads
-the pressure averaged over its area. Sensor imperfections (noise, quantisation, dead cells) are not
-modelled.
+`SensorGrid` describes the sensor geometry and computes the contact pressure in each cell. Each cell
+reads the average pressure over its area. Sensor imperfections (noise, quantisation, dead cells) are
+not modelled.
 """
 
 from __future__ import annotations
@@ -39,10 +39,9 @@ class SensorGrid:
     centre
         Tip centre in sensor axes [m], relative to the middle of the grid.
     rotation
-        Rotation of the sensor axes relative to the finger axes [rad], counter-clockwise seen along
-        +z.
+        Rotation [rad] of the sensor axes relative to the finger axes, positive about +z.
     blur
-        Standard deviation of the pressure blur in the elastomer over the cells [m].
+        Standard deviation [m] of the pressure blur in the elastomer that covers the cells.
 
     Raises
     ------
@@ -92,8 +91,8 @@ class SensorGrid:
         pitch_x, pitch_y = self.pitches
         x = -0.5 * self.cols * pitch_x - self.centre[0]
         y = -0.5 * self.rows * pitch_y - self.centre[1]
-        # The values are in field order. Setting the fields individually would take ten times as
-        # long.
+        # Create the record from values in field order, because setting each field takes ten times
+        # as long.
         fields = (tip.radius, x, y, pitch_x, pitch_y, self.rows, self.cols)
         return Grid(np.array([fields], Grid.dtype))
 
@@ -118,8 +117,8 @@ class SensorGrid:
 
         For a spring tip, the error is at most 1e-5 of the modulus, even in cells at the outline.
         The error increases to 1e-4 for tilts above 30°, and to 1e-3 where the outline almost
-        reaches the rim. For a solid tip, the accuracy equals that of `solid_data`, and contacts
-        outside the range of its data are clamped.
+        reaches the rim. For a solid tip, the accuracy is that of `solid_data`. Contacts outside the
+        range of the data are clamped.
 
         Parameters
         ----------
@@ -132,7 +131,7 @@ class SensorGrid:
         gain
             Factor applied to all pressures.
         out
-            Array to write to and return; None allocates a new one.
+            Array for the result; None allocates a new array.
 
         Returns
         -------
@@ -158,7 +157,7 @@ class SensorGrid:
         return _images(replace(self, rotation=0.0), tip)
 
 
-# The cache holds the grids of two fingers and shifted copies for the error budget.
+# The cache stores the grids of two fingers, and shifted copies of the grids for the error budget.
 @lru_cache(maxsize=16)
 def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     return images(tip, grid.on(tip), grid.blur)

@@ -1,9 +1,9 @@
 """Forward model of a solid tip: a frame is a weighted sum of fixed images.
 
-Each image shows a mode from `solid_data`. A mode has one image on the grid, or two images if it is
-directional: B(r) cos mφ and B(r) sin mφ, averaged over each cell. The image weights are smooth
-functions of (d, n_x, n_y). Because the sensor cannot measure tension, a cell reads 0 where the sum
-is negative.
+Each image shows a mode from `solid_data`. A directional mode has two images, B(r) cos mφ and B(r)
+sin mφ. A mode without direction (m = 0) has one image. The images are averaged over each cell. The
+image weights are smooth functions of (d, n_x, n_y). Because the sensor cannot measure tension, a
+cell reads 0 where the sum is negative.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ IMAGES = 2 * MODES
 _LANES = 8
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
-# Number of sample points per cell side: for cells inside the rim, for cells cut by the rim, and for
-# all cells if the sensor blurs.
+# Numbers of sample points per cell side. Cells inside the rim have _INSIDE points, and cells cut by
+# the rim have _CUT points. All cells of a sensor with blur have _BLURRED points.
 _INSIDE, _CUT, _BLURRED = 6, 24, 12
 
 
@@ -53,7 +53,7 @@ class Weights(Record):
 
 
 def weights_of(tip: Fingertip, material: Material) -> Weights:
-    """Create the weights of a solid tip; the contact is not set yet.
+    """Create the image weights of a solid tip, without setting a contact.
 
     Raises MaterialError unless the material is linear.
     """
@@ -75,7 +75,7 @@ def images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
     out = np.zeros((count, cells.rows * cells.cols))
     width, height = cells.pitch_x / cells.radius, cells.pitch_y / cells.radius
     x, y = (middle / cells.radius for middle in axes(cells))
-    # Distances of the nearest and farthest point of each cell.
+    # Distances of each cell's nearest and farthest point from the tip centre.
     near, far = (
         np.hypot(
             np.maximum(np.abs(x) + sign * width, 0.0),
@@ -125,7 +125,7 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> Iterator[FloatArray]:
 
 @inner_kernel
 def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
-    """Set a contact's image weights (for images in Pa) and their partials in d, n_x and n_y."""
+    """Set the image weights [Pa] of a contact and their partials with respect to d, n_x and n_y."""
     table = weights.table
     square = n_x * n_x + n_y * n_y
     t = math.sqrt(d * table.inverse_radius)
@@ -170,7 +170,7 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def own_shear(weights: Weights, d: float, square: float) -> float:
-    """Return the shear force of straight indentation on a sticking face, divided by a² sin θ [Pa].
+    """Return the shear force of straight indentation with a sticking face, over a² sin θ [Pa].
 
     The shear force acts at height a and is already included in the modes. ``weights`` must be set
     for this contact.
@@ -183,7 +183,7 @@ def own_shear(weights: Weights, d: float, square: float) -> float:
 
 @fast_inner_kernel
 def _evaluate_ratios(weights: Weights, x: float, y: float) -> None:
-    """Evaluate q of each mode and its partials in x and y, using one SIMD lane per mode."""
+    """Evaluate q of each mode and its partials with respect to x and y, one mode per SIMD lane."""
     ratios = weights.ratios
     q = weights.q
     q_x = weights.q_x
@@ -208,7 +208,7 @@ def _evaluate_ratios(weights: Weights, x: float, y: float) -> None:
 
 @fast_inner_kernel
 def _sum_images(weights: Weights, pixels: FloatArray, planes: FloatArray) -> None:
-    """Set ``planes`` [4, cells] to the sums of the ``pixels`` times each of the four weights."""
+    """Set ``planes`` [4, cells] to the sums of ``pixels`` multiplied by the four weight rows."""
     values = weights.values
     for k in range(pixels.shape[0]):
         pressure = by_d = by_x = by_y = 0.0
@@ -228,7 +228,7 @@ def _sum_images(weights: Weights, pixels: FloatArray, planes: FloatArray) -> Non
 def press_solid(
     weights: Weights, pixels: FloatArray, d: float, n_x: float, n_y: float, planes: FloatArray
 ) -> None:
-    """Compute the contact pressure and its partials in d, n_x and n_y, [4, cells].
+    """Compute the pressure and its partials with respect to d, n_x and n_y, [4, cells].
 
     The pressure is not clipped; it is negative where the rubber is in tension.
     """
@@ -258,9 +258,10 @@ def render_solid(
     """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), multiplied by ``gain``, into ``out``.
 
     ``shear`` [N] is the force on the face along x and y, acting at height a. If ``whole`` is True,
-    ``shear`` is the total shear; otherwise ``shear`` is added to the shear of straight indentation.
-    ``pixels`` holds all images, including those for shear. The result is zero for d ≤ 0. Contacts
-    outside the range of the data are clamped to the maximum depth and tilt at the same azimuth.
+    ``shear`` is the total shear force. Otherwise, ``shear`` is added to the shear force that
+    straight indentation causes. ``pixels`` contains all images, including the shear images. The
+    result is zero for d ≤ 0. Contacts outside the range of the data are clamped to the maximum
+    depth and tilt at the same azimuth.
     """
     each = weights[0]
     table = each.table
@@ -281,12 +282,12 @@ def render_solid(
 
 
 def pixels_of(images: FloatArray) -> FloatArray:
-    """Transpose ``images`` to [cells, ·], padded with zeros to a multiple of `_LANES` columns."""
+    """Transpose ``images`` to [cells, ·]; pad with zero columns to a multiple of `_LANES`."""
     return np.ascontiguousarray(np.pad(images, ((0, -len(images) % _LANES), (0, 0))).T)
 
 
 class SolidPressure:
-    """Pressure model of one solid tip for the cells of the ``basis`` images."""
+    """Pressure model of one solid tip on the cells of the ``basis`` images."""
 
     def __init__(self, tip: Fingertip, material: Material, basis: FloatArray) -> None:
         self._weights = weights_of(tip, material).array
@@ -299,7 +300,7 @@ class SolidPressure:
         out: FloatArray,
         shear: tuple[float, float] | None = None,
     ) -> None:
-        """Call :func:`render_solid`; the default ``shear`` is that of straight indentation."""
+        """Call :func:`render_solid`; the default ``shear`` results from straight indentation."""
         whole = shear is not None
         render_solid(
             self._weights, self._pixels, contact, shear or (0.0, 0.0), whole, gain, out.reshape(-1)

@@ -1,11 +1,11 @@
 """Forward model of a spring tip on a grid of cells: pressure and its partials.
 
-A cell reads the mean over sample points that are distributed evenly over its area. Above a point
-(x, y) of the base, the spring has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ with z = u − v
-x − w y; see `footprint`. Each point represents a small rectangle and uses the mean strain over it.
-Inside the footprint, the mean strain follows from tabulated means of 1/ℓ, x/ℓ and y/ℓ. Where the
-outline cuts the rectangle, only the part with f = ℓ² − z² > 0 contributes. In a rectangle cut by
-the outline, f is approximated by a plane, and its values by a uniform distribution.
+A cell reads the mean over sample points that are distributed evenly over its area. The spring above
+a base point (x, y) has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ, where z = u − v x − w y;
+see `footprint`. Each sample point represents a small rectangle, and uses the mean strain of the
+rectangle. Inside the footprint, the mean strain is computed from tabulated means of 1/ℓ, x/ℓ and
+y/ℓ. If the outline cuts the rectangle, only the part with f = ℓ² − z² > 0 contributes. In a
+rectangle cut by the outline, f is approximated as linear, and its values as uniformly distributed.
 
 The point weights include the sensor's blur; see `blur`.
 """
@@ -44,9 +44,9 @@ _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 class SpringPoints(NamedTuple):
     """Sample points of a grid under a tip, in the memory layout that the kernels use.
 
-    Each row of points is one array. Each array contains the points at the first position in each
-    cell, followed by the points at the second position, and so on. The array also includes cells
-    outside the grid that are within the range of the blur.
+    One array stores one row of points. The array contains the first point of every cell, then the
+    second point of every cell, and so on. Cells outside the grid are included if they are within
+    the range of the blur.
     """
 
     line: FloatArray  # [5, row]: distance from the tip centre in x [m], then scratch values
@@ -94,8 +94,8 @@ def _set_strains(
 ) -> None:
     """Set ε and −∂ε/∂u of the points from ``first`` to ``last`` in the row that begins at ``row``.
 
-    ``half`` contains half the side lengths of a point's rectangle. Indices are unsigned, because
-    Numba checks signed indices for negative values, and this check prevents vectorisation.
+    ``half`` contains half the side lengths of a point's rectangle. Indices are unsigned. Numba
+    checks signed indices for negative values, which prevents vectorisation.
     """
     u = face.u
     v = face.v
@@ -111,15 +111,16 @@ def _set_strains(
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
         # Approximate width of the uniform distribution of f. The exact width is 4 (big + small²/(3
-        # big)). With the approximate width, the mean of max(f, 0) is correct to within 2 % if the
-        # outline passes through the centre and f is linear.
+        # big)). For a linear f and an outline through the centre, the approximate width changes the
+        # mean of max(f, 0) by at most 2 %.
         by_x = abs(size_x * (x - z * v))
         by_y = abs(size_y * (y - z * w))
         big = max(by_x, by_y)
         small = min(by_x, by_y)
         spread = 4.0 * max(big, max(0.963 * big + 0.222 * small, 0.77 * big + 0.556 * small))
         part = min(max(f + 0.5 * spread, 0.0), spread)
-        # Value of z in the middle of the part with f > 0, where f decreases along (p, q).
+        # Compute z in the middle of the part with f > 0. The direction in which f decreases is (p,
+        # q).
         p = x - z * v
         q = y - z * w
         away = 0.5 * max(0.5 * part - f, 0.0) / (p * p + q * q + least)
@@ -149,8 +150,7 @@ def _raise_power(line: FloatArray, first: int, last: int, coefficient: float) ->
 def _sum_points(points: SpringPoints, first: int, last: int, ahead: int, weight: float) -> None:
     """Add the points at the index offset ``ahead`` to the sums of cells ``first`` to ``last``.
 
-    The three sums are the stress, its partial with respect to −u, and the product of this partial
-    and x.
+    The three sums are the stress σ, −∂σ/∂u and −x ∂σ/∂u.
     """
     line = points.line
     for k in range(first, last):
@@ -233,7 +233,7 @@ def press_springs(
     count_y, reach = points.along.shape
     size_x = 0.5 * grid.pitch_x / count_x
     size_y = 0.5 * grid.pitch_y / count_y
-    # If the outline cuts a rectangle, the rectangle's centre may lie outside the outline.
+    # Widen the face, because the outline may cut a rectangle whose centre is outside the outline.
     set_around(around, face, a, math.hypot(size_x, size_y))
     low, high = extremes(around, a)
     lines = points.y.shape[0]
@@ -281,7 +281,7 @@ def count_for(cells: Grid, fineness: float) -> tuple[int, int]:
 
 
 class SpringsPressure:
-    """Pressure of one spring tip on a grid of cells with ``count`` (x, y) points per cell."""
+    """Pressure model of a spring tip on a grid of cells, with ``count`` (x, y) points per cell."""
 
     def __init__(
         self, cells: Grid, material: Material, blur: float, count: tuple[int, int]
@@ -293,7 +293,7 @@ class SpringsPressure:
         self._planes = np.zeros((PLANES, cells.rows, cells.cols))
 
     def __call__(self, contact: tuple[float, float, float], gain: float, out: FloatArray) -> None:
-        """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, to ``out``.
+        """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), scaled by ``gain``, to ``out``.
 
         The result is zero for d ≤ 0. Beyond the model's domain, the footprint ends at the rim.
         """

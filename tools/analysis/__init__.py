@@ -1,4 +1,4 @@
-"""Analyse recordings: `analyse` computes contacts, and `plot` compares them with the model.
+"""Analyse recordings: `analyse` computes contacts, and `plot` compares recordings with the model.
 
 Both commands use the daemon's estimator.
 """

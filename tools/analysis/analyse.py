@@ -1,9 +1,10 @@
 """Run ``softfinger analyse FILE``: compute d, θ, force and energy versus time from frames.
 
 The frames are processed with the daemon's perception code. A stream recording (.mcap) contains its
-own settings and calibrations. All other sources (.npz, .npy, a folder of such files, or a
-Tekscan-style export) contain only frames and are analysed with the settings of the profile's left
-sensor. The grid size is taken from the file, and so is the pitch if the file contains one.
+own settings and calibrations. All other files (.npz, .npy, a folder of .npy files, a Tekscan-style
+export) contain only frames. These frames are analysed with the settings of the profile's left
+sensor. The grid size is taken from the file. A pitch in the file overrides the pitch in the
+profile.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Analyse files and write the results. Raises SoftfingerError or OSError for a single file."""
+    """Analyse files and write the results. With one file, raises SoftfingerError or OSError."""
     settings, files = profile(arguments), arguments.files
     if len(files) == 1:
         print(_analysed(arguments, settings, files[0]), end="")
@@ -110,7 +111,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 
 _EIGHT_BITS = 255
-_NOISE_RATIO = 1.5  # ratio of measured noise to tactile.noise above which the noise is reported
+_NOISE_RATIO = 1.5  # the noise is reported above this ratio of measured noise to tactile.noise
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
@@ -161,10 +162,10 @@ OnProgress = Callable[[int], None]
 class Source:
     """Frames from all sensors in one file; ``frames(progress)`` yields (finger, t [s], counts).
 
-    ``t`` is relative to the recording's first message, or to the first frame in files that contain
-    only frames. ``total`` is the final value of ``progress``. ``recording`` is set for files that
-    contain only frames. Kernels are loaded when ``models`` is called, so that an unreadable file is
-    reported quickly.
+    In a stream recording, ``t`` is relative to the first message. In files that contain only
+    frames, ``t`` is relative to the first frame, and ``recording`` is set. ``total`` is the final
+    value of ``progress``. Kernels are loaded only when ``models`` is called, so an unreadable file
+    is reported quickly.
     """
 
     settings: Settings
@@ -186,8 +187,9 @@ def open_source(path: Path, settings: Settings, own: bool) -> Source:
     Parameters
     ----------
     own
-        If True, use the settings in a stream recording instead of ``settings``. For files with only
-        frames, ``settings`` are always used, including the pitch unless the file contains a pitch.
+        If True, use the settings in a stream recording instead of ``settings``. For a file with
+        only frames, ``own`` must be False. A pitch in this file overrides the pitch in
+        ``settings``.
 
     Raises
     ------

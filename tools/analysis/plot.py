@@ -1,7 +1,7 @@
 """Run ``softfinger plot FILE.mcap``: plot a recording versus time, and compare it with the model.
 
 The model uses the recorded settings and calibrations. Force and energy are taken from the recorded
-states, which include the modulus factor estimated in grips.
+states. The recorded force and energy include the modulus factor that was estimated in grips.
 """
 
 from __future__ import annotations
@@ -109,10 +109,10 @@ class Missing(SoftfingerError):
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """Recording, or part of one, in SI units; ``t`` is relative to the recording's first message.
+    """Recording, or part of a recording, in SI units.
 
-    ``states`` contains one array per field. The fields have the same names as in the stream; nested
-    names contain a dot.
+    ``t`` is relative to the first message of the recording. ``states`` contains one array per
+    field. The fields are named as in the stream; the names of nested fields contain a dot.
     """
 
     name: str
@@ -138,7 +138,7 @@ class RecordedRun:
         return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
 
     def contacts(self) -> dict[str, ContactTable]:
-        """Return the table of each finger that had a contact; raise Missing if there was none."""
+        """Return the table of each finger with a contact; raise Missing if there is no contact."""
         if not self.t.size:
             raise Missing("the recording does not contain hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
@@ -207,7 +207,7 @@ def draw_time(run: RecordedRun) -> Figure:
 
 
 def draw_angle(run: RecordedRun) -> Figure:
-    """Plot F and U versus θ with model curves of constant d, and plot measured/model ratios."""
+    """Plot F, U and the gain versus θ, with model curves of F and U at constant d."""
     tables = run.contacts()
     rows = len(tables)
     figure = style.new_figure(7.2, 1.9 + 3.0 * rows)
@@ -243,7 +243,7 @@ def draw_angle(run: RecordedRun) -> Figure:
 def _against_angle(
     panel: Axes, seen: dict[str, FloatArray], table: ContactTable, field: str, factor: float
 ) -> Any:
-    """Draw model curves, and points coloured by d; return the mappable for the colour bar."""
+    """Draw model curves and recorded points; return the points for the colour bar."""
     from matplotlib.colors import Normalize
 
     depths = _depths(seen["d"])
@@ -269,7 +269,7 @@ def _against_angle(
 
 
 def _depths(d: FloatArray) -> FloatArray:
-    """Return one or more displacements [m], rounded for labels, that span the measured range."""
+    """Return round values of the displacement [m] that span the measured range."""
     from matplotlib.ticker import MaxNLocator
 
     largest = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3

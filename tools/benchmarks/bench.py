@@ -31,7 +31,7 @@ MEASUREMENTS = {
     "faults": "true grip force with faulty measurements (15 minutes)",
     "robustness": "true grip force of hands that differ from their settings",
 }
-# These benchmarks run on virtual time, so other programs do not affect their results.
+# These benchmarks run in virtual time, so other programs do not affect their results.
 SWEPT = ("reflex", "faults", "robustness")
 PAGE = ("estimator", "tick")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
@@ -119,7 +119,7 @@ def _journal(file: Path, name: str) -> Path:
 
 
 def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
-    """Run a measurement and return its tables, or an empty list if it failed."""
+    """Run a measurement and return its tables, or an empty list after a failure."""
     tables: list[Report] = []
     more = {key: getattr(arguments, key) for key, of in _OWN.items() if name in of}
     if name in SWEPT:
@@ -141,7 +141,7 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
 
 
 def _kept(name: str, tables: list[Report]) -> list[Row]:
-    """Convert rows for JSON: replace NaN by null."""
+    """Convert the rows of all tables for JSON, with NaN replaced by null."""
     return [
         {"measurement": name, "table": table.title}
         | {key: None if value != value else value for key, value in row.items()}

@@ -1,15 +1,15 @@
-"""Measure the residual object angle error for each grip control law.
+"""Measure the object angle error that remains with each control law of the grip.
 
 An object is placed between the fingers at an angle and then grasped. The error is computed from the
-simulated hand's true angle, not from the daemon's estimate. The simulated plants differ from the
-settings, and the sensor is either ideal or has defects. All runs use virtual time, so the results
-do not depend on the machine's speed.
+object's true angle in the simulation, not from the daemon's estimate. The simulated plants differ
+from the settings, and the sensor is either ideal or has defects. All runs use virtual time, so the
+results do not depend on the machine's speed.
 
 The daemon's control laws are compared with two laws from the literature. *Equal torques* is the
-`upright` law without its spring and dither. *Two-phased* is the serial two-phased controller for
-soft-fingered manipulation, :class:`TwoPhased`. The two-phased controller was published with a
-camera that measures the object angle with a delay. The two-phased controller and the daemon's law
-are therefore also tested with angles that are up to 0.3 s old.
+`upright` law without its spring and dither. *Two-phased* (:class:`TwoPhased`) is the serial
+two-phased controller for soft-fingered manipulation. The published two-phased controller uses a
+camera, which measures the object angle with a delay. The two-phased controller and the daemon's law
+are therefore also tested with delays of up to 0.3 s.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _SLOW_BANDWIDTH, _FAST_BANDWIDTH = 0.5, 4.0
 
 
 class Altered(Grip):
-    """The daemon's control law, with the object angle delayed by ``delay`` [s].
+    """The daemon's control law, which receives the object angle with a ``delay`` [s].
 
     The torque constants of the two joints differ by ``apart``, as a fraction of their mean.
     """
@@ -67,9 +67,8 @@ class TwoPhased(Altered):
     """Serial two-phased controller from the literature.
 
     Phase one integrates the object angle error with ``bandwidth`` [Hz] into an antisymmetric joint
-    goal. Phase two is a PD law that moves the joints to this goal; equal bias torques for the grip
-    are added. The measured force is not used. The bias torques are computed from the requested
-    force.
+    goal. Phase two is a PD law that moves the joints to this goal. Equal bias torques for the grip
+    are computed from the requested force and added. The measured force is not used.
     """
 
     def __init__(
@@ -133,10 +132,7 @@ def _upright(
     weight: tuple[float, float] = (0.0, 0.0),
     **simulation: Any,
 ) -> Way:
-    """Return a test of the `upright` law without angle feedback.
-
-    The plant violates the assumptions of the control law.
-    """
+    """Return a test of the `upright` law on a plant that violates the assumptions of this law."""
     tips: Sections = {"simulation": simulation}
     if width:
         tips = {"object": {"width": width}, "simulation": {"object_width": width}}
@@ -166,9 +162,9 @@ LATE_LIMITS = {
     for name, (control, law) in _STEERED_LAWS.items()
     for delay in DELAYS
 }
-# Compared with relaxed spring tips, tips without tangential coupling have four times the energy
-# curvature at θ = 0. If the tangential stiffness is less than three quarters of the default, the
-# energy has a maximum at θ = 0.
+# At θ = 0, the energy curvature of tips without tangential coupling is four times that of relaxed
+# spring tips. If the tangential stiffness is less than three quarters of the default, the energy
+# has a maximum at θ = 0.
 _TIPS: dict[str, Sections] = {
     "solid": SOLID,
     "without tangential coupling": {"simulation": {"tip_law": "bristles"}},
@@ -184,7 +180,7 @@ LATE_TIPS = {
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Return tables of residual angles [°]; with few draws, p99 is close to the maximum."""
+    """Return tables of residual angles [°]. With few plants, p99 is close to the maximum."""
     plants = drawn(2 if brief else _DRAW_COUNT)
     title = (
         f"remaining angle of {math.degrees(_ANGLE_STD):g}° after {_READ_TIME:g} s at {_FORCE:g} N"
@@ -201,7 +197,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
-    """Draw each plant's deviations from the settings; all control laws use the same plants."""
+    """Draw random plants that differ from the settings; all control laws use the same plants."""
     rng = np.random.default_rng(16)
     return [
         {
@@ -217,7 +213,7 @@ def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
 
 
 def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
-    """Return the row for one law: residual angles on ``plants``, and the number of lost objects.
+    """Return one law's row, with the residual angles on ``plants`` and the number of lost objects.
 
     ``angles`` lists the residual angle on each plant [°], or None if the object is not held.
     """
@@ -242,7 +238,7 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float | None:
             hand.run(hand.loop.period)
         hand.plant.apply_load(*way.weight)
         hand.run(begun + _READ_TIME - _STEERING_TIME - hand.now)
-        if way.is_steered:  # Do not wait for the force: some laws do not measure it.
+        if way.is_steered:  # Do not wait for the force, because some laws do not measure it.
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERING_TIME)
         is_held = min(hand.plant.force) > 0.0

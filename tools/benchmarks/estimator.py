@@ -1,14 +1,14 @@
-"""Measure run time and error of contact table lookups and frame estimates.
+"""Measure the run time and the error of contact table lookups and frame estimates.
 
-All measured functions take turns in one run. All lookups use the same points: |θ| up to 30° and d
-up to 8 mm. Half of the displacements are evenly spaced, and half are logarithmically spaced down to
-1 µm. The reported error is the maximum relative deviation from quadrature with many nodes.
+All measured functions take turns in one run. All lookups use the same random points with |θ| up to
+30° and d up to 8 mm. Half of the displacements are distributed uniformly, and half logarithmically
+down to 1 µm. The reported error is the maximum relative deviation from quadrature with many nodes.
 
-Each frame has 44 × 44 cells on a 58 mm square and shows a contact with d = 4 mm and a tilt of 15°.
-The noise is 0.2 % of the modulus. As in the control loop, the estimator is called from Python.
-Spring tips and solid tips are measured in turn. RMS errors over these frames are listed next to the
-Cramér-Rao bound. The "sensor" rows show the errors for a profile's sensor that has been pressed in
-the same way for one second.
+Each frame has 44 × 44 cells on a 58 mm square. The contact has d = 4 mm and a tilt of 15°, unless a
+row gives other values. The noise is 0.2 % of the modulus. As in the control loop, the estimator is
+called from Python. Spring tips and solid tips are measured in turn. The table lists the RMS errors
+over these frames and the Cramér-Rao bound. The "sensor" rows show the errors for a profile's sensor
+after one second under the same contact.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def rms_errors(found: FloatArray, truth: Truth) -> dict[str, float]:
 
 
 def tilts(theta: float, azimuth: float) -> tuple[float, float]:
-    """Return (tilt_x, tilt_y) for a total tilt towards ``azimuth`` [rad]."""
+    """Return (tilt_x, tilt_y) for a total tilt ``theta`` towards ``azimuth`` [rad]."""
     s = math.sin(theta)
     return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
 
@@ -84,7 +84,7 @@ def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
 
 
 def lookups(rounds: int, count: int = 512) -> Report:
-    """Return the time per point [ns] for ``count`` points, in one call and in separate calls."""
+    """Measure the time per point [ns] and the error of lookups, in one or in separate calls."""
     rng = np.random.default_rng(3)
     even = rng.uniform(0.0, _D_MAX, count)
     spread = 10.0 ** rng.uniform(-6.0, np.log10(_D_MAX), count)
@@ -150,7 +150,7 @@ def frames_to_contacts(rounds: int) -> Report:
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
     times = {name: taken / _FRAME_COUNT for name, taken in interleave(subjects, rounds).items()}
-    # Use the minimum, which is affected least by other programs on the machine.
+    # Use the minimum, because other programs on the machine affect the minimum least.
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
     for name, (run, truth, aim) in cases.items():
@@ -167,7 +167,7 @@ def frames_to_contacts(rounds: int) -> Report:
 
 
 def centroid_and_extent(frames: FloatArray) -> FloatArray:
-    """Use NumPy to compute [d, tilts] [n, 3] from each footprint's centroid and extent.
+    """Compute d and the tilts [n, 3] from each footprint's centroid and extent, using NumPy.
 
     For a constant modulus, the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance is
     d (4a − d)/6 − sin² θ d (12a − 5d)/36. The initial footprint contains all cells above a
@@ -214,7 +214,7 @@ def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> Floa
 
 
 def bound() -> float:
-    """Return the Cramér-Rao bound for d [m] from all cells if tilts and gain are unknown.
+    """Return the Cramér-Rao bound for d [m] from all cells, for unknown tilts and gain.
 
     Pressure derivatives with respect to (d, tilt_x, tilt_y, gain) are central differences.
     """

@@ -2,8 +2,8 @@
 
 Each case is a grip with a faulty measurement or an unusual tip. A trial's seed determines the
 noise, the times, the affected finger, the object mass and the torque constant error. Trials run in
-virtual time, so they do not depend on the machine. The results are computed from the plant's true
-state.
+virtual time, so the results do not depend on the machine. The results are computed from the plant's
+true state.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _EVENT_PREFIX = "consistency."  # prefix of the event kinds that report a faulty
 SETTLES = "settles at 0.8 to 1.2 without a force increase"
 BOUNDED = "≤ 50 ms above 1.3, reported within 0.3 s"
 _SETTLED_RANGE = (0.8, 1.2)
-_EXCESS_TIME_MAX = 0.05  # maximum time during which the force may exceed 1.3 times the request [s]
-_REPORT_TIME_MAX = 0.3  # time limit for a report once half of the error has developed [s]
+_EXCESS_TIME_MAX = 0.05  # maximum time with a force above 1.3 times the requested force [s]
+_REPORT_TIME_MAX = 0.3  # time limit for a report, counted from the midpoint of the onset [s]
 _SLIDE_MAX = 0.010  # m
 
 # Phases of a trial.
@@ -55,8 +55,8 @@ class FaultCase:
     """Benchmark case: a kind of grip and a fault.
 
     ``words`` are faults in the syntax of `softfinger emulate --fault`, with ``{side}`` as a
-    placeholder for the finger. The faults start during the hold or, if ``before`` is True, before
-    the grasp.
+    placeholder for the finger. The faults start during the hold. If ``before`` is True, the faults
+    start before the grasp.
     """
 
     name: str
@@ -117,7 +117,11 @@ NAMES = tuple(case.name for case in CASES)
 
 @dataclass
 class GripTrial:
-    """Outcome of a trial: relative forces, and times [s] measured from the grasp or the fault."""
+    """Outcome of a trial.
+
+    Forces are relative to the requested force. Times [s] are counted from the grasp or from the
+    fault.
+    """
 
     false: tuple[str, ...]  # channels that may be reported as faulty
     held: bool = True  # True if the hold was established
@@ -129,7 +133,7 @@ class GripTrial:
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
-        """Record the results from ``watch`` and the hand's final state."""
+        """Store the results of ``watch`` and the final state of the hand."""
         self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events
@@ -137,7 +141,7 @@ class GripTrial:
     def named(self, rightly: bool) -> list[tuple[float, str]]:
         """Return (time, channel) of each correct diagnosis.
 
-        If ``rightly`` is False, the wrong diagnoses are returned instead.
+        If ``rightly`` is False, the wrong diagnoses are returned.
         """
         names = [
             (t, k.removeprefix(_EVENT_PREFIX))
@@ -147,7 +151,7 @@ class GripTrial:
         return [(t, name) for t, name in names if (name in self.false) == rightly]
 
     def missed(self, case: FaultCase) -> list[str]:
-        """Return the criteria that the trial failed."""
+        """Return the criteria that the trial did not meet."""
         low, high = _SETTLED_RANGE
         named = min((t for t, _ in self.named(True)), default=math.inf) - 0.5 * case.comes
         wrong = {
@@ -227,7 +231,7 @@ def trial(case: FaultCase, seed: int) -> GripTrial:
 
 
 def summary(case: FaultCase, found: Sequence[GripTrial]) -> Row:
-    """Return a case's row: median, extremes, failed criteria and event times."""
+    """Return a case's row, with the median, extremes, missed criteria and event times."""
     settled = [each.settled for each in found if not math.isnan(each.settled)]
     missed = [each.missed(case) for each in found]
     return {
@@ -254,7 +258,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Format each event kind with its number of trials and its median first occurrence [s]."""
+    """Format each event kind with its trial count and the median time of its first event [s]."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

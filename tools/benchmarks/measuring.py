@@ -19,7 +19,7 @@ from softfinger.tools.terminal.text_layout import plain_table, table_text
 Row = dict[str, Any]
 
 # Duration of a repetition [s]. A repetition is short enough to avoid most interruptions, but long
-# compared with the clock resolution.
+# relative to the clock resolution.
 _SLICE = 4e-4
 
 
@@ -33,7 +33,7 @@ class Report:
     failed: bool = False
 
     def __str__(self) -> str:
-        """Format as aligned text: four digits for numbers, blanks for None and NaN, no lists."""
+        """Format as aligned text with four digits. None and NaN are blank; lists are omitted."""
         shown = (key for row in self.rows for key in row if not isinstance(row[key], list))
         keys = list(dict.fromkeys(shown)) or ["name"]
         table = plain_table()
@@ -49,8 +49,7 @@ class Report:
 def attempt(title: str, part: Callable[[], Report]) -> Report:
     """Run one part of a measurement; after an error, return a failed report with the reason.
 
-    The remaining parts of the measurement still run, e.g. if a hand loses its grip on a busy
-    machine.
+    The remaining parts still run after an error, e.g. if a hand loses its grip on a busy machine.
     """
     try:
         return part()
@@ -65,7 +64,7 @@ def _cell(value: Any) -> str:
 
 
 def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None, **more: Any) -> Row:
-    """Return the row for samples in ``unit``: median, interquartile range and 99th percentile."""
+    """Return a row with the median, interquartile range and 99th percentile of the samples."""
     values = np.asarray(samples, dtype=np.float64)
     low, median, high, p99 = np.percentile(values, [25.0, 50.0, 75.0, 99.0]).tolist()
     spread = {"median": median, "IQR": high - low, "p99": p99}

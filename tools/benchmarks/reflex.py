@@ -1,12 +1,12 @@
 """Measure how a grip reacts to a sudden load increase.
 
-A 10 N grip carries a constant load along the object faces, away from the palm. A larger load is
-then applied and maintained: either a push, or a twist with the same force at the faces. Trials run
-in virtual time, and the results are computed from the simulated hand's true state. *Lost*: the
-object is no longer between the tips. *Slid*: object displacement along its faces. The displacement
-is measured relative to the midpoint between the tips, so that leaning fingers do not affect the
-result. *Answer*: time from the onset of slip until the goal currents have increased by a quarter.
-*Said*: time from object loss until the hand leaves the grip modes.
+In a 10 N grip, the object is under a constant load along its faces, away from the palm. Then a
+larger load is applied and maintained. The larger load is a push, or a twist with the same force at
+the faces. Trials run in virtual time, and the results are computed from the simulated hand's true
+state. *Lost*: the object is no longer between the tips. *Slid*: displacement of the object along
+its faces. The displacement is measured relative to the midpoint between the tips, so leaning
+fingers do not affect the result. *Answer*: time from the onset of slip until the goal currents have
+increased by a quarter. *Said*: time from object loss until the hand leaves the grip modes.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Overload(NamedTuple):
 def measure(
     brief: bool = False, full: bool = False, sweep: Callable[..., Iterable[Any]] = map
 ) -> list[Report]:
-    """Return one table per hand (tip or sensor, and object mass); ``brief`` runs fewer cases.
+    """Return one table for each tip or sensor and object mass; ``brief`` runs fewer cases.
 
     ``sweep`` maps cases to outcomes in one or more processes.
     """

@@ -38,7 +38,7 @@ _FRAME_COUNT = 16  # number of frames through which the benchmark cycles
 
 
 class RigError(SoftfingerError):
-    """Error raised if the test rig does not work, so that the measurement is not possible."""
+    """Error raised if the test rig does not work and the measurement is therefore impossible."""
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
@@ -49,7 +49,7 @@ def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
 
 @contextlib.contextmanager
 def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
-    """Yield a virtual-time daemon with private addresses, and a subscriber to ``topics``."""
+    """Yield a virtual-time daemon with private addresses, and subscribe to ``topics``."""
     with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
         sections = {
             "loop": {"clock": "virtual"},
@@ -151,7 +151,7 @@ def can(daemon: Daemon) -> None:
     """Replace a daemon's backends with canned backends, so that only the tick itself is timed.
 
     The canned backends repeat the last reading and the next few frames. Several frames are used,
-    because the daemon would detect a single repeated frame as a frozen sensor.
+    because the daemon would diagnose a repeated frame as a frozen sensor.
     """
     loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate
     fingers = loop.perception.fingers

@@ -1,8 +1,9 @@
 """Measure the true grip force of hands that differ from their settings.
 
 The simulated hand and the daemon have separate settings. In each of the *rows*, one parameter
-differs by an amount that is normal for a healthy hand. In the *ensemble*, all parameters are drawn
-at random. Grips run in virtual time, so the results do not depend on the machine.
+differs from its setting by an amount that is normal for a healthy hand. In the *ensemble*, all
+parameters are drawn at random. Grips run in virtual time, so the results do not depend on the
+machine.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _LATENCY = Settings().tactile.latency
 
 @dataclass(frozen=True)
 class HandCase:
-    """Case of a grip with ``force`` [N] in which the daemon's settings differ from the hand."""
+    """Grip with ``force`` [N] by a hand that differs from the daemon's settings."""
 
     name: str
     force: float
@@ -171,7 +172,7 @@ def drawn(seed: int) -> HandCase:
 
 @dataclass
 class Outcome:
-    """Outcome of a grip. Forces are relative to the requested force, times are in s."""
+    """Outcome of a grip. Forces are relative to the requested force, and times are in s."""
 
     held: bool = False  # True if the hold was established
     settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released

@@ -1,10 +1,10 @@
-"""Measure tick times: back to back, in place, and with emulated servos over a pty.
+"""Measure the duration of ticks back to back, in place, and with emulated servos over a pty.
 
-Back-to-back ticks follow each other without a pause. Each in-place tick starts after a sleep, as in
-a running daemon. Both kinds of ticks are measured alternately, with the same hand and canned
-readings. In the last measurement, another process emulates the servos, either unpaced or with the
-transmission times of a given baud rate. The whole simulated hand is also timed for one second of
-virtual time.
+Back-to-back ticks run without a pause. Each in-place tick starts after a sleep, as in a running
+daemon. Both kinds of ticks are measured alternately, with the same hand and canned readings. In the
+last measurement, another process emulates the servos. The emulation is unpaced, or paced to the
+transmission times of a baud rate. In addition, the complete simulated hand is timed over one second
+of virtual time.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _simulated(title: str, seconds: int) -> Report:
 
 
 def _in_turns(title: str, rounds: int) -> Report:
-    """Measure only the pipeline: back to back with or without subscribers, or in place at 3 rates.
+    """Measure the pipeline back to back, with and without subscribers, and in place at 3 rates.
 
     SCHED_FIFO is used if permitted.
     """
@@ -108,7 +108,7 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
 
 
 def in_place(daemon: Daemon, rate: float) -> list[float]:
-    """Return tick durations [µs] during 0.15 s; real-time deadlines start the ticks."""
+    """Return the durations [µs] of the ticks in 0.15 s, each started at a real-time deadline."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
     for _ in range(round(0.15 * rate)):

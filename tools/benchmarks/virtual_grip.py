@@ -18,13 +18,13 @@ from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 
-EXCESS_RATIO = 1.3  # ratio of force to requested force above which the force is excessive
-LOST_SLIDE = 0.1  # displacement along the faces above which the object counts as lost [m]
+EXCESS_RATIO = 1.3  # an excessive force exceeds this multiple of the requested force
+LOST_SLIDE = 0.1  # the object counts as lost above this displacement along its faces [m]
 _TORQUE_ERROR = 0.1  # maximum relative error of the torque constant
 # Goal current that counts as a reaction, relative to the current during the hold.
 _INCREASED_RATIO = 1.25
-_AVERAGING_TIME = 0.5  # final part of the hold over which the force is averaged [s]
-_SLIP_FRACTION = 0.999  # fraction of the friction limit above which the tip counts as slipping
+_AVERAGING_TIME = 0.5  # duration of the final part of the hold, in which the force is averaged [s]
+_SLIP_FRACTION = 0.999  # a tip counts as slipping above this fraction of the friction limit
 
 
 class Watch:
@@ -86,7 +86,7 @@ class VirtualGrip(SimulatedDaemon):
 
     @classmethod
     def drawn(cls, seed: int, chance: random.Random, sections: Sections) -> Self:
-        """Draw a grip with a random object mass and a random torque constant error."""
+        """Draw a grip with a random object mass and a random error of the torque constant."""
         drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
         error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
         return cls(merged(sections, {"simulation": drawn}), torque=1.0 + error)
@@ -99,7 +99,7 @@ class VirtualGrip(SimulatedDaemon):
 
     def __exit__(self, *ended: object) -> None:
         super().__exit__(*ended)
-        gc.collect()  # Reference cycles in a daemon keep megabytes of frames in memory.
+        gc.collect()  # Collect the daemon's reference cycles, which keep frames in memory.
 
     def command(self, name: str, **numbers: float) -> dict[str, Any]:
         """Send a command and ignore refusals."""

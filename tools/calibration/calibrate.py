@@ -33,8 +33,8 @@ STEPS = (
     "scales",
 )
 _OF_PROFILE = STEPS[: STEPS.index("tare")]  # All other steps calibrate a single tip.
-# If the standard deviation of a sensor gain exceeds this fraction of its prior value, the gain has
-# never been measured in a grip.
+# Fraction of the prior standard deviation. A sensor gain with a larger standard deviation has never
+# been measured in a grip.
 _LEARNT = 0.8
 # Minimum relative standard deviation of each factor. Rubber and joints change from day to day.
 _LEAST = 0.02

@@ -144,7 +144,7 @@ def _while_pressed(
     told: str,
     load: Mapping[str, float],
 ) -> NDArray[np.uint16]:
-    """Return the last frames before a load is in place, and ``--frames`` frames under the load."""
+    """Return the last frames before a load is applied, and ``--frames`` frames under the load."""
     before: deque[NDArray[np.uint16]] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock, clock.now())
     with ThreadPoolExecutor(1) as pool:

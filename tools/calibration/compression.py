@@ -1,7 +1,7 @@
-"""Run `calibrate law --compression`: fit a tip's material law to CSV files of a test machine.
+"""Run `calibrate law --compression`: fit a tip's material law to CSV files of a testing machine.
 
 A file contains strain and stress, or displacement and force. A file with displacement and force
-also needs the tilt, in a column or from ``--theta``.
+also requires the tilt, in a column or from ``--theta``.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 class _Quantity(NamedTuple):
-    """Quantity in a file: accepted column names, and accepted units with their SI factors."""
+    """Column names and units that a file may use for a quantity; the units have SI factors."""
 
     words: set[str]
     units: dict[str, float]
@@ -76,7 +76,7 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     """Read a file's known columns and convert them to SI units.
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
-    semicolon. Units follow the column names in the header, or are in a separate row below the
+    semicolon. The unit of a column is given after the column name, or in a separate row below the
     header. Other columns, empty lines and lines that begin with # are ignored.
 
     Raises
@@ -149,7 +149,7 @@ def _is_number(cell: str) -> bool:
 
 @dataclass(frozen=True)
 class _Test:
-    """Test run, with the name that messages use for the run."""
+    """Test run, and its name in messages."""
 
     name: str
     run: Run
@@ -158,14 +158,14 @@ class _Test:
 def fit_files(
     calibration: Calibration, settings: Settings, paths: list[Path], theta: list[float]
 ) -> tuple[Calibration, str, tuple[Panel, ...]]:
-    """Fit the material law to test data, using the tip model in the profile's `tip.physics`.
+    """Fit the material law to test data, using the tip model selected by `tip.physics`.
 
     Parameters
     ----------
     calibration, settings
         The tip's calibration, and the profile.
     paths
-        Files from the test machine.
+        Files from the testing machine.
     theta
         Tilt of each file [deg], or an empty list.
 

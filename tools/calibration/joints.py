@@ -196,7 +196,7 @@ def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any
 
 
 def put(text: str, section: str, values: Mapping[str, Any]) -> str:
-    """Return a profile's text with the arrays or numbers ``values`` set in ``[section]``.
+    """Return a profile's text with ``values``, i.e. arrays or numbers, set in ``[section]``.
 
     If the profile has no ``[section]`` header but uses dotted keys, ``section.key`` is used.
     """

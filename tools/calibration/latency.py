@@ -30,12 +30,12 @@ _STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, divided by the first force
 _HELD = 0.5  # hold time per force [s]
 _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
 # Accepted range for the ratio of d from frames to d from joints. A ratio outside this range means
-# that the frames do not follow the joints.
+# that the frames do not match the motion of the joints.
 _SCALE = 0.5, 2.0
-# Maximum rms residual [m]. Larger values indicate sliding, tilting or a second contact.
+# Maximum rms residual [m]. Larger residuals indicate sliding, tilting or a second contact.
 _MISFIT_MAX = 0.3e-3
-# Relative errors of d from frames. The first error applies if d is estimated from the frame shape,
-# and the second error applies if d is estimated from the frame amplitude.
+# Relative errors of d from frames. The first error applies to d estimated from the frame shape. The
+# second error applies to d estimated from the frame amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 
@@ -116,7 +116,7 @@ def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArra
     """Return times, the sum of d over all fingers, and its standard deviation due to noise.
 
     Each frame is estimated independently. The times are the sample times of the first finger's
-    frames while all fingers touch.
+    frames during which all fingers are in contact.
     """
     names = sorted(own.scene.fingers)
     models = recorded_models(source)
@@ -151,7 +151,7 @@ def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArra
 
 
 def _closing(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray]:
-    """Return times, and d1 + d2 [m] computed from the joint angles, up to a constant offset.
+    """Return times and d1 + d2 [m] from the joint angles; d1 + d2 has an unknown constant offset.
 
     The sum d1 + d2 = W + 2a − (O2 − O1)·n does not change if the object moves between the tips.
     """

@@ -115,7 +115,7 @@ class Step:
 
     @cached_property
     def readings(self) -> list[FloatArray]:
-        """Mean readings of each load, with noise far from the contact removed."""
+        """Mean readings of each load, without the noise of cells far from the contact."""
         noise = self.calibration.tare.noise if self.calibration.tare else 0.0
         spread = np.full(self.converter.zero.shape, noise)
         return [
@@ -169,7 +169,7 @@ def done(step: Step) -> Done:
 
 
 def _kept(kind: type[Any], found: object, **more: Any) -> Any:
-    """Create a ``kind`` step for the file from the fields of ``found`` and ``more``."""
+    """Create a step of type ``kind`` from the fields of ``found`` and ``more``."""
     values = {name: getattr(found, name) for name in kind.model_fields if hasattr(found, name)}
     lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
     return kind(date=now(), **(lists | more))
@@ -350,8 +350,8 @@ def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArra
 
     Returns
     -------
-    The curves and the RMS residuals of d [m], θ [rad] and F (relative to its RMS). The residuals
-    are computed from the mean over each load's frames.
+    The curves, and the RMS residuals of d [m], θ [rad] and F. The residual of F is relative to the
+    RMS of F. Each load contributes the mean over its frames.
 
     Raises
     ------
