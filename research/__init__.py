@@ -1,1 +1,1 @@
-"""Programs for computing the package's data files; they run only from the source tree."""
+"""Programs that compute the package's data files; run the programs from the source tree."""

@@ -112,7 +112,7 @@ __all__ = [
     "to_columns",
 ]
 
-# Module of each public name. For type checkers, the imports above declare the same names.
+# Public names of each module. For type checkers, the imports above declare the same names.
 _PUBLIC = {
     "daemon.client.asynchronous": "AsyncHand AsyncSubscription",
     "daemon.client.command_client": "NoAnswer",

@@ -1,20 +1,20 @@
-"""Simulate soft tips, with this package's contact law and pressure grids, in a MuJoCo scene.
+"""Simulate soft tips in a MuJoCo scene, with this package's contact law and pressure grids.
 
 :class:`SoftTips` turns spheres in any MuJoCo model into soft hemispheres. A passive-force callback
-(`mjcb_passive`) applies the force from the contact table, with friction. A user sensor returns the
-pressure under each tip. :class:`MujocoHand` simulates the hand of a profile. The daemon uses this
-class if ``servos.backend = "mujoco"``.
+(`mjcb_passive`) applies friction and the force from the contact table. A user sensor returns the
+pressure under each tip. :class:`MujocoHand` simulates the hand of a profile. The daemon uses
+:class:`MujocoHand` if ``servos.backend = "mujoco"``.
 
-The contact law is the kernel that the simulated hand uses (`simulation.physics.tip`). In 3D, the
-shear is a vector in the plane of the face. The component along the tilt is d_t. The component
-across the tilt is treated as a variance, because U contains ρ(ζ² + v). The forces f are computed
-for the end of the step (docs/mujoco.md). The forces are linearly implicit in d, θ and both shears,
-whose Jacobian rows are R:
+The simulated hand uses the same contact law (`simulation.physics.tip`). In 3D, the shear is a
+vector in the plane of the face. The component along the tilt is ζ = d_t. The square of the
+component across the tilt is used as the variance v, because U contains ρ(ζ² + v). The forces f are
+computed for the end of the step (docs/mujoco.md). The forces are linearly implicit in d, θ and both
+shears, whose Jacobian rows are R:
 
     (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
 
-K and D are the contact law's stiffness and damping, h is the time step, and a is the acceleration
-due to all other forces in the last step. At rest, f equals the contact law's force.
+K and D are the contact law's stiffness and damping, and h is the time step. a is the acceleration
+that all other forces caused in the last step. At rest, f equals the contact law's force.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _set_frame(touch: Touch, geometry: FloatArray) -> None:
 
 @inner_kernel
 def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -> float:
-    """Evaluate the contact law for a 2D shear; return the force across the tilt, with damping."""
+    """Evaluate the contact law for a 2D shear; return the damped force across the tilt."""
     tip = touch.contact
     stiffness = limit = 0.0
     for _ in range(2):
@@ -129,8 +129,8 @@ def press(
     """Evaluate all tips; store the rows R [4n, nv], the force along each row, and B in ``work``.
 
     ``geometry`` [n, 10] contains d, centre, axis and foremost point of each tip. ``jacobians``
-    [n, 4, 3, nv] contains the tip's position and rotation Jacobians, followed by those of the
-    touched geom. ``dt`` [s] is the time since the last call.
+    [n, 4, 3, nv] contains each tip's position and rotation Jacobians, and then those of the touched
+    geom. ``dt`` [s] is the time since the last call.
     """
     p, data, rates = parameters[0], tables[0], np.zeros(_ROWS)
     rows, force, implicit = work
@@ -215,10 +215,10 @@ def solve(
 class SoftTips:
     """Context manager that turns spheres in a MuJoCo model into soft tips.
 
-    While active, the context uses MuJoCo's global callbacks ``mjcb_passive`` and ``mjcb_sensor``,
-    so only one model at a time can have soft tips. A user sensor named ``TIP_pressure`` with
-    ``needstage="vel"`` receives the cell pressures [Pa], which are updated ``tactile.rate`` times
-    per second.
+    The active context uses MuJoCo's global callbacks ``mjcb_passive`` and ``mjcb_sensor``. Only one
+    model at a time can therefore have soft tips. A user sensor named ``TIP_pressure`` with
+    ``needstage="vel"`` receives the cell pressures [Pa]. The pressures are updated ``tactile.rate``
+    times per second.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ class SoftTips:
         solve(*law, work, self._inertial, data.qacc, data.qfrc_passive, self._own)
 
     def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
-        """Set the pressure sensors on each step, because MuJoCo clears them (`mjcb_sensor`)."""
+        """Set the pressure sensors, which MuJoCo clears in each step (`mjcb_sensor`)."""
         if data is self.data and stage == mujoco.mjtStage.mjSTAGE_VEL:
             is_due = data.time >= self._due
             self._due = data.time + self._period - 1e-9 if is_due else self._due
@@ -329,11 +329,11 @@ class SoftTips:
 
 
 def hand_mjcf(settings: Settings, p: Parameters) -> str:
-    """Return the MJCF model of the profile's hand with a box in front of it.
+    """Return the MJCF model of the profile's hand and of a box in front of the hand.
 
     The hand moves in the xy plane, and z points towards the viewer. `set_parameters` computes the
-    parameters ``p``. Raises SettingsError unless the object is a rectangle and the hand has two
-    fingers.
+    parameters ``p``. Raises SettingsError if the object is not a rectangle or the hand does not
+    have two fingers.
     """
     shape, count = settings.simulation.object_shape, len(settings.scene.fingers)
     if shape != "rectangle" or count != 2:
@@ -389,7 +389,7 @@ def feel(plants: Records[Plant], touches: Records[Touch], ring: Records[Sample])
     for k in range(2):
         plant.stages[0].on_object[k] = touches[k].contact
         tip = plant.stages[0].on_object[k]
-        if touches[k].across[2] < 0.0:  # In the plane, θ, shear and force are signed.
+        if touches[k].across[2] < 0.0:  # The planar plant uses signed θ, shear and force.
             tip.theta, tip.sine = -tip.theta, -tip.sine
             tip.tangential, tip.shear = -tip.tangential, -tip.shear
     settle(plant, ring)

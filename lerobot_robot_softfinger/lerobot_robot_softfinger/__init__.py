@@ -1,4 +1,4 @@
-"""LeRobot plugin that adds ``softfinger`` as a ``--robot.type`` and an ``--env.type``."""
+"""LeRobot plugin that adds ``--robot.type=softfinger`` and ``--env.type=softfinger``."""
 
 from lerobot_robot_softfinger.config_environment import SoftfingerEnvConfig
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig

@@ -11,7 +11,7 @@ from lerobot_robot_softfinger.features import FULL_SCALE
 @RobotConfig.register_subclass("softfinger")
 @dataclass(kw_only=True)
 class SoftfingerConfig(RobotConfig):
-    """Connection to a running ``softfinger`` daemon, and the meaning of actions.
+    """Settings for the connection to a running ``softfinger`` daemon, and for actions.
 
     If ``control`` is ``joints``, actions are joint goals. If ``control`` is ``law``, actions are
     the force and object angle for the built-in grip control law.
@@ -20,13 +20,13 @@ class SoftfingerConfig(RobotConfig):
     address: str | None = None  # tcp://HOST or STREAM,COMMANDS; default: SOFTFINGER_ADDRESS
     keys: Path | None = None  # folder with this client's keys, if the daemon requires keys
     control: str = "joints"
-    rows: int = 44  # number of rows per tactile grid
-    cols: int = 44  # number of columns per tactile grid
+    rows: int = 44  # number of rows of each tactile grid
+    cols: int = 44  # number of columns of each tactile grid
     full_scale: float = FULL_SCALE  # pressure shown as white in images [Pa]
     least_force: float = 0.5  # minimum grip force [N]; a smaller `grip.force` opens the hand
     timeout: float = 5.0  # timeout for a reply, a state or a frame [s]
     start_timeout: float = 120.0  # timeout for the first state [s], including compilation
-    disarm_on_disconnect: bool = True  # True if the hand drops the object on disconnection
+    disarm_on_disconnect: bool = True  # True if disconnecting disarms the hand and drops the object
 
     def __post_init__(self) -> None:
         super().__post_init__()

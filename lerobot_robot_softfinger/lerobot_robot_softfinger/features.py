@@ -20,7 +20,7 @@ STATE = tuple(
 )
 JOINTS = tuple(f"{name}.pos" for name in FINGERS)
 IMAGES = {name: f"{name}_touch" for name in FINGERS}
-FULL_SCALE = 127.5e3  # full-scale pressure [Pa], with 500 Pa per step in an 8-bit image
+FULL_SCALE = 127.5e3  # full-scale pressure [Pa]; a step of an 8-bit image is 500 Pa
 
 
 def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[str, float]:

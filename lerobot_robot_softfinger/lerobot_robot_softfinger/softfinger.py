@@ -19,8 +19,8 @@ class Softfinger(Robot):
     """LeRobot `Robot` implementation for the softfinger hand.
 
     Connecting does not switch on the torque or move the hand. The first action arms the hand. If
-    the hand is disarmed or enters a fault state later, the next action does not arm it again and
-    raises Refused.
+    the hand is later disarmed or enters a fault state, the next action raises Refused and does not
+    arm the hand.
     """
 
     config_class = SoftfingerConfig
@@ -51,7 +51,7 @@ class Softfinger(Robot):
     def connect(self, calibrate: bool = True) -> None:
         """Connect to the daemon.
 
-        Raises NoStream or NoAnswer if the daemon is not running, and ValueError if the grid size
+        Raises NoStream or NoAnswer if the daemon is not running. Raises ValueError if the grid size
         differs from the settings.
         """
         config = self.config
@@ -94,7 +94,7 @@ class Softfinger(Robot):
 
     @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:
-        """Wait for the next state and return it with each finger's latest frame."""
+        """Wait for the next state; return the state and each finger's latest frame."""
         state = self._hand.state()
         with contextlib.suppress(NoStream):
             while True:

@@ -1,6 +1,6 @@
 """Compute the linear model of a solid tip: ``python -m research.solid_tip``.
 
-The result is the input file for `strain`. The notes in the file written by `strain` describe the
+The result is the input file for `strain`. The notes in the file that `strain` writes describe the
 format.
 """
 
@@ -29,7 +29,7 @@ HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are used for validation on
 
 
 def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
-    """Compute the presses of one block, mesh and ν over the whole domain, cached in ``folder``."""
+    """Compute all presses of one block, mesh and ν, or load the presses from ``folder``."""
     block, rings, poisson = which
     base, sticking = block.removesuffix(STICKING), block.endswith(STICKING)
     file = folder / f"{block}-{rings}-{poisson:.6f}.npz"
@@ -46,7 +46,7 @@ def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
 
 
 def differences(tip: SolidTip, samples: fit.Samples) -> str:
-    """Return the errors in N, U and p relative to presses, for three depth ranges."""
+    """Describe the errors in N, U and p relative to ``samples`` for three depth ranges."""
     areas = np.sqrt(np.diff(tip.edges**2))
     rows = []
     for d, theta, push, energy, _, base in zip(*samples, strict=True):
@@ -62,7 +62,7 @@ def differences(tip: SolidTip, samples: fit.Samples) -> str:
 
 
 def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float]:
-    """Return the maximum relative differences between two files: of N and of a sensor frame."""
+    """Return the maximum relative differences between two models in N and in a sensor frame."""
     force, pressure = [], []
     for poisson in (*fit.NU, 0.49):
         tip, second = SolidTip(arrays, block, poisson), SolidTip(other, block, poisson)
@@ -76,7 +76,7 @@ def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float
 
 
 def main() -> None:
-    """Compute the presses, fit the model, write the file and print its errors."""
+    """Compute the presses, fit the model, write the file and print the model's errors."""
     parser = argparse.ArgumentParser(prog="python -m research.solid_tip", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write, .npz")
     parser.add_argument("--rings", type=int, default=64, help="number of elements along the arc")

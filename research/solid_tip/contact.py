@@ -1,14 +1,14 @@
-"""Contact of a rigid plane with the hemisphere, as a linear complementarity problem.
+"""Solve contact of a rigid plane with the hemisphere as a linear complementarity problem.
 
-Without friction, each surface cell has one unknown: the force q ≥ 0 along the plane's normal
-n = (sin θ, 0, cos θ). The same force acts on the cell's mirror image at −y. The cells move by C q,
-where C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Contact therefore
-requires q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
+Without friction, each surface cell has one unknown force q ≥ 0 along the plane's normal n = (sin θ,
+0, cos θ). The same force acts on the cell's mirror image at −y. The cells move by C q, where C is
+the compliance. The plane overlaps a cell at X by δ = X·n − (a − d). Contact therefore requires q ≥
+0, C q − δ ≥ 0 and q·(C q − δ) = 0.
 
 On a sticking face, two additional forces along the plane hold each cell at the position where the
-cell first touched the plane. The result then depends on the path. The plane moves straight along n,
-so the held points do not move along the plane and the tangential forces do no work. Therefore N =
-∂U/∂d holds, as it does without friction.
+cell first touched the plane. With sticking, the result depends on the plane's path. The plane moves
+straight along n. The held points therefore do not move along the plane, and the tangential forces
+do no work. N = ∂U/∂d therefore holds with and without friction.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from research.solid_tip.green import FloatArray, Green
 
-# Cells may be in contact up to this distance outside the undeformed overlap (in units of a).
+# Maximum distance of contact cells from the undeformed overlap [a].
 BEYOND = 0.06
 
 
@@ -52,7 +52,7 @@ class TiltedPlane:
             height = r * np.cos(phi) * sine + z * cosine
             near = height > 1 - d_max - BEYOND
             phi, half = phi[near, None], cells // 2
-            # Axes in cylindrical components, for the harmonics that the ring's cells can resolve.
+            # Convert the axes to cylindrical components of each harmonic.
             x, y, upright = axes.T
             load = np.stack(
                 np.broadcast_arrays(
@@ -88,7 +88,7 @@ class TiltedPlane:
         self.depth = 0.0
 
     def press(self, d: float) -> Press:
-        """Solve at depth ``d``, starting from the cells in contact in the last press.
+        """Solve at depth ``d``, starting from the contact cells of the last press.
 
         With a sticking face, the result depends on the path, so increase the depth in small steps.
         A cell that comes into contact during a step sticks at an interpolated position. Raises

@@ -1,10 +1,10 @@
-"""Fit the file's data to presses: a polynomial for the energy, modes for the base pressure.
+"""Fit a polynomial to the energies of presses, and modes to the base pressures.
 
-The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so
-N = ∂U/∂d holds exactly. For each harmonic, a singular value decomposition of the base pressure
-divided by N gives the modes. The mode amplitudes are also polynomials. All polynomials are
-Chebyshev series in s = √(d/a), sin²θ and ν. The notes in the file describe the layout of the
-coefficients. `SolidTip` reads the file using only NumPy.
+One polynomial for U/U_Hertz is fitted to energies and normal forces together, so N = ∂U/∂d holds
+exactly. For each harmonic, the modes are the singular vectors of the base pressure divided by N.
+The mode amplitudes are also polynomials. All polynomials are Chebyshev series in s = √(d/a), sin²θ
+and ν. The notes in the file describe the layout of the coefficients. `SolidTip` needs only NumPy to
+read the file.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ NU = (0.45, 0.4995)
 S_MAX = np.sqrt(D_MAX)
 ORDERS = (11, 6)  # number of coefficients in s, and in sin²θ
 HARMONICS = 9
-# Cells beyond this radius are down-weighted, because a bonded tip has a stress singularity at the
-# rim, and the base of a tip that is not bonded ends at the rim.
+# Cells beyond this radius are down-weighted. A bonded tip has a stress singularity at the rim, and
+# the base of a lying tip ends at the rim.
 RIM = 0.95
 
 
@@ -48,7 +48,7 @@ class Samples(NamedTuple):
 
     @classmethod
     def of(cls, presses: list[Press], base_radius: FloatArray) -> Samples:
-        """Collect ``presses``, whose base pressure is given at the nodes ``base_radius``."""
+        """Collect ``presses``; ``base_radius`` contains the radii of the base nodes."""
         rings = ring_means(base_radius)
         d, theta, push, energy, shear = (
             np.array([getattr(each, name) for each in presses])
@@ -78,7 +78,7 @@ def ring_means(base_radius: FloatArray) -> FloatArray:
 def terms(
     s: FloatArray, theta: FloatArray, orders: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the products T_i T_j at each point, (n, I·J), and their derivatives in s."""
+    """Return the products T_i T_j at each point, shape (n, I·J), and their derivatives in s."""
     x, w = 2 * s / S_MAX - 1, 2 * (np.sin(theta) / np.sin(THETA_MAX)) ** 2 - 1
     first, second = chebyshev.chebvander(x, orders[0] - 1), chebyshev.chebvander(w, orders[1] - 1)
     slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(orders[0]))).T * (2 / S_MAX)
@@ -170,7 +170,7 @@ def fit(
 
 
 class SolidTip:
-    """Solid tip from one block of the file at one ν, for E = a = 1."""
+    """Solid tip with E = a = 1 at one ν, from one block of the data file."""
 
     def __init__(
         self, arrays: Mapping[str, NDArray[np.generic]], block: str, poisson: float
@@ -204,14 +204,14 @@ class SolidTip:
         return push, energy, pressure
 
     def shear(self, d: float, theta: float) -> float:
-        """Return T/N of a sticking face; T is the force on the tip along (cos θ, 0, −sin θ)."""
+        """Return T/N for a sticking face; T is the force on the tip along (cos θ, 0, −sin θ)."""
         x = 2 * np.sqrt(d) / self.s_max - 1
         w = 2 * (np.sin(theta) / np.sin(self.theta_max)) ** 2 - 1
         stick = float(chebyshev.chebval2d(x, w, self.coef[0]))
         return stick * float(np.sin(theta) * np.cos(theta))
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
-        """Average the pressure over cells of a square grid centred under the tip (rows along y)."""
+        """Average the pressure over the cells of a square grid under the tip, with rows along y."""
         parts, turns = 10, 2000  # numbers of radial and angular pieces per ring
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,

@@ -1,12 +1,12 @@
-"""Surface Green's functions of the hemisphere: response of its rings and base to ring loads.
+"""Compute the response of a hemisphere's rings and base to ring loads (Green's functions).
 
-A ring is one element of the arc. The load is a traction that is constant along the ring's arc and
-has harmonic m around the axis. The response consists of the mean displacement of every ring and the
-pressure on the base.
+Each ring is one element along the meridian arc. The load is a traction that is constant along the
+ring's arc and has harmonic m around the axis. The response consists of the mean displacement of
+every ring and the pressure on the base.
 
 The functions are computed with finite elements of the linear elastic hemisphere, one Fourier
-harmonic at a time. A displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ), where U, V and W
-are defined on the meridian plane (r, z), a quarter disc. The elements are quadrilaterals with nine
+harmonic at a time. A displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ). U, V and W are
+functions on a quarter disc in the meridian plane (r, z). The elements are quadrilaterals with nine
 nodes. The volumetric strain is projected onto linear functions in each element (the Q2/P1 pair with
 the discontinuous pressure eliminated). This projection avoids locking as ν approaches ½.
 """
@@ -34,7 +34,7 @@ GAUSS = np.polynomial.legendre.leggauss(3)
 
 
 def quadratic(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the quadratic shape functions on [−1, 1] at ``x``, and their derivatives, (n, 3)."""
+    """Return the quadratic shape functions on [−1, 1] and their derivatives at ``x``, (n, 3)."""
     values = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
     return values, np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
 
@@ -100,8 +100,8 @@ class Meridian:
         """Return the stiffness matrix of harmonic ``m`` for E = 1.
 
         The degrees of freedom U, V and W of node k have the indices 3k, 3k + 1 and 3k + 2. The
-        energy is integrated only over r and z; the factor π (2π for m = 0) is omitted here and in
-        the loads.
+        energy is integrated only over r and z. The matrix and the loads omit the factor π (2π for m
+        = 0).
         """
         shear, lame = 0.5 / (1 + poisson), poisson / ((1 + poisson) * (1 - 2 * poisson))
         shape, gradient, r, weight = self._geometry
@@ -140,18 +140,18 @@ CAP = 0.2  # polar angle of the cap on which the shear force acts [rad]
 
 
 class Green(NamedTuple):
-    """Response of rings and base, with components (r, φ, z); rings start at the pole."""
+    """Green's functions of rings and base, with components (r, φ, z); ring 0 is at the pole."""
 
     place: FloatArray  # mean r and z of each ring [a], shape (R, 2)
     weight: FloatArray  # ∫ r ds of each ring [a²], shape (R,)
-    cells: IntArray  # number of cells around each ring, even, shape (R,)
+    cells: IntArray  # even number of cells around each ring, shape (R,)
     rings: FloatArray  # weight × mean displacement for unit traction, shape (M + 1, 3, R, 3, R)
     base_radius: FloatArray  # radii of the base nodes [a], shape (B,)
     base: FloatArray  # base pressure at these nodes for unit traction, shape (H, B, 3, R)
 
 
 def arc_loads(mesh: Meridian) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return position (R, 2), ∫ r ds (R,), nodal weights ∫ N r ds (R, 3) and angle of each ring."""
+    """Return each ring's position (R, 2), ∫ r ds (R,), nodal weights ∫ N r ds (R, 3) and angle."""
     points, gauss = GAUSS
     value, slope = quadratic(points)
     arc = mesh.number[-1]
@@ -165,7 +165,7 @@ def arc_loads(mesh: Meridian) -> tuple[FloatArray, FloatArray, FloatArray, Float
 
 
 def base_mass(radius: FloatArray) -> sparse.csc_matrix:
-    """Return ∫ N N r dr of the quadratic base elements, whose nodes are at ``radius``."""
+    """Return the mass matrix ∫ N N r dr of quadratic base elements with nodes at ``radius``."""
     points, gauss = GAUSS
     value, slope = quadratic(points)
     rows, columns, entries = [], [], []
@@ -181,7 +181,7 @@ def base_mass(radius: FloatArray) -> sparse.csc_matrix:
 
 
 def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
-    """Return the fixed degrees of freedom: base, axis and, for symmetric loads, the twist."""
+    """Return the fixed degrees of freedom: base, axis and, for axisymmetric loads, the twist."""
     base = 3 * mesh.base[:, None] + (np.arange(3) if bonded else np.array([2]))
     axis = 3 * mesh.axis[:, None] + {0: [0, 1], 1: [2]}.get(m, [0, 1, 2])
     twist = 3 * np.arange(len(mesh.nodes) if m == 0 else 0) + 1
@@ -189,9 +189,9 @@ def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
 
 
 def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
-    """Return the stiff springs that constrain harmonic 1.
+    """Return the stiffness matrix of the springs that constrain harmonic 1.
 
-    They enforce U + V = 0 on the axis and prevent a lying base from moving as a whole.
+    The springs enforce U + V = 0 on the axis and prevent a lying base from moving as a whole.
     """
     if m != 1:
         return 0.0
@@ -212,7 +212,7 @@ def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
 
 
 def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) -> Green:
-    """Compute the Green's functions for ``rings`` elements along the arc, using square cells."""
+    """Compute the Green's functions for ``rings`` elements along the arc, with square cells."""
     mesh = Meridian(rings)
     place, weight, nodal, angle = arc_loads(mesh)
     count = int(np.sum(angle < CONTACT_END))
@@ -234,7 +234,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
         factors = splu(
             held, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
-        loads = np.zeros((size, 3 * active.size))  # sorted by component, then by ring
+        loads = np.zeros((size, 3 * active.size))  # columns sorted by component, then by ring
         for k, ring in enumerate(active):
             for c in range(3):
                 loads[3 * arc[2 * ring : 2 * ring + 3] + c, c * active.size + k] = nodal[ring]

@@ -1,15 +1,15 @@
-"""Neo-Hookean finite elements of the hemisphere under a rigid plane, in the deformed configuration.
+"""Compute large deformations of a neo-Hookean hemisphere under a rigid plane (finite elements).
 
 The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and κ = E/(3 −
-6ν), where E and ν are the small-strain values. Elements have 27 nodes. In the volumetric part, J −
-1 is projected onto linear functions in each element (mean dilatation to first order). This
-projection avoids locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a
-tilted plane, the mesh covers half a turn, with the symmetry plane y = 0. For an upright plane, the
-mesh is one thin wedge, and all nodes at the same r and z have the same motion.
+6ν). E and ν are the small-strain values. Elements have 27 nodes. In the volumetric part, J − 1 is
+projected onto linear functions in each element (mean dilatation to first order). This projection
+avoids locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a tilted
+plane, the mesh covers half a turn, with the symmetry plane y = 0. For an upright plane, the mesh is
+one thin wedge, and all nodes at the same r and z have the same motion.
 
-Contact occurs between the plane and nodes. An active node lies in the plane and transmits a normal
-force. An active node moves freely along the plane unless the face is sticking. Each Newton step
-also updates the active set. The linear solver is pypardiso.
+Contact is modelled at the nodes. An active node lies in the plane and transmits a normal force.
+Unless the face is sticking, an active node moves freely along the plane. Each Newton step also
+updates the set of active nodes. The linear solver is pypardiso.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Strained(NamedTuple):
 
     d: float
     push: float  # normal force N
-    shear: float  # force against the tip along (cos θ, 0, −sin θ)
+    shear: float  # force on the tip along (cos θ, 0, −sin θ)
     energy: float
     base: FloatArray  # harmonics of the base pressure as a function of the radius, shape (H, R)
 
@@ -61,12 +61,12 @@ class State(NamedTuple):
 
     depth: float
     motion: FloatArray  # displacement of each degree of freedom
-    touching: NDArray[np.bool_]  # contact state of the face nodes
+    touching: NDArray[np.bool_]  # True for each face node in contact
     held: FloatArray  # positions of the sticking nodes along the plane
 
 
 class Body:
-    """Meshed tip at one ν for a plane at ``theta`` [rad]; None means upright and axisymmetric."""
+    """Meshed tip at one ν for a plane at ``theta`` [rad]; axisymmetric if ``theta`` is None."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class Body:
         self._revolve(mesh, phis)
         gradient = self._geometry()
         turns = self._free_nodes(bonded) if whole else self._axisymmetric(mesh, bonded)
-        # Matrix from the element's degrees of freedom to the displacement gradient at the
+        # This matrix converts an element's degrees of freedom to displacement gradients at the
         # quadrature points.
         size = self.places.shape[1]
         self.strain = np.zeros((len(self.elements), 243, size))
@@ -114,7 +114,7 @@ class Body:
             self.moves = self.solve(rest, loads, known)
 
     def _revolve(self, mesh: Meridian, phis: FloatArray) -> None:
-        """Create the nodes and elements of ``mesh`` at every angle; axis nodes are shared."""
+        """Create nodes and elements by revolving ``mesh`` to ``phis``; axis nodes are shared."""
         count = len(mesh.nodes)
         on_axis = mesh.nodes[:, 0] < 1e-12
         number = np.zeros((count, phis.size), dtype=np.int64)
@@ -145,7 +145,7 @@ class Body:
         self.lines = number[mesh.base].T  # base nodes from the centre to the rim
 
     def _geometry(self) -> FloatArray:
-        """Set weights and linear functions; return shape function gradients (e, q, 27, 3)."""
+        """Set weights and linear functions; return the shape functions' gradients (e, q, 27, 3)."""
         points, gauss = GAUSS
         value, slope = quadratic(points)
 
@@ -218,7 +218,7 @@ class Body:
         return turns
 
     def _sparsity(self) -> None:
-        """Set the sparsity pattern of the tangent's upper triangle, and its entries' positions."""
+        """Set the sparsity pattern of the tangent's upper triangle, and the entries' positions."""
         size = self.places.shape[1]
         row, column = np.repeat(self.places, size, 1).ravel(), np.tile(self.places, size).ravel()
         self.upper = np.flatnonzero(row <= column)
@@ -238,12 +238,12 @@ class Body:
         self.analysed = False
 
     def _strain(self, part: slice, motion: FloatArray) -> FloatArray:
-        """Return the displacement gradient (e, q, 3, 3) at the points of some elements."""
+        """Return the displacement gradient (e, q, 3, 3) at the points of the elements ``part``."""
         moved = self.strain[part] @ motion[self.places[part]][..., None]
         return np.asarray(moved.reshape(-1, 27, 3, 3))
 
     def pressures(self, motion: FloatArray, change: FloatArray) -> FloatArray:
-        """Return p as linear functions, with a first-order update for ``change`` in the motion."""
+        """Return the pressure coefficients (e, 4), updated to first order for ``change``."""
         moved = self._strain(slice(None), motion)
         more = self._strain(slice(None), change)
         f = moved + np.eye(3)
@@ -258,11 +258,11 @@ class Body:
     def forces(
         self, motion: FloatArray, pressures: FloatArray | None = None
     ) -> tuple[float, FloatArray, FloatArray | None]:
-        """Return the energy, the dof forces and, if ``pressures`` are given, the upper tangent.
+        """Return the energy, the dof forces and, given ``pressures``, the tangent's upper triangle.
 
-        ``pressures`` are the coefficients (e, 4) of each element's linear functions, updated as in
-        the Newton steps of a mixed method. If each step recomputed the pressures, the second-order
-        volume change, multiplied by κ, would distort the next tangent.
+        ``pressures`` are the coefficients (e, 4) of each element's linear functions. Each Newton
+        step updates the coefficients, as in a mixed method. Recomputed pressures would contain κ
+        times the second-order volume change and would distort the next tangent.
         """
         if self.at_rest is not None:
             out = self.times_tangent(self.at_rest, motion)
@@ -322,7 +322,7 @@ class Body:
         return stress, density, four, swell
 
     def solve(self, numbers: FloatArray, right: FloatArray, known: FloatArray) -> FloatArray:
-        """Solve for the dofs under forces ``right``; ``known`` has the given dofs, or NaN."""
+        """Solve for the dofs under forces ``right``; ``known`` prescribes dofs that are not NaN."""
         if self.moves is not None:
             return self._solve_at_rest(right, known)
         given = ~np.isnan(known)
@@ -339,9 +339,9 @@ class Body:
         return np.asarray(found).squeeze()
 
     def _solve_at_rest(self, right: FloatArray, known: FloatArray) -> FloatArray:
-        """Solve for linear elements as in `solve`, using the response to forces on the face."""
+        """Solve as `solve` does, but for linear elements and from the response to face forces."""
         assert self.moves is not None
-        # From the start, all forces except those on the face are in equilibrium.
+        # Initially, all forces except those on the face are in equilibrium.
         given = ~np.isnan(known[self.pushed])
         load = right[self.pushed]
         if given.any():
@@ -416,7 +416,7 @@ class Body:
             reaction = (forces + self.times_tangent(numbers, change))[self.normal]
             gap = motion[self.normal] - target
             now = np.where(touching, reaction < 0, gap > 1e-10)
-            if attempt > 15:  # Keep alternating nodes active after 15 attempts.
+            if attempt > 15:  # After 15 attempts, keep alternating nodes active.
                 now |= touching
             still = np.abs(change).max() < 1e-6 and size == 1.0
             if still and (now == touching).all():
@@ -430,7 +430,7 @@ class Body:
         raise RuntimeError(f"no contact found at d = {d} a, θ = {self.theta} rad")
 
     def base_pressure(self, motion: FloatArray, forces: FloatArray) -> FloatArray:
-        """Return cosine harmonics of the base pressure at `MIDDLES`, in the deformed position."""
+        """Return the cosine harmonics of the deformed base's pressure at the radii `MIDDLES`."""
         place = self.nodes.copy()
         if self.at_rest is not None:  # The elements are linear.
             motion = 0 * motion
@@ -469,7 +469,7 @@ class Body:
         return np.asarray(np.where(m == 0, 1.0, 2.0) / AZIMUTHS * (np.cos(m * phi) @ at))
 
     def _between(self) -> FloatArray:
-        """Return the interpolation from the node lines to four times as many azimuths."""
+        """Return the matrix that interpolates from node lines to four times as many azimuths."""
         count = len(self.lines)
         local = np.linspace(0, count - 1, 4 * (count - 1) + 1)
         first = 2 * np.minimum(local // 2, count // 2 - 1).astype(int)
@@ -498,7 +498,7 @@ class Body:
 def strained(
     block: str, poisson: float, theta: float | None, mesh: Meridian, file: Path
 ) -> dict[str, FloatArray]:
-    """Return linear and nonlinear presses as arrays (2, n, …), linear first; cached in ``file``."""
+    """Return arrays (2, n, …) of linear and nonlinear presses, cached in ``file``."""
     if not file.exists():
         base, sticking = block.removesuffix("-sticking"), block.endswith("-sticking")
         found = []

@@ -1,12 +1,13 @@
 """Add the effect of finite strain to the linear model of a solid tip.
 
-``python -m research.solid_tip.strain LINEAR OUT --folder FOLDER`` reads the linear model from the
-file written by ``python -m research.solid_tip`` and writes the neo-Hookean model in the same
-format. To obtain the effect of finite strain, the linear and neo-Hookean elements of `rubber` are
-compared on the same mesh, so the mesh error cancels. The ratio of the two energies scales the
-energy of the linear model. The difference between the two base pressures, relative to the normal
-force, is added to the base pressure of the linear model. Upright presses use a fine mesh. Tilted
-presses use a coarse mesh and are compared with upright presses on that mesh.
+``python -m research.solid_tip.strain LINEAR OUT --folder FOLDER`` reads the linear model, which
+``python -m research.solid_tip`` has written. The command then writes the neo-Hookean model in the
+same format. The effect of finite strain is computed by comparing linear and neo-Hookean elements of
+`rubber`. The two kinds of elements use the same mesh, so the mesh error cancels. The ratio of the
+two energies scales the energy of the linear model. Each base pressure is divided by the normal
+force, and the difference between the two results is added to the base pressure of the linear model.
+Upright presses use a fine mesh. Tilted presses use a coarse mesh and are compared with upright
+presses on that mesh.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from research.solid_tip.rubber import HARMONICS, strained
 NU = fit.chebyshev_nodes(*fit.NU, 3)
 SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
 AREAS = np.pi * np.diff(RING_EDGES**2)
-# Tilts computed for each block, as a map from indices of `SINES` to values of ν. At the largest
-# depth and tilt, the elements of lying rubber collapse and the solution does not converge, so the
-# fit extrapolates there.
+# For each block, this map contains the indices of `SINES` of the computed tilts, and the values of
+# ν. At the largest depth and tilt, the elements of lying rubber collapse, and the solution does not
+# converge. The fit therefore extrapolates there.
 TILTS = {
     "bonded": {1: NU[1:2], 2: NU[1:2], 4: NU[1:2]},
     "lying": {1: NU[1:2], 2: NU[1:2]},

@@ -74,7 +74,7 @@ def by_law(observation: Observation) -> NDArray[np.float32]:
     """Return the action that commands the target force and, in ``rotate``, the goal angle."""
     least, most = FORCES
     goal = float(observation["goal"][0])
-    angle = goal / ANGLE if abs(goal) < ANGLE else 0.0  # A goal above this limit is a force in N.
+    angle = goal / ANGLE if abs(goal) < ANGLE else 0.0  # A larger goal is a force [N].
     return np.array([2.0 * (FORCE - least) / (most - least) - 1.0, angle], np.float32)
 
 

@@ -28,7 +28,7 @@ from softfinger.tools.sweep import Sweep, add_sweep
 SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, and episodes per sample
 STEPS = 200
 FEATURES = 5
-# Scale of the weights. An action of 1 is fast (1 rad/s), so small weights keep the joints slow.
+# Scale of the weights. An action of 1 means 1 rad/s, so small weights keep the joints slow.
 _WEIGHT_SCALE = 0.2
 _ADDED_STD = 0.2  # increase in standard deviation that avoids premature convergence
 
@@ -52,7 +52,7 @@ def policy(weights: Weights) -> Policy:
 
 
 def returns(seed: int, shaped: bool, weights: Weights) -> float:
-    """Compute the mean return over EPISODES episodes with consecutive seeds from ``seed``."""
+    """Compute the mean return of EPISODES episodes, whose seeds start at ``seed``."""
     env = SoftFingerEnv("grasp", shaped=shaped)
     limited = gymnasium.wrappers.TimeLimit(env, STEPS)
     try:
@@ -86,7 +86,7 @@ def learn(
 
 
 def draw(curve: list[float], path: Path) -> None:
-    """Plot the returns versus the generations to ``path``.
+    """Save a plot of the return versus the generation to ``path``.
 
     Raises MissingExtra if matplotlib is not installed, and OSError if the file cannot be written.
     """

@@ -84,10 +84,12 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     - ``pressure`` [2, rows, cols]: the latest frames, uint16 counts,
     - ``goal`` [1]: target in N, or in rad for ``rotate``.
 
-    An episode terminates when the object is lost or the hand is in a fault state. ``info`` holds
-    ``truth`` (the object's x, y [m] and angle [rad]), ``fault``, ``refused`` (the reason why the
-    daemon refused a command, or an empty string) and ``is_success`` (True if the error is within
-    the reward's scale of 1 N, 0.05 rad or 2 mm).
+    An episode terminates when the object is lost or the hand is in a fault state. ``info`` contains
+
+    - ``truth``: the object's x, y [m] and angle [rad],
+    - ``fault``: the daemon's fault, or an empty string,
+    - ``refused``: the reason why the daemon refused a command, or an empty string,
+    - ``is_success``: True if the error is below the reward's scale of 1 N, 0.05 rad or 2 mm.
 
     References
     ----------
@@ -257,7 +259,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return math.exp(-off)
 
     def _closed(self) -> float:
-        """Return the shaping potential: the progress of both joint angles and both tip forces."""
+        """Return the shaping potential, which measures progress in joint angles and tip forces."""
         q, most = self._loop.state.reading.q, self._settings.hand.q_max
         force = sum(min(float(each) / FORCE, 1.0) for each in self._hand.force)
         return 5.0 * (q[0] / most[0] + q[1] / most[1] + force)

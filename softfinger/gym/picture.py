@@ -1,8 +1,8 @@
-"""Draw the simulated hand and its pressure maps as an RGB image with NumPy, and display the image.
+"""Draw the simulated hand and its pressure maps as an RGB image, and display the image.
 
-The scene contains the same lines as the `softfinger view` page: the fingers with their tips, the
-estimated object in green and the true object in grey. The pressure maps are next to the scene, with
-the left finger's map above the right finger's map.
+The scene contains the same lines as the `softfinger view` page. The estimated object is green, and
+the true object is grey. The pressure maps are next to the scene, with the left finger's map above
+the right finger's map.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Test kit for programs that control a hand or Dynamixel servos.
 
 The pytest fixtures `emulated_hand`, `virtual_hand` and `recorded_hand` are available in all test
-runs if softfinger is installed. The fixtures return objects of this package's classes, which also
-work as context managers without pytest. The conformance checks are intended for authors of backend
-plugins. Each name is imported on first access, so that other test runs do not load Numba.
+runs if softfinger is installed. The fixtures return objects of this package's classes. The classes
+also work as context managers without pytest. The conformance checks are intended for authors of
+backend plugins. Each name is imported on first access, so that other test runs do not load Numba.
 """
 
 from __future__ import annotations

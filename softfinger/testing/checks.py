@@ -2,7 +2,7 @@
 
 Each check takes the settings of a profile that uses the backend, for example
 ``check_tactile(load(Path("profile.toml")))``. The check creates the backend in the same way as the
-daemon. If the check fails, it raises AssertionError with the value found and the value expected.
+daemon does. A failed check raises AssertionError with the found and expected values.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) 
     for name in settings.scene.fingers:
         sensor = make_sensor(settings, clock, None, FINGERS.index(name))
         assert sensor is not None, "tactile.backend: found none, expected a board"
-        for _ in range(2):  # The daemon reopens a board after its port was lost.
+        for _ in range(2):  # The daemon reopens a board whose port was lost.
             sensor.open()
             try:
                 _check_frames(settings, sensor, frames, time.monotonic() + patience)
@@ -74,11 +74,11 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
 
 
 def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0) -> None:
-    """Connect to the servos twice and read them.
+    """Connect to the servos twice, and read the servos each time.
 
-    If ``torque`` is True, the torque is also switched on at the current position and off again.
-    While torque is on, the joints must not move by more than 0.05 rad. ``patience`` [s] limits each
-    waiting time.
+    If ``torque`` is True, the check also switches the torque on at the current position, and then
+    off. While torque is on, the joints must not move by more than 0.05 rad. ``patience`` [s] limits
+    each waiting time.
     """
     servos = make_servos(settings, make_clock(settings), None)
     assert servos is not None, "servos.backend: found none, expected servos"
@@ -127,7 +127,7 @@ def _check_counters(backend: Servos | TactileSensor) -> None:
 
 
 def check_shape(settings: Settings) -> None:
-    """Create the object's shape and compare its properties with values from its corners."""
+    """Check the properties of the object's shape against values computed from its corners."""
     shape = shape_of(settings)
     assert isinstance(shape, Shape), f"found {type(shape).__name__}, expected a Shape"
     if shape.kind == DISC:

@@ -67,8 +67,8 @@ class EmulatedHand:
     def send(self, words: str) -> str:
         """Send requests or faults in the same way as `softfinger emulate --send`; return the reply.
 
-        For example, ``"place"`` puts the object back, and ``"press depth=3mm"`` presses a plate
-        onto the tips and waits until the plate has arrived. Raises Refused if a word is unknown.
+        For example, ``"place"`` puts the object back. ``"press depth=3mm"`` presses a plate onto
+        the tips and waits until the plate has arrived. Raises Refused if a word is unknown.
         """
         return carry_out(self.folder, words)
 
@@ -82,8 +82,8 @@ class EmulatedHand:
     def report(self, forget: bool = False) -> dict[str, Any]:
         """Return the traffic on the servo bus and the true state of the hand.
 
-        `softfinger help emulate` lists the fields. If ``forget`` is True, the record is then
-        cleared.
+        `softfinger help emulate` lists the fields. If ``forget`` is True, the recorded traffic is
+        then cleared.
         """
         report: dict[str, Any] = json.loads(self.send("report forget" if forget else "report"))
         return report
@@ -110,7 +110,7 @@ def free_servos(
     t: float = 0.0,
     **options: Any,
 ) -> ServoBus:
-    """Create factory-new servos on free joints at the positions ``counts``, at time ``t`` [s].
+    """Create factory-new servos on free joints at time ``t`` [s]; ``counts`` are the positions.
 
     If ``for_daemon`` is True, the servos have the return delay and the mode that `softfinger run`
     expects.
@@ -173,14 +173,15 @@ class EmulatedBus:
         return self._terminal.path
 
     def call(self, job: Callable[[], Any]) -> Any:
-        """Run ``job`` between two packets and return its result."""
+        """Run ``job`` between two packets on the bus, and return the result."""
         with self._between_packets:
             return job()
 
     def fault(self, *words: str) -> None:
         """Start faults such as ``"silent=2"`` or ``"drop=0.1"``; ``"well"`` ends all faults.
 
-        Raises FaultError for unknown words, and for faults that require a hand or start later.
+        Raises FaultError for unknown words, and for faults that require a hand or have a start
+        time.
         """
         events = parse_faults(words, tuple(servo.id for servo in self.bus.servos))
         for event in events:
@@ -216,7 +217,7 @@ class EmulatedBus:
                 self._terminal.service(self.now())
 
     def now(self) -> float:
-        """Return the servo time [s], i.e. real time without long stalls of this process."""
+        """Return the servos' time [s], which is real time without long stalls of this process."""
         seen, self._seen = self._seen, time.monotonic()
         self._origin += max(self._seen - seen - _STALL, 0.0)
         return self._seen - self._origin

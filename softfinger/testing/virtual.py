@@ -42,11 +42,11 @@ _EVERYTHING = -1  # bit mask of all topics
 
 
 class RecordingOver(NoStream):
-    """The end of the recording has been reached."""
+    """Error raised at the end of the recording."""
 
 
 class Tap(Link):
-    """Link that also passes published messages to ``take`` and transmits its owner's requests."""
+    """Link that also passes published messages to ``take``, and queues its owner's requests."""
 
     def __init__(self, take: Callable[[bytes, dict[str, Any]], None]) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class Tap(Link):
         self.answer: dict[str, Any] = {}  # reply to the owner's last request
 
     def request(self, request: dict[str, Any], t: float) -> None:
-        """Add a request that arrives at time ``t`` [s]; the next tick sets its `answer`."""
+        """Add a request that arrives at time ``t`` [s]; the next tick sets `answer`."""
         urgent = request["command"] == "stop"
         self.asked.append(Ask(t, self.stops, urgent, "", [_OWN], msgpack.packb(request)))
 
@@ -160,7 +160,7 @@ class VirtualTimeHand(Hand):
         raise NotImplementedError
 
     def run(self, seconds: float, controller: Controller | None = None) -> list[Refused]:
-        """Advance by ``seconds`` under the control of ``controller``, if given.
+        """Advance by ``seconds``, and carry out the commands of ``controller``, if given.
 
         Parameters
         ----------
@@ -207,9 +207,8 @@ class VirtualTimeHand(Hand):
     def serve(self, speed: float = 1.0) -> Iterator[str]:
         """Serve clients over ZeroMQ; the context manager returns `address`.
 
-        During the context, a thread advances virtual time ``speed`` times as fast as real time, if
-        the machine is fast enough. Clients in this process are created with
-        ``Hand(hand.address)``.
+        A thread advances virtual time ``speed`` times as fast as real time, or more slowly if the
+        machine is slow. Clients in this process are created with ``Hand(hand.address)``.
         """
         config = Config(self.stream_address, self.command_address, GATEWAY_TOPICS, _QUEUE)
         over = threading.Event()
@@ -220,7 +219,7 @@ class VirtualTimeHand(Hand):
                 while not over.is_set():
                     self._step()
                     due = begin + (self.t - first) / speed
-                    # If the machine is late, the hand pauses.
+                    # If the machine is late, delay the schedule instead of catching up.
                     begin += max(time.monotonic() - due, 0.0)
                     over.wait(max(due - time.monotonic(), 0.0))
 
@@ -244,7 +243,7 @@ class VirtualTimeHand(Hand):
         return made
 
     def _select_topics(self) -> None:
-        """Collect the topics of the open subscriptions, or all topics while recording."""
+        """Select the topics of the open subscriptions, or all topics during a recording."""
         self._subscriptions = [each for each in self._subscriptions if each.is_open]
         self._link.tapped = 0 if self._writer is None else _EVERYTHING
         for each in self._subscriptions:
@@ -319,8 +318,8 @@ class VirtualHand(VirtualTimeHand):
     def fault(self, *words: str) -> None:
         """Start loads and measurement faults such as ``"push=3@0.5"`` or ``"left:gain=0.8"``.
 
-        `softfinger help emulate` lists all faults. Times are relative to this call. ``"well"`` ends
-        all faults.
+        `softfinger help emulate` lists all faults. Times of faults are relative to the time of this
+        call. ``"well"`` ends all faults.
 
         Raises
         ------
@@ -376,7 +375,7 @@ def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
 class RecordedHand(VirtualTimeHand):
     """Recording with the interface of a `Hand`, in virtual time; commands have no effect.
 
-    Iterating over a stream stops, and `run` returns, when the recording ends.
+    When the recording ends, iteration over a stream stops and `run` returns.
 
     Parameters
     ----------

@@ -1,12 +1,12 @@
-"""Grasp an object, rotate it to both sides and plot the recorded states.
+"""Grasp an object, rotate it in both directions and plot the recorded states.
 
 The script is divided into notebook cells. Start a daemon with ``softfinger run``. Then run the
-whole file,
+whole file with
 
     python -m softfinger.tools.examples.grasp_and_turn --picture grasp_and_turn.png
 
-or run the file cell by cell in an editor that supports ``# %%``. The script needs matplotlib (extra
-``plot``).
+Alternatively, run the cells one by one in an editor that supports ``# %%``. The script needs
+matplotlib (extra ``plot``).
 """
 
 # %% Settings: hand address, force and angles
@@ -28,7 +28,7 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--stream")
 parser.add_argument("--commands")
 parser.add_argument("--picture", default="grasp_and_turn.png")
-where = parser.parse_known_args()[0]  # Ignore the arguments of a notebook kernel.
+where = parser.parse_known_args()[0]  # Ignore the arguments that a notebook kernel adds.
 
 FORCE = 8.0  # N on each tip
 ANGLES = (12.0, -12.0, 0.0)  # successive object angles [degrees]
@@ -43,7 +43,7 @@ def settled(state: HandState) -> bool:
 recorded: list[HandState] = []
 with Hand(where.stream, where.commands) as hand:
     with hand.stream(hand.timeout) as states:
-        recorded.append(next(states))  # Wait for the stream before moving.
+        recorded.append(next(states))  # Wait for the first state before moving.
         try:
             hand.arm()
             hand.grasp(force=FORCE)
@@ -55,20 +55,20 @@ with Hand(where.stream, where.commands) as hand:
             end = hand.wait_for(lambda state: state.mode == "armed")
         finally:
             hand.stop()  # Switch torque off, even after an error.
-        for state in states:  # Read all states that have arrived so far.
+        for state in states:  # Record the remaining states up to `end`.
             recorded.append(state)
             if state.seq >= end.seq:
                 break
     print(f"{len(recorded)} states, {states.lost} lost")
 
-# %% Convert to columns, which `pandas.DataFrame(columns)` also accepts
+# %% Convert the states to columns, a form that `pandas.DataFrame(columns)` accepts
 columns = to_columns(recorded)
 t = (columns["mono_ns"] - columns["mono_ns"][0]) * 1e-9
 touching = {name: columns[f"{name}.contact"] for name in ("left", "right")}
 held = columns["mode"] == "holding"
 print(f"force while holding: {columns['left.force'][held].mean():.2f} N, commanded {FORCE:g} N")
 
-# %% Compute the energy landscape of the built-in hand's fingertip, and the minimum energy over θ
+# %% Compute the fingertip's energy landscape, and the angle of minimum energy at each depth
 tip, material = Fingertip(radius=0.020), Material.table_i()
 table = ContactTable.build(tip, material)
 deepest = 1.25 * max(columns[f"{name}.d"][touching[name]].max() for name in touching)

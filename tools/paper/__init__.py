@@ -1,5 +1,6 @@
-"""The `figures` and `validate` commands, which reproduce the paper's figures and published values.
+"""Implement the `figures` and `validate` commands.
 
-The sheets that a figure is drawn from are also written as CSV files. matplotlib is imported only
-when a figure is drawn.
+`figures` reproduces the paper's figures, and `validate` compares the model with published values.
+The data of each figure are also written as CSV files. matplotlib is imported only when a figure is
+drawn.
 """

@@ -1,9 +1,9 @@
-"""Draw Figs. 7, 10 and 11: model curves for the paper's two experiments and for its appendix.
+"""Draw model curves for the paper's two experiments and its appendix (Figs. 7, 10 and 11).
 
 The paper shows its measurements only as plots, so the measured points are not reproduced. The
 appendix splits U(d, 0) (eq. 12) into three terms. The terms are computed both by integration and
-from the printed equations. `terms` and `limits` use SI units and the paper's dimensions: eq. 16 is
-a length, eq. 18 is dimensionless, and eq. 19 is an inverse length.
+from the printed equations. The functions for the appendix use SI units. Eq. 16 is a length, eq. 18
+is dimensionless, and eq. 19 is an inverse length.
 """
 
 from __future__ import annotations
@@ -53,17 +53,17 @@ ROLLED = 9.2  # angle between finger and object after rolling by 20.7° [degrees
 
 
 def _force(d: Numbers, theta: Numbers) -> FloatArray:
-    """Return F [N] for the paper's constant modulus, with d in mm and θ in degrees."""
+    """Return F [N] for the paper's constant modulus; d is in mm and θ in degrees."""
     return closed_forms(MODULUS, d * MILLI, np.radians(theta)).force
 
 
 def _force_table_i(d: Numbers, theta: Numbers) -> FloatArray:
-    """Return F [N] for Table I's material law, with d in mm and θ in degrees."""
+    """Return F [N] for Table I's material law; d is in mm and θ in degrees."""
     return integrate(TIP, Material.table_i(), d * MILLI, np.radians(theta)).force
 
 
 def compression() -> tuple[Sheet, ...]:
-    """Tabulate force versus displacement at each angle, from the model and the sum of all cells."""
+    """Tabulate the model's force and the sum over the cells, versus displacement and angle."""
     material = Material.constant(MODULUS)
     d = np.arange(81) / 10.0
     columns = {"d [mm]": d}
@@ -106,11 +106,11 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return force and energy for a rotation of the finger about its root, followed by rolling.
+    """Return the force while the finger rotates about its root, and then while the object rolls.
 
-    For each final displacement D, the root is D/sin 11.5° away from the tip centre. During the
-    rotation, d therefore increases from first touch as D sin |θ|/sin 11.5°. During rolling, d is
-    constant at D.
+    For each final displacement D, the root is D/sin 11.5° away from the tip centre. The tip first
+    touches the object at θ = 0, so d = D sin |θ|/sin 11.5° during the rotation. During rolling, d
+    is constant and equals D.
     """
     tilting = -np.arange(0, 116) / 10.0
     rolling = np.arange(-115, 93) / 10.0
@@ -179,21 +179,21 @@ class Terms(NamedTuple):
         return first + second + third
 
     def terms(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the contribution [J] of each term to the energy in eq. 12."""
+        """Return each term's contribution [J] to the energy in eq. 12."""
         h = radius - d
         factor = 0.5 * modulus * h**2
         return factor * self.first, -2.0 * h * factor * self.second, h**2 * factor * self.third
 
 
 def limits(radius: float, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return θ_max and p [rad] (eqs. 15 and 17), i.e. the values of θ and t at the contact rim."""
+    """Return θ_max and p [rad], the values of θ and t at the contact rim (eqs. 15 and 17)."""
     h = radius - d
     theta_max = np.arctan(np.sqrt(radius**2 - h**2) / h)
     return theta_max, np.arccos(h / radius * np.tan(theta_max))
 
 
 def printed_terms(radius: float, d: FloatArray) -> Terms:
-    """Evaluate eqs. 16, 18 and 19 as printed, at d [m]."""
+    """Evaluate eqs. 16, 18 and 19 at ``d`` [m], as printed in the paper."""
     h2 = (radius - d) ** 2
     return Terms(
         2.0 * np.pi * d / (3.0 * h2) * (3.0 * radius**2 - 3.0 * radius * d + d**2),
@@ -203,13 +203,13 @@ def printed_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def integrated_terms(radius: float, d: FloatArray) -> Terms:
-    """Return the terms from Gauss quadrature, with a relative error ≤ 1e-12 up to d = 0.7 a."""
+    """Compute the terms by Gauss quadrature (relative error ≤ 1e-12 up to d = 0.7 a)."""
     d = np.asarray(d, dtype=np.float64)[..., None]
     h = radius - d
     points, weights = leggauss(_NODES)
     theta_max, _ = limits(radius, d)
     theta = 0.5 * theta_max * (points + 1.0)
-    # Include the factor 2π from the integration over φ.
+    # The integration over φ contributes a factor of 2π.
     area = np.pi * theta_max * weights * np.sin(theta) / np.cos(theta) ** 3
     root = np.sqrt(radius**2 - (h * np.tan(theta)) ** 2)
     return Terms(*(np.sum(area * each, axis=-1) for each in (root, 1.0, 1.0 / root)))

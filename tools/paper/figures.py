@@ -1,6 +1,6 @@
 """Run ``softfinger figures``: compute the paper's figures and write them as CSV and PNG.
 
-Figures affected by an erratum in the paper are marked.
+If an erratum in the paper affects a figure, the caption states the correction.
 """
 
 from __future__ import annotations

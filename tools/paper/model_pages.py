@@ -1,4 +1,4 @@
-"""Draw Figs. 3 to 5 and Table I: material law, and force and energy versus tilt and displacement.
+"""Draw the material law (Fig. 3 and Table I) and the force and energy curves (Figs. 4 and 5).
 
 In Figs. 4 and 5, lines show the closed forms. Markers show the paper's double integrals, evaluated
 numerically.
@@ -43,9 +43,9 @@ MODULUS = TABLE_I_MAXIMUM  # modulus used in the paper [Pa]
 MILLI = 1e-3
 MPA = 1e-6
 _NODES = 64  # number of Gauss nodes per double integral
-_STEEP_TILT = 25  # tilt at which the page states the slope [degrees]
-_FITTED = slice(10, None)  # rows for d = 1 mm to 8 mm, from which the exponents are fitted
-_STEP = 1e-4  # finite-difference step, relative or in rad
+_STEEP_TILT = 25  # tilt at which the figure states the slope [degrees]
+_FITTED = slice(10, None)  # rows used to fit the exponents (d from 1 to 8 mm)
+_STEP = 1e-4  # finite-difference step, relative for d and in rad for θ
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
 
@@ -87,7 +87,7 @@ def _stress(axes: Axes, curve: Sheet, _: Sheet) -> None:
 
 
 def _slope(axes: Axes, curve: Sheet, table: Sheet) -> None:
-    """Draw the slope of the law and the points in Table I, each labelled with its value."""
+    """Draw the material law's slope, and Table I's points labelled with their values."""
     axes.plot(curve["strain"], curve["modulus"], color=KINDS[0], label="slope of the law")
     measured = table["modulus in the paper"]
     axes.plot(table["strain"], measured, "o", color="white", mec=KINDS[0], mew=1.4, label="Table I")
@@ -105,14 +105,14 @@ def _slope(axes: Axes, curve: Sheet, table: Sheet) -> None:
 def double_integrals(
     radius: float, modulus: float, d: ArrayLike, theta: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Return F [N] and U [J] from eqs. 3 and 10 as printed; d [m] and θ [rad] broadcast.
+    """Integrate eqs. 3 and 10 as printed, and return F [N] and U [J].
 
-    The integrals are computed by product Gauss quadrature, so they verify the closed forms
-    independently. The relative error is ≤ 1e-10 if θ is at least 6° below its limit. F and U are 0
+    ``d`` [m] and ``theta`` [rad] are broadcast. The product Gauss quadrature is independent of the
+    closed forms. The relative error is ≤ 1e-10 if θ is at least 6° below its limit. F and U are 0
     at d = 0.
     """
     points, weights = leggauss(_NODES)
-    # Substitute sines for x and y, so that the rim of the ellipse does not reduce the accuracy.
+    # Substituting sines for x and y keeps the quadrature accurate at the rim of the ellipse.
     angle = 0.5 * np.pi * points
     weight = 0.5 * np.pi * weights * np.cos(angle)
     depth, tilt = np.broadcast_arrays(np.asarray(d, float), np.asarray(theta, float))
@@ -134,46 +134,46 @@ def double_integrals(
 
 @dataclass(frozen=True)
 class Plotted:
-    """Force or energy, with its symbols and units in the figures."""
+    """Plotted quantity (force or energy), with its symbol and unit."""
 
     symbol: str
     label: str
     unit: str
     scale: float  # factor from SI to this unit
-    row: int  # row in closed_forms and double_integrals
-    slope: int  # row of the d derivative in closed_forms
+    row: int  # index in the results of closed_forms and double_integrals
+    slope: int  # index of the derivative with respect to d in closed_forms
     exponent: int
     equation: int
     power: str  # power law in d at θ = 0
     prefactor: str
-    straight: float  # factor of the power law, divided by E
+    straight: float  # prefactor of the power law, divided by E
 
     def closed(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Return the closed form in the figure's unit, with d in mm and θ in degrees."""
+        """Return the closed form in the figure's unit; d is in mm and θ in degrees."""
         return closed_forms(MODULUS, d * MILLI, np.radians(theta))[self.row] * self.scale
 
     def integral(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Return the double integral in the figure's unit, with d in mm and θ in degrees."""
+        """Return the double integral in the figure's unit; d is in mm and θ in degrees."""
         pair = double_integrals(TIP.radius, MODULUS, d * MILLI, np.radians(theta))
         return pair[self.row] * self.scale
 
     def local_exponent(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Return d ln(integral) / d ln(d), with d in mm and θ in degrees."""
+        """Return d ln(integral) / d ln(d); d is in mm and θ in degrees."""
         above, below = (self.integral(d * (1.0 + step), theta) for step in (_STEP, -_STEP))
         return np.log(above / below) / math.log((1.0 + _STEP) / (1.0 - _STEP))
 
     def steepness(self, d: Numbers) -> FloatArray:
-        """Return the derivative of the integral with respect to θ [unit/rad] at 25°; d in mm."""
+        """Return the integral's derivative with respect to θ at 25° [unit/rad]; d is in mm."""
         step = math.degrees(_STEP)
         above, below = (self.integral(d, np.float64(_STEEP_TILT + each)) for each in (step, -step))
         return (above - below) / (2.0 * _STEP)
 
     def at_zero_tilt(self, d: Numbers) -> FloatArray:
-        """Return the paper's solid line, πEd² or πEd³/3, in the figure's unit, with d in mm."""
+        """Return the paper's solid line (πEd² or πEd³/3) in the figure's unit; d is in mm."""
         return self.straight * MODULUS * np.asarray(d * MILLI) ** self.exponent * self.scale
 
     def largest(self, tilt: float) -> float:
-        """Return the value at 8 mm and ``tilt`` [degrees], in the figure's unit."""
+        """Return the quantity at d = 8 mm and at ``tilt`` [degrees], in the figure's unit."""
         cosine = np.cos(np.radians(tilt)) ** (self.exponent - 1)
         return float(self.at_zero_tilt(np.float64(8.0)) / cosine)
 
@@ -208,11 +208,11 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Tabulate the quantity, its ratio to the value at θ = 0, and exponents versus d at each tilt.
+    """Tabulate the quantity and its exponents versus d, up to 8 mm, at each tilt.
 
-    d ranges up to 8 mm. Ratios and exponents are computed from the double integral and are
-    therefore independent of the closed form. The exponents for Table I's law are computed from its
-    own integral.
+    For each tilt, a second sheet contains the fitted exponent, and the quantity divided by its
+    value at θ = 0. The second sheet is computed from the double integral, not from the closed form.
+    The exponents for Table I's law are computed from the integral of that law.
     """
     d = np.arange(81) / 10.0
     power = quantity.at_zero_tilt(d)

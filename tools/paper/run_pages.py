@@ -1,8 +1,8 @@
-"""Reproduce Figs. 7, 8 and 10 in simulation, with the daemon's plant, sensor, estimator and table.
+"""Reproduce Figs. 7, 8 and 10 with the daemon's simulated hand, estimator and contact table.
 
 Each run returns true and estimated values, one row per frame. The figures show the model, the
-estimates and their errors. The simulated sensor matches the paper's sensor: 44 × 44 cells on a 58
-mm square, and 40 ms per scan. The noise of each cell is 0.5 % of the modulus.
+estimates and their errors. Like the paper's sensor, the simulated sensor has 44 × 44 cells on a 58
+mm square and takes 40 ms per scan. The noise of each cell is 0.5 % of the modulus.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ), and the res
 
 RADIUS = 0.020  # m
 SCAN = 0.040  # s
-TILTED = math.radians(11.5)  # rotation of the finger about its root
-ROLLED = math.radians(20.7)  # rotation of the object while it rolls back
+TILTED = math.radians(11.5)  # rotation of the finger about its root [rad]
+ROLLED = math.radians(20.7)  # rotation of the object while it rolls back [rad]
 _SPEED = 0.002  # compression speed [m/s]
 _GAP = 0.5e-3  # gap before compression [m]
 _D_MAX = 0.4 * RADIUS
@@ -50,9 +50,9 @@ _MOTION_MARGIN = math.radians(3.0)
 _WIDTH = 0.040
 _HALF_SEPARATION = 0.050
 _ROLL_STEPS = 104  # number of frames during rolling
-_LATE_FRAME_COUNT = 2  # number of frames in transit
-_RELATIVE_D_MIN = 1.0  # displacement above which the page shows relative errors [mm]
-_ROLLED_AT = 4  # displacement in the whole-path figure [mm]
+_LATE_FRAME_COUNT = 2  # number of frames still in transit when the motion ends
+_RELATIVE_D_MIN = 1.0  # displacement above which errors are shown [mm]
+_ROLLED_AT = 4  # displacement in the panels that show the whole path [mm]
 _PATH = -12.5, 10.5
 _SCALES = {"d": 1e3, "theta": 1.0}  # factors for displayed errors
 
@@ -74,10 +74,10 @@ def run_compression(tilt: float) -> dict[str, FloatArray]:
 
 
 def run_rotation() -> dict[str, FloatArray]:
-    """Rotate the finger by 11.5° about its root against a fixed object, starting at first touch.
+    """From first touch, rotate the finger by 11.5° about its root against a fixed object.
 
-    The distance from the root is chosen so that d reaches 4 mm. The servo moves the joint. Between
-    frames, d and θ are predicted from the joint angle.
+    The tip's distance from the root is chosen so that d reaches 4 mm. The servo moves the joint.
+    Between frames, d and θ are predicted from the joint angle.
     """
     length = _ROOT_DEPTH / math.sin(TILTED)
     sections: Sections = {
@@ -126,7 +126,8 @@ def _daemon(sections: Sections) -> Daemon:
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
-        # The sensor is calibrated, so the estimator attributes excess pressure to a stiffer tip.
+        # The sensor is calibrated, so the estimator attributes excess pressure to the tip's
+        # stiffness.
         "tactile": {
             "rate": 1.0 / SCAN,
             "latency": SCAN,
@@ -146,7 +147,7 @@ def _daemon(sections: Sections) -> Daemon:
 def _frames(
     daemon: Daemon, count: int, place: Callable[[SimulatedHand, float], None] | None = None
 ) -> Iterator[Row]:
-    """Yield the true state at each frame's sample time, and the estimate from this frame alone."""
+    """Yield the true state at each sampling time, and the estimate from that frame alone."""
     hand, loop = daemon.hand, daemon.loop
     assert hand is not None
     if place is not None:
@@ -190,16 +191,16 @@ def _columns(
 
 
 def roll(hand: SimulatedHand, d: float, angle: float, rolling: float = 1.0) -> None:
-    """Place the held object where rolling to ``angle`` [rad] at constant ``d`` [m] would move it.
+    """Move the object as if it had rolled to ``angle`` [rad] at constant ``d`` [m].
 
-    ``rolling`` is the fraction of the face motion that the tip follows by rolling.
+    A fraction ``rolling`` of the face motion is rolling; the rest is shear.
     """
     q = float(hand.q[0])
     parameters = hand.plant.parameters
     length = parameters.length
     tip = -_HALF_SEPARATION + length * math.sin(q), length * math.cos(q)
     out = RADIUS + 0.5 * _WIDTH - d
-    along = rolling * (RADIUS - d) * angle  # tip position on the face
+    along = rolling * (RADIUS - d) * angle  # tip position along the face [m]
     parameters.script_x = tip[0] + out * math.cos(angle) + along * math.sin(angle)
     hand.object_pose[:] = (
         parameters.script_x,
@@ -215,7 +216,7 @@ def _rms(off: FloatArray) -> float:
 
 @cache
 def compression() -> tuple[Sheet, ...]:
-    """Return one sheet per angle and a sheet with the errors for displacements above 1 mm."""
+    """Return one sheet per angle, and one sheet of errors for displacements above 1 mm."""
     sheets, rows = [], []
     for tilt in TILTS:
         run = Sheet(f"fig7_run_{tilt}deg", run_compression(float(np.radians(tilt))))
@@ -235,7 +236,7 @@ def compression() -> tuple[Sheet, ...]:
 
 
 def _deep_errors(run: Sheet, symbol: str) -> FloatArray:
-    """Return the errors for d > 1 mm: d in µm, θ in degrees, force or energy in %."""
+    """Return the errors for d > 1 mm, in µm (d), degrees (θ) or % (force and energy)."""
     deep = run["d"] > _RELATIVE_D_MIN
     truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
     relative = symbol in ("F", "U")
@@ -266,7 +267,7 @@ def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
 
 @cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return sheets for the rotation, rolling at each displacement, and the force/energy minima."""
+    """Return the sheets of the rotation, of the rolling, and of the minima of F and U."""
     columns: dict[str, FloatArray] = {}
     for depth in DEPTHS:
         columns |= run_rolling(depth)
@@ -290,10 +291,10 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
 
 
 def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
-    """Fit a parabola in θ and return the position of its minimum with the standard error.
+    """Fit a parabola in θ; return the angle of its minimum, and the standard error.
 
-    Without noise, both curves are parabolas to within 0.1 %. The standard error is computed from
-    the fit residuals; it matches the scatter of runs with ten seeds.
+    Without noise, F and U are parabolas in θ to within 0.1 %. The standard error is computed from
+    the fit residuals and matches the scatter of runs with ten seeds.
     """
     (a, b, _), covariance = np.polyfit(theta, values, 2, cov=True)
     slope = np.array([0.5 * b / a**2, -0.5 / a, 0.0])
@@ -301,7 +302,7 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
 
 
 def _along(symbol: str, axes: Axes, rotation: Sheet, rolling: Sheet, _: Sheet) -> None:
-    """Draw the path of the rotation and of the subsequent rolling at d = 4 mm."""
+    """Draw the rotation and the subsequent rolling at d = 4 mm."""
     for piece, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),

@@ -1,11 +1,12 @@
-"""Explain why the minimum lies slightly before 0° (section IV-B): rolling also shears the tip.
+"""Show that shear during rolling moves the minima of F and U to θ < 0 (section IV-B).
 
 The finger is tilted to −11.5°. From this tilt, the object rolls to 9.2° at constant displacement d.
-A fraction s of the face motion shears the tip instead of rolling it. The shear is
+A fraction s of the face motion shears the tip; the rest is rolling. The shear is
 
     ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
 
-For the springs of the parallel distributed model, with equal lateral and axial stiffness,
+The springs of the parallel distributed model have equal lateral and axial stiffness. The energy and
+the force are
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      F = πE [d²/cos θ + 2 d ζ sin θ]
 
@@ -14,9 +15,9 @@ with ζ sin θ and ζ tan θ have the sign of θ, so F and U reach their minima 
 position. ∂U/∂d is the force on the face at fixed tilt and shear. The minimum of ∂U/∂d lies between
 the minima of F and U.
 
-*Plant* is the simulated tip, which integrates the shear. The force on the base of the plant's tip
-is N cos θ + T sin θ. This force exceeds F by πE ζ² cos θ, because the plant's springs shear from
-the moment they touch at the contact rim.
+In the figures, *plant* is the simulated tip, which integrates the shear. The force on the plant's
+base is N cos θ + T sin θ. This force exceeds F by πE ζ² cos θ, because the plant shears each spring
+from its first touch at the contact rim.
 """
 
 from __future__ import annotations
@@ -46,9 +47,9 @@ from softfinger.tools.style import GREY, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHARES = (0.0, 0.02, 0.05, 0.1)  # shares shown in the figure
+SHARES = (0.0, 0.02, 0.05, 0.1)  # fractions s shown in the figure
 _EACH = tuple(k / 100.0 for k in range(11))
-DEPTH, SHARE = 6, 0.05  # displacement d [mm] and share of the case that is also simulated
+DEPTH, SHARE = 6, 0.05  # displacement shown in the figure [mm], and fraction s simulated
 _STEPS = 208
 _FORCE, _SLOPE, _ENERGY = "F on the base", "dU/dd", "U"
 
@@ -95,7 +96,7 @@ def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def angle_of_minimum(theta: FloatArray, values: FloatArray) -> float:
-    """Return the angle [degrees] of the minimum of a parabola through three points."""
+    """Return the angle of the minimum [degrees], from a parabola through three points."""
     k = int(np.clip(np.argmin(values), 1, len(values) - 2))
     near = slice(k - 1, k + 2)
     a, b, _ = np.polyfit(theta[near] - theta[k], values[near], 2)

@@ -1,4 +1,4 @@
-"""Represent figures as data: one sheet of numbers per CSV file, and panels drawn from sheets."""
+"""Represent a figure by sheets of data, and by panels that are drawn from the sheets."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DOT = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
 
 @dataclass(frozen=True)
 class Sheet:
-    """Columns of equal length, with keys ``quantity [unit]``; ``name`` is the file name.
+    """Columns of equal length with the keys ``quantity [unit]``; ``name`` is the file name.
 
     Values are strings or numbers. NaN is written as an empty cell. Dimensionless numbers have the
     unit 1, and strings have no unit.
@@ -69,7 +69,7 @@ def _cell(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Erratum:
-    """Erratum in the paper: its location, the printed statement and the corrected statement."""
+    """Erratum in the paper, with its location, the printed statement and the correction."""
 
     place: str
     printed: str
@@ -78,7 +78,7 @@ class Erratum:
 
 @dataclass(frozen=True)
 class Panel:
-    """Axes in a figure: drawing function, labels, limits and legend."""
+    """Axes in a figure, with drawing function, labels, limits and legend."""
 
     content: Callable[..., None]  # drawing function, called with the axes and all sheets
     xlabel: str
@@ -98,7 +98,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class FigurePage:
-    """Figure from the paper: data, panels and errata."""
+    """Figure from the paper, with data, panels and errata."""
 
     title: str
     size: tuple[float, float]  # inch
@@ -122,7 +122,7 @@ class FigurePage:
 
 
 def errata_sheet(pages: dict[str, FigurePage]) -> Sheet:
-    """Return all errata in ``pages``, one per row."""
+    """Return a sheet with one row per erratum in ``pages``."""
     rows = [
         {"figure": name, "place in the paper": e.place, "printed": e.printed, "holds": e.holds}
         for name, page in pages.items()

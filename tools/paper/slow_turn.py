@@ -1,15 +1,15 @@
 """Compute quasi-static manipulation (section V) and compare it with the simulated hand.
 
-Both tips consist of the paper's springs and stick to the object. Apart from the sticking tips, the
-model is frictionless. For a tip with shear ζ
+Both tips consist of the paper's springs and stick to the object. The model has no other friction.
+The energy and the shear rate of a tip with shear ζ are
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
-The shear rate is the rolling speed minus two other terms: the sliding speed along the face, and the
-component, along a tilted face, of the velocity at which d increases. The quantities s, d and θ are
-defined in `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is at equilibrium
-if Σ δU = 0 for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, the
-condition becomes
+The shear rate is the rolling speed (a − d) θ̇ minus two terms. ṡ is the sliding speed along the
+face. ḋ tan θ is the compression speed's component along a tilted face. The quantities s, d and θ
+are defined in `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is in
+equilibrium if Σ δU = 0 for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ,
+the condition becomes
 
     Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FORCE, WIDTH = 10.0, 0.040  # force per tip base [N] and object width [m]
-REACH = math.radians(8.0)  # maximum object angle per side
+REACH = math.radians(8.0)  # maximum object angle in each direction [rad]
 ANTISYMMETRIC_ANGLES = (-4, -2, 0, 2, 4)  # degrees
 _SWING_TIME = 4.0  # duration of a swing from 0 to REACH [s]
 _SIDE_ANGLES = np.radians(np.linspace(-2.5, 2.5, 41))
@@ -49,7 +49,7 @@ _FREE = {"table_friction": 0.0, "joint_friction": 0.0}
 
 
 class Held(NamedTuple):
-    """Pose of the hand and the object, and contacts of both tips."""
+    """Poses of the hand and the object, and contacts of both tips."""
 
     q: FloatArray
     pose: FloatArray
@@ -91,7 +91,7 @@ class Held(NamedTuple):
         return np.asarray(normal * deeper - tangential * along + rolls)
 
     def unbalanced(self) -> FloatArray:
-        """Return residuals [N]: force along x and y, moment divided by W, and grip force."""
+        """Return four residuals [N]: forces along x and y, moment divided by W, and grip force."""
         normal, moment, tangential = self.gradient()
         angle = self.pose[2]
         across, along = [math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]
@@ -138,7 +138,7 @@ def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
 
 @cache
 def gripped() -> Held:
-    """Return the upright equilibrium grip with unsheared tips."""
+    """Return the equilibrium grip of an upright object with unsheared tips."""
 
     def met(x: FloatArray) -> Held:
         q = np.full(2, x[0])
@@ -172,8 +172,8 @@ def potential(there: Held, start: Held) -> float:
 def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
     """Return V at the object angle of ``floor`` plus each offset in ``aside`` [rad].
 
-    The antisymmetric joint angle equals that of ``floor``, and V is minimised over all other
-    coordinates. The tips roll to each pose from ``start`` in one step. V is NaN where a tip would
+    V is minimised over all coordinates except the antisymmetric joint angle, which ``floor``
+    provides. The tips roll to each pose from ``start`` in one step. V is NaN where a tip would
     slip.
     """
     antisymmetric = 0.5 * float(floor.q[0] - floor.q[1])
@@ -200,10 +200,10 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
 
 
 def swing() -> list[dict[str, float]]:
-    """Rotate the object in the simulated hand back and forth; return one row every 20 ms.
+    """Rotate the object back and forth in the simulated hand; return one row every 20 ms.
 
     The holding force deviates by a few percent from `FORCE`. ΣU and T are therefore scaled to
-    `FORCE`, because ΣU is proportional to F^(3/2) and T to F.
+    `FORCE`. ΣU is proportional to F^(3/2), and T is proportional to F.
     """
     sections: dict[str, dict[str, Any]] = {
         "material": {"law": "constant", "modulus": MODULUS},
@@ -239,13 +239,13 @@ def swing() -> list[dict[str, float]]:
 
 
 def _triangle(turns: float) -> float:
-    """Return a triangle wave with the values 0, 1, 0, −1, 0 at 0, 1, 2, 3, 4."""
+    """Return a triangle wave with period 4 and amplitude 1, rising from 0 at ``turns`` = 0."""
     return 1.0 - abs((turns + 1.0) % 4.0 - 2.0)
 
 
 @cache
 def slow_turn() -> tuple[Sheet, ...]:
-    """Return sheets with the computed path, the plant's path, and V versus the object angle."""
+    """Return three sheets: the computed path, the plant's path, and V versus the object angle."""
     there = np.linspace(0.0, REACH, _STEPS + 1)[1:]
     back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _STEPS + 1)]
     start = gripped()

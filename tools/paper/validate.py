@@ -1,8 +1,8 @@
 """Run ``softfinger validate``: compare the model with published values.
 
-Each row shows a computed quantity, the published value with its source, and the verdict ``agree``,
-``disagree`` or ``unknown``. The verdict is ``unknown``, with a reason, for quantities that are not
-modelled or that require measurements on hardware.
+Each row shows the computed value, the published value with its source, and a verdict. The verdict
+is ``agree``, ``disagree`` or ``unknown``. If a quantity is not modelled or requires measurements on
+hardware, the verdict is ``unknown`` with a reason.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TILTS = np.radians(np.linspace(0.0, 20.0, 41))
 FIGURES = {"agree": "✓", "disagree": "✗", "unknown": "?"}
 _TRIALS = 5
 _FRAMES = 64
-_PRESSED = 0.005, 0.2  # displacement d [m] and tilt [rad] in the sensor frames
+_PRESSED = 0.005, 0.2  # displacement d [m] and tilt [rad] of the simulated contact
 
 
 class PublishedValue(NamedTuple):
@@ -75,7 +75,7 @@ def comparisons() -> Iterator[PublishedValue]:
 
 def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
             unit: str = "", why: str = "") -> PublishedValue:  # fmt: skip
-    """Return a row that compares ``ours`` with the range [low, high], all rounded to ``form``."""
+    """Compare ``ours`` with the range [low, high]; all three values are rounded to ``form``."""
     shown = [f"{each:{form}}" for each in (low, high, ours)]
     inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
     verdict = "agree" if inside else "disagree"
@@ -219,7 +219,7 @@ def _sensors() -> Iterator[PublishedValue]:
 
 
 def _errors(settings: Settings) -> tuple[float, float, float]:
-    """Return the RMS errors of d [m], tilt [rad] and force [N] for a sensor's settled frames."""
+    """Return the RMS errors of d [m], tilt [rad] and force [N] after the estimates have settled."""
     from softfinger.daemon.profile.factory import make_material
     from softfinger.tools.benchmarks.estimator import settled
 

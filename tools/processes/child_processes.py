@@ -29,7 +29,7 @@ class RecorderError(SoftfingerError):
 
 
 class _Lifeline:
-    """Pipe whose closing terminates a child process."""
+    """Pipe to a child process, which exits when the pipe closes."""
 
     def start(self, words: list[str], keys: str, **options: Any) -> subprocess.Popen[Any]:
         """Start ``softfinger`` with the arguments ``words`` and, if keys are set, ``--keys``."""
@@ -73,7 +73,7 @@ class MonitorProcess:
         self.process = self._lifeline.start(words, keys)
         called = False
 
-        # This handler is also called if a child is stopped or continued.
+        # This handler is also called when a child is stopped or continued.
         def child_changed(*_: Any) -> None:
             nonlocal called
             if not called and self.process.poll() is not None:
@@ -95,7 +95,7 @@ class MonitorProcess:
                 break
             except subprocess.TimeoutExpired:
                 end()
-        # If the monitor was killed, the monitor page is still on the screen.
+        # A killed monitor leaves its page on the screen.
         if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)

@@ -1,8 +1,8 @@
 """Compile a scene's kernels on all cores, for ``softfinger compile`` or a daemon's first start.
 
-The daemon itself only loads the kernels and therefore uses less memory. Each process compiles one
-pipeline part (`loop.warm_up`) after another. Parts that need the contact table wait until the table
-exists.
+The daemon itself only loads the kernels and therefore uses less memory. Each process compiles
+pipeline parts (`loop.warm_up`) one after another. Parts that need the contact table wait until the
+table exists.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Built(NamedTuple):
-    """Result of a build: number of missing parts, and whether a part has failed."""
+    """Number of parts that were missing, and True if one of them could not be built."""
 
     parts: int
     failed: bool
@@ -83,9 +83,9 @@ def build_kernels(
     """Build the missing parts in ``wanted``, or all missing parts of the scene by default.
 
     If all parts exist, the function returns quickly without a message. If standard error is a
-    terminal and ``bar`` is set, a bar shows the progress. Otherwise ``tell(level, kind, text)`` is
-    called for each part. Failures are also passed to ``tell``. If the function is interrupted, it
-    ends all processes.
+    terminal and ``bar`` is set, a bar shows the progress. Without a bar, ``tell(level, kind,
+    text)`` is called for each part. Failures are also passed to ``tell``. An interrupt ends all
+    processes.
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
@@ -134,7 +134,7 @@ class _Build:
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
         self._head = f"{settings.model_dump_json()}\n"
         self._missing = missing
-        self._at: dict[str, str] = {}  # kernel that is being compiled for each part
+        self._at: dict[str, str] = {}  # for each part, the kernel that is being compiled
         self._total, self._begun = _kernels(missing), 0
         self._started = time.monotonic()
         self._bar, self._tell = bar, tell
@@ -179,7 +179,7 @@ class _Build:
         )
 
     def _build(self, part: Part, after: Future[str] | None) -> str:
-        """Wait for ``after``, build a part in this thread's process; return any failure reason."""
+        """Wait for ``after``, then build ``part``; return the reason for a failure, or ""."""
         if after is not None:
             wait([after])
         head, process = "", getattr(self._own, "process", None)
@@ -224,14 +224,14 @@ def _start() -> subprocess.Popen[str]:
 
 
 def main() -> None:
-    """Compile kernels, one part of a scene at a time, until standard input ends.
+    """Compile a scene's kernels part by part, until standard input ends.
 
     Standard input contains the settings as JSON, followed by one part name per line. Standard
-    output has three kinds of lines: ``kernel NAME`` when the compilation of a kernel starts,
-    ``done`` when a part has been built, and ``failed REASON`` when a part could not be built.
+    output contains a line ``kernel NAME`` when the compilation of a kernel starts. The last line
+    for each part is ``done`` or ``failed REASON``.
     """
-    # The compiler allocates many long-lived objects, so frequent garbage collection takes 10 % of
-    # the time.
+    # The compiler allocates many long-lived objects, so frequent garbage collection would take 10 %
+    # of the time.
     gc.set_threshold(100_000)
     out = sys.stdout
     sys.stdout = sys.stderr  # Other output must not interfere with the protocol.

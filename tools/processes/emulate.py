@@ -1,4 +1,4 @@
-"""Run ``softfinger emulate``: the arguments, signals and exit status of an emulated hand."""
+"""Run ``softfinger emulate``: parse arguments, handle signals and return the exit status."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def _ids(text: str) -> tuple[int, ...]:
 def run(arguments: argparse.Namespace) -> int:
     """Emulate the hand until SIGINT, SIGTERM or SIGHUP arrives.
 
-    If the setup fails, a message is printed, and 1 is returned.
+    If the setup fails, print a message and return 1.
     """
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
@@ -164,7 +164,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
     # The following imports are slow (numpy, numba), so settings errors are reported first.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # Garbage collection during imports takes a tenth of the start-up time.
+    gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
         EmulatedServos,
@@ -228,11 +228,11 @@ def _ready(ports: dict[str, Path]) -> str:
 
 
 def _unhurried(settings: Settings, paced: bool) -> Settings:
-    """Return the settings with real-time options that are suitable for a pseudo-terminal.
+    """Return the settings with real-time options for a pseudo-terminal.
 
-    SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Idle
-    states are disabled only if the servos reproduce the wire timing, because this timing requires
-    very short sleeps.
+    SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Emulated
+    wire timing requires very short sleeps. CPU idle states are therefore disabled only if the
+    servos reproduce the wire timing.
     """
     changes = {"priority": 0, "cpus": (), "spin": 0.0, "lock_memory": False}
     held = paced and settings.realtime.hold_latency

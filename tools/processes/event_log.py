@@ -1,12 +1,12 @@
-"""Write the daemon's events as lines to standard error or to a file, from a separate thread.
+"""Write the daemon's events to standard error or a file, one per line, in a separate thread.
 
-A stopped terminal (Ctrl-S), a full pipe or a full disk blocks writes. Therefore ticks never write,
-and lines that cannot be written are dropped.
+A stopped terminal (Ctrl-S), a full pipe or a full disk blocks writes. Ticks therefore never write
+to the log. Lines that cannot be written are dropped.
 
 Plain lines are for human readers. With ``form="json"``, each line is an object with the fields
-``timestamp`` (Unix time [s] at which the line was queued), ``level`` (``info``, ``warning``,
-``error``), ``kind`` and ``text``, as in ``hand/event``. Numbers are in additional fields. In
-systemd's journal, each line has a priority.
+``timestamp``, ``level``, ``kind`` and ``text``, as in ``hand/event``. ``timestamp`` is the Unix
+time [s] at which the line was queued. ``level`` is ``info``, ``warning`` or ``error``. Additional
+fields contain numbers. In systemd's journal, each line has a priority.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warnin
 class EventLog:
     """Log in plain text or JSON; the ``line`` method never blocks or fails.
 
-    Lines are appended to an existing ``file``. Raises OSError if the file cannot be opened.
+    Lines are appended to ``file`` if the file exists. Raises OSError if the file cannot be opened.
     """
 
     def __init__(self, form: str = "plain", file: Path | None = None) -> None:
@@ -72,7 +72,7 @@ class EventLog:
         logging.getLogger().addHandler(handler)
 
     def close(self, patience: float = 1.0) -> None:
-        """Write the queued lines; stop after at most ``patience`` s."""
+        """Write the queued lines, for at most ``patience`` s."""
         self._closing = True
         self._news.set()
         self._thread.join(patience)
@@ -110,7 +110,7 @@ class EventLog:
 
 
 def _clock(date: str, timestamp: float) -> str:
-    """Format the time of day, or print plain seconds if the system date is invalid."""
+    """Format a Unix time as a date, or as plain seconds if the date is invalid."""
     try:
         clock = time.strftime(date, time.localtime(timestamp))
     except (OverflowError, OSError, ValueError):

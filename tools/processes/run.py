@@ -1,4 +1,4 @@
-"""Run ``softfinger run``, the daemon process: settings, signals and exit status."""
+"""Run ``softfinger run``: load the settings, handle signals and return the exit status."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _serve(
     # The following imports are slow (numpy, numba, zmq), so settings errors are reported first.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # Garbage collection during imports takes a tenth of the start-up time.
+    gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
     from softfinger.daemon.loop.build import Daemon
     from softfinger.tools.processes.compile import build_kernels
 
@@ -167,7 +167,7 @@ def _serve(
 
 @contextmanager
 def _service(loop: Any) -> Iterator[None]:
-    """Notify systemd, if requested, when the daemon is ready, on each tick, and when it stops."""
+    """If requested, notify systemd when the daemon is ready, on each tick and at the end."""
     service = Service.of_environment()
     if service is None:
         yield
@@ -208,7 +208,7 @@ def _scene(settings: Settings) -> str:
 
 
 def _numbers(state: State) -> dict[str, Any]:
-    """Return the numbers to log with an event; ``seq`` identifies the event in a recording."""
+    """Return the numbers to log with an event; ``seq`` is the state's number in a recording."""
     numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
     real = {
         name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON has no NaN.

@@ -1,4 +1,4 @@
-"""Convert the message maps of a topic to a channel's JSON and back."""
+"""Convert a topic's message maps to a channel's JSON, and back."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
 LIBRARY = "softfinger"
 
-# Frames and events also contain the fields that Foxglove's schemas require. A stream field with the
-# same name as a Foxglove field is renamed in the recording.
+# Recorded frames and events also contain the fields that Foxglove's schemas require. If a stream
+# field has the same name as a Foxglove field, the stream field is renamed.
 _STAMP = {
     "type": "object",
     "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
@@ -71,7 +71,7 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
 
 
 def to_json(topic: bytes) -> Converter:
-    """Return a function that converts a map to JSON and may modify the map."""
+    """Return a function that converts a stream map to JSON; the function may modify the map."""
     return {schema.TACTILE: _image, schema.EVENT: _log}.get(topic, lambda message: message)
 
 
@@ -124,9 +124,10 @@ def _log(message: dict[str, Any]) -> dict[str, Any]:
 def _restored(
     topic: bytes, floats: list[list[str]], names: list[str], message: dict[str, Any]
 ) -> dict[str, Any]:
-    """Restore the stream's map: convert null to NaN and base64 to bytes, and drop added fields.
+    """Restore the stream's map from a channel's JSON.
 
-    Raises ValueError, TypeError or AttributeError if the map is not a message of this topic.
+    Null becomes NaN, base64 becomes bytes, and Foxglove's fields are dropped. Raises ValueError,
+    TypeError or AttributeError if the map is not a message of this topic.
     """
     if topic in _FOXGLOVE and _STORED_AS["timestamp"] in message:
         for name in _FOXGLOVE[topic][1]:

@@ -80,7 +80,7 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
 
 
 Row = dict[str, Any]
-_BLOCK = 2000  # number of rows per write
+_BLOCK = 2000  # number of rows written at once
 
 
 class CsvTable:
@@ -155,9 +155,9 @@ def export(
 ) -> list[Path]:
     """Write one table per topic, and one ``.npz`` file of frames per sensor, into ``folder``.
 
-    In all files, the first column ``t`` is the time since the recording's first message [s],
-    according to the daemon's clock. The other columns are the fields of the schema and any
-    additional fields of the topic's first message.
+    In all files, the first column ``t`` is the time [s] on the daemon's clock since the recording's
+    first message. The other columns are the fields of the schema and any additional fields of the
+    topic's first message.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def export(
     OSError, MissingExtra
     """
     tables: dict[bytes, Table] = {}
-    grids: dict[str, tuple[list[float], list[Any]]] = {}  # scan times and counts of each finger
+    grids: dict[str, tuple[list[float], list[Any]]] = {}  # scan times and frames of each finger
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):
@@ -197,7 +197,7 @@ def export(
 
 
 def _file_name(topic: bytes) -> str:
-    """Return a safe file name for any topic; the file is not hidden or in another folder."""
+    """Convert a topic to a file name that is neither hidden nor in another folder."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 

@@ -1,9 +1,8 @@
-"""Read MCAP files: `Recording` provides a file's summary and its messages in order of arrival.
+"""Read an MCAP file's summary, and its messages in order of arrival.
 
-A recording may have been written by any MCAP writer, and may contain chunks, indexes, statistics
-and other programs' channels. Sizes and counts in the file are not trusted. The memory use and the
-run time are bounded by the file's size on disk. `read_recording` returns the states as NumPy
-columns.
+`Recording` is the reader, and `read_recording` returns the states as NumPy columns. The file may
+come from any MCAP writer and contain other programs' channels. Sizes and counts stated in the file
+are not trusted. The file's size on disk limits the memory use and the run time.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ __all__ = ["Recording", "read_recording"]
 
 _MESSAGE_SIZE_MAX = 1 << 20  # maximum message size [bytes]; a frame of the largest grid has 0.2 MB
 _SETTINGS_SIZE_MAX = 4 << 20  # maximum settings size [bytes], including per-cell calibrations
-_CHUNK_SIZE_MAX = 64 << 20  # unpacked chunk size limit [bytes]; chunks usually have 1 to 8 MB
-# Each channel or message counts as at least this number of bytes, because reading a record takes
+_CHUNK_SIZE_MAX = 64 << 20  # maximum unpacked chunk size [bytes]; usual chunks have 1 to 8 MB
+# Minimum number of bytes counted per channel or message, because reading even a short record takes
 # time.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
@@ -52,9 +51,9 @@ _END = struct.Struct("<BQQQI8s")  # footer and magic
 def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     """Read a recording's states as one array per field, in order of arrival.
 
-    The names of the arrays are the field names in `hand/state`; nested names contain a dot
-    (``left.force``). The first array, ``t``, is the time since the recording's first message [s],
-    as in all files written by ``softfinger export``.
+    Each array has the name of its `hand/state` field; names of nested fields contain a dot
+    (``left.force``). The first array, ``t``, is the time since the recording's first message [s].
+    Files written by ``softfinger export`` contain the same column ``t``.
     ``pandas.DataFrame(read_recording("run.mcap"))`` accepts the result.
 
     Raises
@@ -74,25 +73,25 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 class MessageSource(Protocol):
-    """Source of messages in a file or in memory; error messages call the source ``path``."""
+    """Source of recorded messages, in a file or in memory; ``path`` appears in error messages."""
 
     path: Path
 
     def messages(
         self, topics: Collection[bytes] | None = None
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield the topic and map of each message whose topic is in ``topics``, in order."""
+        """Yield the topic and the map of each message in order; ``topics`` selects the topics."""
 
 
 class Recording:
     """Reader for an existing recording. Raises RecordingError if the file is not a recording.
 
-    ``counts`` (number of messages by channel), ``start`` and ``end`` (Unix time [s], NaN if empty)
-    are read from the summary at the end of the file. If the summary is incomplete, or if the file
-    contains other programs' channels, the whole file is read once instead. If the recorder was
-    killed, the end of the file is missing, and ``truncated`` is True. Corrupted chunks are skipped.
-    Messages in other programs' channels are ignored; ``others`` counts them. ``say`` is called once
-    for each kind of problem found.
+    The summary at the end of the file provides ``counts`` (messages per channel), ``start`` and
+    ``end`` (Unix times [s]). In an empty recording, ``start`` and ``end`` are NaN. If the summary
+    is incomplete, or if the file contains other programs' channels, the whole file is read once
+    instead. ``truncated`` is True if the end of the file is missing, for example because the
+    recorder was killed. Corrupted chunks are skipped. Messages in other programs' channels are
+    ignored and counted in ``others``. ``say`` is called once for each kind of problem found.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
@@ -102,7 +101,7 @@ class Recording:
         self.damage = ""  # description of the first defect found so far
         self._say = say
         self.counts: dict[str, int] = {}
-        self.others: dict[str, int] = {}  # number of messages in each channel from other programs
+        self.others: dict[str, int] = {}  # number of messages in each channel of other programs
         self.start = math.nan
         self.end = math.nan
         self.chunks = 0
@@ -162,7 +161,7 @@ class Recording:
 
     @cached_property
     def zero(self) -> int:
-        """Daemon clock time of the first message [ns], which is the origin of all times ``t``."""
+        """Time of the first message on the daemon's clock [ns], which is the origin of ``t``."""
         state = self._left, self.chunks  # Save the variables that the loop changes.
         for _, message in self.messages():
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
@@ -170,12 +169,12 @@ class Recording:
                 # A frame's mono_ns is the scan time, but its timestamp is the arrival time.
                 after = stamp - self.start - float(message.get("delay_s", 0.0))
                 self._left, self.chunks = state
-                # The timestamp is a float with a resolution of 0.2 µs.
+                # The timestamp is a float with a resolution of 0.2 µs, so round to 1 µs.
                 return mono - round(after * 1e6) * 1000
         return 0
 
     def time(self, message: dict[str, Any]) -> float:
-        """Return the time of a message or the scan time of a frame, relative to the start [s]."""
+        """Return a message's time, or a frame's scan time, since the first message [s]."""
         mono, stamp = message.get("mono_ns"), message.get("timestamp")
         if isinstance(mono, int):
             return (mono - self.zero) * 1e-9
@@ -266,7 +265,7 @@ class Recording:
             for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
                 if (message := self._take_record(kind, content)) is not None:
                     yield message
-        # Format errors and compression errors raise exceptions without a common base class.
+        # Format errors and compression errors have no common exception class.
         except Exception as error:
             self._damaged(error)
 
@@ -293,7 +292,7 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
-        # A newer version of softfinger recorded this topic.
+        # If softfinger wrote the file, an unknown topic comes from a newer version.
         if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
             self._other_names[channel.id] = channel.topic
             return
@@ -310,14 +309,14 @@ class Recording:
     def _damaged(self, error: Exception | None) -> None:
         first = not self.damage
         usual = "the end of the file is missing" if self.truncated else "a chunk can't be read"
-        # The messages of the MCAP library about lengths and checksums would not help the user.
+        # The MCAP library's messages about lengths and checksums would not help the user.
         self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
         if first and self._say is not None:
             what = "cut short" if self.truncated else "damaged"
             self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 
     def _begin(self, file: BinaryIO) -> str:
-        """Check the end of the file; return the header's profile, or PROFILE if it is missing."""
+        """Check the file's end; return the header's profile, or PROFILE if there is no header."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Header
 
@@ -391,9 +390,9 @@ class Recording:
 def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
     """Yield the kind and content of each record whose kind is in ``wanted``.
 
-    If a message is too long, only its header is returned as the content. Raises EOFError for an
-    incomplete record, and ValueError for an invalid record or for an overlong record that is not a
-    message.
+    For an overlong message, the content is only the message header. An incomplete record raises
+    EOFError. A record of unknown type, or an overlong record that is not a message, raises
+    ValueError.
     """
     while head := file.read(_RECORD.size):
         if len(head) < _RECORD.size:
@@ -417,9 +416,9 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
 
 
 def _plain(message: dict[str, Any]) -> dict[str, Any]:
-    """Check that a map has only plain values, at most two levels of nested maps, and few fields.
+    """Check that a map has few fields, no lists, and at most two levels of nested maps.
 
-    Raises ValueError if the check fails and AttributeError if the message is not a map.
+    Raises ValueError if the check fails, and AttributeError if ``message`` is not a map.
     """
     count, maps = 0, [message]
     for _ in range(3):

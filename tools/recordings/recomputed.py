@@ -28,7 +28,7 @@ from softfinger.tools.recordings.reader import MessageSource, Recording
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
-# Fields that depend on the timing of the machine rather than on the inputs of the loop.
+# These fields depend on the machine's timing, not on the inputs of the loop.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of hand/settings
@@ -132,10 +132,10 @@ def recompute(
     settings: Settings | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Comparison:
-    """Process the recorded inputs with the loop and compare all states.
+    """Run the control loop with the recorded inputs, and compare all states.
 
-    ``settings`` replaces the recorded settings. Raises RecordingError if the recording lacks a
-    topic or frames.
+    ``settings`` replaces the recorded settings. Raises RecordingError if required topics or frames
+    are missing.
     """
     own, calibrations = recorded_settings(recording)
     if not recording.count(schema.INPUT):
@@ -160,7 +160,7 @@ def _run(
     calibrations: list[str],
     progress: Callable[[int], None] | None,
 ) -> None:
-    # Importing the loop is slow, so first reject recordings without settings or inputs.
+    # Importing the loop is slow, so recordings without settings or inputs are rejected earlier.
     from softfinger.daemon.loop.process_replay import ProcessReplay
     from softfinger.daemon.loop.publishing import parts
 
@@ -202,7 +202,7 @@ def _run(
             _compare(result, state, again)
 
 
-# Tick input, recent frames by (finger, seq), commands, and state, which is None if it is missing.
+# Tick input, recent frames by (finger, seq), commands, and the state or None.
 _Tick = tuple[
     dict[str, Any], dict[tuple[int, int], Any], list[dict[str, Any]], dict[str, Any] | None
 ]
@@ -213,7 +213,7 @@ def _ticks(
 ) -> Iterator[_Tick]:
     """Yield all ticks.
 
-    In a recording, the frames and commands of a tick come first, then the input, and then the
+    For each tick, a recording contains first the frames and commands, then the input, then the
     state.
     """
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)

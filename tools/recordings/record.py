@@ -57,12 +57,12 @@ _POLL_INTERVAL = 0.1
 _BACKLOG_TIMEOUT = 10.0  # time limit for processing queued messages at the end [s]
 _TRANSIT_TIME = 0.5  # time allowed at the end for messages that are still in transit [s]
 _PROGRESS_INTERVAL = 0.5  # time between two progress lines, and between two flushes [s]
-_BATCH_SIZE = 1000  # number of messages between time checks
+_BATCH_SIZE = 1000  # maximum number of messages read before the time is checked
 
 
 # If the recorder is killed, only the incomplete chunk is lost. The incomplete chunk contains the
 # messages since the last flush.
-CHUNK_SIZE = 256 * 1024  # chunk size before compression [bytes], 0.2 s of state at 1 kHz
+CHUNK_SIZE = 256 * 1024  # chunk size before compression [bytes], about 0.2 s of states at 1 kHz
 
 
 class RecordingWriter:
@@ -91,7 +91,7 @@ class RecordingWriter:
         # Repeated messages that arrived before the first new message.
         self._early: list[tuple[bytes, dict[str, Any]]] = []
         try:
-            # The buffer is large enough to hold a chunk in one write.
+            # The buffer holds a whole chunk, so that one call writes the chunk.
             self._file = path.open("xb", buffering=4 * CHUNK_SIZE)
         except FileExistsError:
             raise RecordingError(f"{path}: already exists; choose another file") from None
@@ -102,7 +102,7 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
-            # This chunk size is larger than the size at which `add` ends a chunk.
+            # The MCAP writer's own limit is twice the size at which `_write` ends a chunk.
             self._mcap = Writer(self._file, 2 * CHUNK_SIZE)
             self._mcap.start(PROFILE, LIBRARY)
             self._wrote()
@@ -110,7 +110,7 @@ class RecordingWriter:
             raise self._failed(error) from None
 
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Write one message; its map may be modified. Raises RecordingError.
+        """Write one message; this method may modify ``message``. Raises RecordingError.
 
         A repeated message (``again``) contains its original time, which precedes the recording. To
         keep all log times within the recording, the repeated message gets the previous message's
@@ -131,7 +131,7 @@ class RecordingWriter:
         self._write(topic, message, when)
 
     def flush(self) -> None:
-        """End the chunk and pass it to the system, so that it survives a kill of this process."""
+        """End the chunk and write it, so that the data survive if this process is killed."""
         try:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._wrote()
@@ -242,7 +242,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Recorder:
-    """State of one ``record`` call: socket, files and counters."""
+    """Files and counters of one ``record`` call."""
 
     def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
@@ -252,7 +252,7 @@ class _Recorder:
         # The last writer in this list is the active writer.
         self._writers = [RecordingWriter(arguments.file)]
         self._opened = time.monotonic()
-        self._messages = 0  # number of received messages to write
+        self._messages = 0  # number of received messages that are to be written
         self._unreadable = 0
         self._waiting = False  # True once the notice about the missing stream has been printed
 
@@ -277,7 +277,7 @@ class _Recorder:
         return self._summary(failure)
 
     def _take_all(self, socket: zmq.Socket[bytes]) -> str:
-        """Read messages until a stop condition is met; return any failure reason or ""."""
+        """Read messages until a stop condition is met; return the reason for a failure, or ""."""
         arguments, ending = self._arguments, self._ending
         began = shown = last = time.monotonic()
         ending.begin()
@@ -300,8 +300,7 @@ class _Recorder:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)
                 shown = now
-        # Some messages that were sent before a signal, such as the daemon's last messages, arrive
-        # after the signal.
+        # Messages sent before the signal, such as the daemon's last messages, may still arrive.
         self._read_remaining(
             socket, _TRANSIT_TIME if ending.is_requested or not ending.is_met else 0.0
         )
@@ -316,7 +315,7 @@ class _Recorder:
         return count
 
     def _read_remaining(self, socket: zmq.Socket[bytes], quiet: float) -> None:
-        """Process the queued messages and any messages that arrive within another ``quiet`` s."""
+        """Process the queued messages, then wait up to ``quiet`` [s] for further messages."""
         end = time.monotonic() + _BACKLOG_TIMEOUT
         while time.monotonic() < end:
             if self._take_batch(socket) < _BATCH_SIZE:
@@ -392,9 +391,9 @@ def _topics(named: list[bytes] | None) -> list[bytes]:
 
 
 def recover(path: Path) -> tuple[int, str]:
-    """Repair a recording; return the number of messages and the reason why it was incomplete.
+    """Repair a recording; return the number of messages and a description of the damage.
 
-    A complete file is not changed. The repaired file replaces the original only once it is
+    A complete file is not changed. The repaired file replaces the original when the repair is
     complete. Raises RecordingError.
     """
     recording = Recording(path)

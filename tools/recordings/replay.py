@@ -31,7 +31,7 @@ first tick. If the recording starts at the first tick, the same code and setting
 results.
 Exit status: 0 published, or all states identical; 1 the file can't be read; 3 states differ."""
 
-_SUBSCRIBER_WAIT = 10.0  # timeout for the first subscriber [s]
+_SUBSCRIBER_WAIT = 10.0  # maximum waiting time for the first subscriber [s]
 _EXIT_DIFFERENT = 3
 
 
@@ -159,10 +159,10 @@ _POLL_INTERVAL = 1e-3  # s
 
 
 class Wire:
-    """Context manager for a gateway that publishes on ``address``, with access control by ``keys``.
+    """Context manager that publishes on ``address``; ``keys`` restrict the access.
 
-    Raises RecordingError if the address cannot be bound, or if other machines can reach it although
-    no keys are given.
+    Raises RecordingError if the address cannot be bound. An address that other machines can reach
+    requires ``keys``.
     """
 
     def __init__(self, address: str, keys: Path | None = None) -> None:
@@ -189,7 +189,7 @@ class Wire:
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
         """Publish one message as soon as the gateway can accept it."""
-        if topic not in schema.TOPICS:  # Another version of softfinger uses this topic.
+        if topic not in schema.TOPICS:  # This topic belongs to another version of softfinger.
             return
         give_up = time.monotonic() + _SEND_TIMEOUT
         while not self._link.look() and time.monotonic() < give_up:

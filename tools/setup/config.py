@@ -50,9 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Check a profile, or print the requested list, profile or reference.
+    """Check a profile, or print a profile, the list of profiles, the schema or the reference.
 
-    Raises SettingsError for an unknown profile, section or key. Raises OSError for a file error.
+    Raises SettingsError for an unknown profile, section or key. Raises OSError if a file cannot be
+    accessed.
     """
     if arguments.action == "check":
         return _check(arguments)
@@ -70,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    """Print errors and warnings of a profile; return 1 if there are errors."""
+    """Print a profile's errors and warnings; return 1 if there are errors."""
     from softfinger.daemon.perception.finger_model import make_models
 
     name, errors, warnings = str(arguments.config), list[str](), list[str]()
@@ -97,7 +98,7 @@ def _text(profile: Path) -> str:
 
 
 def subject(profile: Path) -> str:
-    """Return the first sentence of the comment at the beginning of a profile."""
+    """Return the first sentence of a profile's opening comment."""
     comment = itertools.takewhile(lambda line: line.startswith("#"), _text(profile).splitlines())
     words = " ".join(line[1:].strip() for line in comment if not line.startswith("#:"))
     return min((words.partition(mark)[0] for mark in (": ", ". ")), key=len)

@@ -1,4 +1,4 @@
-"""Run ``softfinger envelope``: simulate which objects a hand can hold.
+"""Run ``softfinger envelope``: determine by simulation which objects a hand can hold.
 
 The objects vary in shape, size, friction and mass.
 """
@@ -40,7 +40,7 @@ _LOAD_TIME = 1.0  # duration of the weight ramp [s]
 _OBSERVATION_TIME = 1.0  # observation time under the full weight [s]
 _LOAD_STEP_COUNT = 20  # number of steps in the weight ramp
 _TURN_MIN = math.radians(5.0)
-_SLIDE_MAX = 0.010  # displacement along the faces above which the object counts as lost [m]
+_SLIDE_MAX = 0.010  # displacement above which the object counts as lost [m]
 _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
 
 
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _between(what: str, low: float, high: float) -> Callable[[str], float]:
-    """Return a parser for numbers from ``low`` to ``high``; 0 itself is never allowed."""
+    """Return a parser for nonzero numbers from ``low`` to ``high``."""
     return lambda text: number(text, what, low, high, includes_low=low > 0.0)
 
 
@@ -146,10 +146,10 @@ def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, 
 def grasped(
     settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
 ) -> Cell:
-    """Grasp an object on the table, then pull it away from the palm with its own weight.
+    """Grasp an object on the table, then pull it from the palm with a force equal to its weight.
 
-    The daemon's settings contain the object's width or diameter ``size`` [m], friction and weight
-    (``mass`` [kg]), but not its shape. The daemon always assumes a block.
+    The daemon's settings contain the object's width or diameter (``size`` [m]), friction and weight
+    (from ``mass`` [kg]). The settings do not contain the ``shape``; the daemon assumes a block.
     """
     from softfinger.tools.simulated_daemon import SimulatedDaemon
 

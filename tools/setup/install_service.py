@@ -58,7 +58,7 @@ def _file(name: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """Quote one word in ExecStart: escape specifiers, variables and separators."""
+    """Quote one word for ExecStart, and escape specifiers, variables and separators."""
     if any(ord(character) < 32 for character in word):
         raise SettingsError(f"{word!r}: a systemd unit can't contain control characters")
     word = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")

@@ -1,4 +1,4 @@
-"""Run ``softfinger limits``: print a table of all limits with their values in a profile."""
+"""Run ``softfinger limits``: print all limits and their values in a profile."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _values(settings: Settings, row: Limit) -> list[str]:
-    """Return each setting of a limit, multiplied by the fraction at which the limit is reached."""
+    """Format a limit's settings, each with the fraction at which the limit is reached."""
     share = "" if row.fraction == 1.0 else f"{row.fraction:g} × "
     return [f"{share}{key} = {_shown(_value(settings, key))}" for key in row.keys]
 

@@ -1,4 +1,4 @@
-"""Run ``softfinger scan [PORT …]``: find servos and their baud rates without changing them."""
+"""Run ``softfinger scan [PORT …]``: find servos and their baud rates without changing settings."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         for servo in found.servos:
             rates.setdefault(replace(servo, baud=0), []).append(str(servo.baud))
         for servo, at in rates.items():
-            # An emulated servo may reply at several baud rates. List these baud rates on one line.
+            # An emulated servo may reply at several baud rates, which are listed on one line.
             print(f"{path}: {servo.describe(', '.join(at))}", flush=True)
         for garbled in found.garbled:
             print(f"{path}: {garbled}\n  → {ONE_SERVO_ONLY}", flush=True)

@@ -33,7 +33,7 @@ _ANCHORS = (
 
 
 def colour_map() -> list[tuple[int, int, int]]:
-    """Return the scale's colours from zero to full scale, as (red, green, blue) in 0…255."""
+    """Return the colours from zero to full scale, as (red, green, blue) from 0 to 255."""
     at = np.linspace(0.0, len(_ANCHORS) - 1.0, LEVELS)
     channels = [np.interp(at, range(len(_ANCHORS)), each) for each in zip(*_ANCHORS, strict=True)]
     return [(r, g, b) for r, g, b in np.rint(channels).T.astype(int).tolist()]
@@ -49,7 +49,7 @@ def _pair_style(top: int, bottom: int) -> Style:
 
 @lru_cache(maxsize=16)
 def _overlaps(cells: int, pixels: int) -> FloatArray:
-    """Return the fraction of each pixel covered by each cell in one dimension; rows sum to 1."""
+    """Return the fraction of each pixel that each cell covers along one axis; rows sum to 1."""
     edges = np.arange(pixels + 1) * (cells / pixels)
     low, high = edges[:-1, None], edges[1:, None]
     cell = np.arange(cells)[None, :]
@@ -59,14 +59,14 @@ def _overlaps(cells: int, pixels: int) -> FloatArray:
 
 
 def resample(grid: FloatArray, height: int, width: int) -> FloatArray:
-    """Resample ``grid`` [rows, cols] to [height, width] by averaging areas; preserve the mean."""
+    """Resample ``grid`` [rows, cols] to [height, width] by averaging areas, preserving the mean."""
     rows, cols = grid.shape
     result: FloatArray = _overlaps(rows, height) @ grid @ _overlaps(cols, width).T
     return result
 
 
 def fit(rows: int, cols: int, lines: int, columns: int, aspect: float = 1.0) -> tuple[int, int]:
-    """Return the largest (lines, columns) that fit into the box and preserve the cell shape.
+    """Return the largest size (lines, columns) that fits into the box and preserves the cell shape.
 
     ``aspect`` is a cell's height divided by its width.
     """
@@ -83,7 +83,7 @@ def levels_of(pixels: FloatArray, full: float) -> NDArray[np.int64]:
 
 
 def picture(grid: FloatArray, full: float, lines: int, columns: int, coloured: bool) -> list[Text]:
-    """Draw ``grid`` as ``lines`` of ``columns`` characters, with row 0 at the bottom.
+    """Draw ``grid`` as ``lines`` lines of ``columns`` characters, with row 0 at the bottom.
 
     ``full`` is the value shown in the brightest colour or with the densest shade.
     """
@@ -125,18 +125,17 @@ def round_up(value: float) -> float:
 
 
 class FullScale:
-    """Full-scale value that follows a signal's peak: up immediately, and down after a delay."""
+    """Full-scale value that increases with a signal's peak at once and decreases after a delay."""
 
     def __init__(self, smallest: float, patience: float = 3.0) -> None:
         self._smallest = smallest
-        # Time for which the peak must stay below the next smaller scale before the scale shrinks
-        # [s].
+        # Time [s] for which a smaller scale must be sufficient before the scale shrinks.
         self._patience = patience
         self._since: float | None = None
         self.value = smallest
 
     def follow(self, peak: float, now: float) -> float:
-        """Update the scale with the signal's ``peak`` at time ``now`` [s]; return full scale."""
+        """Update the scale with the signal's ``peak`` at time ``now`` [s], and return the scale."""
         end = max(self._smallest, round_up(peak)) if peak > 0.0 else self._smallest
         if end >= self.value:
             self.value = end

@@ -1,4 +1,4 @@
-"""Run ``softfinger monitor``, which shows a live page about the hand in the terminal.
+"""Run ``softfinger monitor``: show a live page about the hand in the terminal.
 
 This module parses the arguments, handles keys and signals, and redraws the page. If the output is
 not a terminal, the monitor prints plain lines. `stream_state` collects the data and `monitor_page`
@@ -34,9 +34,9 @@ from softfinger.tools.terminal.stream_state import Commander, StreamReader, Stre
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
 STEP_ANGLE = math.radians(5.0)  # object rotation per arrow-key press [rad]
-# Upper limit of each force range [N], and force step in this range [N].
+# Each pair contains the upper limit of a force range [N] and the force step in this range [N].
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
-_ACCUMULATION_TIME = 1.0  # time within which key presses are combined [s]
+_ACCUMULATION_TIME = 1.0  # time for which a new force replaces the force in the stream [s]
 _CONFIRMATION_TIME = 3.0  # time limit for the second press of d, which confirms disarming [s]
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
@@ -85,13 +85,13 @@ class HandKeys:
         return self._feed.mode in _GRIPPING
 
     def _adding(self, now: float) -> bool:
-        """Return True shortly after a force key; the stream may still contain the old force."""
+        """Return True just after a force key, while the stream may still contain the old force."""
         reply = self._commander.reply
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
         return now - self._pressed < _ACCUMULATION_TIME and not refused
 
     def _change_force(self, sign: float, now: float) -> None:
-        """Change the force by one step, and apply it to the current grip, if any."""
+        """Change the force by one step; if there is a grip, apply the new force at once."""
         present = self.force(now)
         if not math.isfinite(present):
             self._commander.refuse(now, "grasp: the hand's settings have not arrived yet")
@@ -144,7 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until the q key, a signal, the end of the duration or the daemon's exit.
+    """Run until q is pressed, a signal arrives, the duration ends or the daemon exits.
 
     Returns 1 if no stream was received. Raises KeyFileError.
     """
@@ -223,7 +223,7 @@ class _MonitorStop(StopCondition):
         self.wake()
 
     def watch(self, feed: StreamState, address: str, now: float) -> None:
-        """Request the end if there is no stream and ``--no-wait`` was given."""
+        """End the monitor if there is no stream and ``--no-wait`` was given."""
         if not self._no_wait or self.is_met:
             return
         status = feed.status(now)
@@ -247,7 +247,7 @@ def _run_page(
         while not ending.is_met:
             with terminal:
                 _page_loop(page, terminal, keyboard, subscriber, commander, ending)
-            # After Ctrl-Z, the shell takes over the terminal.
+            # Ctrl-Z suspends this process, and the shell takes over the terminal.
             if ending.suspend and not ending.is_met:
                 ending.suspend = False
                 os.kill(os.getpid(), signal.SIGSTOP)
@@ -317,8 +317,8 @@ def _run_plain(address: str, subscriber: StreamReader, ending: _MonitorStop) -> 
                 due = now + PLAIN_LINE_INTERVAL
                 _say(f"{_clock()} {printable(describe(feed.state))}")
         return
-    # The reader has closed the pipe. Python flushes its output again at exit, so redirect the
-    # output to /dev/null.
+    # The reader has closed the pipe. Python flushes standard output again at exit, so redirect it
+    # to /dev/null.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -1,8 +1,8 @@
 """Lay out the ``softfinger monitor`` page as lines of styled text.
 
 Lengths are in mm, angles in degrees, energies in mJ, pressures in kPa. The left finger's map is on
-the left and the right finger's map on the right. The numbers for both fingers and the object are in
-between. Widths are in terminal columns; a wide character takes two columns.
+the left, and the right finger's map is on the right. The numbers for the fingers and the object are
+between the maps. Widths are in terminal columns; a wide character takes two columns.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from softfinger.tools.terminal.text_layout import (
 )
 
 WIDTH, HEIGHT = 80, 24  # minimum page size in columns and lines
-CENTRE = 34  # width of the numbers, in columns
+CENTRE = 34  # width of the area with the numbers, in columns
 MAP_LINES = 11  # height of each map at the minimum page size
 OLD_AGE = 1.0  # age above which a frame is marked as old [s]
 REPLY_TIME = 12.0  # time for which a reply is shown [s]
-DELAY_MIN = 0.05  # delay above which a message is displayed [s]
+DELAY_MIN = 0.05  # delay of the simulated hand above which a message is displayed [s]
 
 GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
 KEY = "bold #56b4e9"
@@ -85,7 +85,7 @@ _ROWS = (
 
 @dataclass
 class MonitorPage:
-    """Page that shows a `StreamState`; ``now`` is the monotonic time [s]."""
+    """Page that shows a `StreamState`; in all methods, ``now`` is the monotonic time [s]."""
 
     feed: StreamState
     address: str
@@ -168,7 +168,7 @@ class MonitorPage:
         return truncated(Text(f" {why_invalid(feed.state)}", WARN), width)
 
     def _body(self, width: int, lines: int, now: float) -> list[Text]:
-        """Draw the titles, both maps, the numbers between them, the colour scale and the object."""
+        """Draw both maps with titles and colour scales, and the numbers between the maps."""
         box = min(2 * lines, (width - CENTRE - 2) // 2)
         frames = self.feed.frames
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
@@ -187,7 +187,7 @@ class MonitorPage:
     def _map(
         self, name: str, lines: int, box: int, full: float, now: float, counts: bool
     ) -> list[Text]:
-        """Draw the title, a map with ``lines`` lines and its scale, up to ``box`` columns wide."""
+        """Draw a map of ``lines`` lines with its title and scale, at most ``box`` columns wide."""
         frame = self.feed.frames.get(name)
         title = Text(name.upper(), FINGER_STYLES[name])
         picture = [Text() for _ in range(lines)]
@@ -233,7 +233,7 @@ class MonitorPage:
             value, style = getattr(finger, key), "default" if finger.valid else DIM
             if key == "temperature":
                 style = BAD if finger.time_to_limit < self.feed.heat_warning_time else style
-                value = value or math.nan  # A value of 0 means that the quantity is unknown.
+                value = value or math.nan  # A temperature of 0 means unknown.
             spread = factor * getattr(finger, std) if std else math.nan
             shown = format_aligned(factor * value, decimals)
             beside = "" if math.isnan(spread) else "±" + format_narrow(spread)
@@ -254,7 +254,7 @@ class MonitorPage:
         )
 
     def _ticks(self) -> Text:
-        """Draw the rate, the overruns, and the median, tail and maximum of all tick durations."""
+        """Draw the tick rate, the overruns, and the median, p99 and maximum of the tick times."""
         times, overruns = self.feed.times, self.feed.state.overruns
         rate = math.nan if times is None else times.rates.tick
         line = Text(f" tick {format_value(rate, 0)} Hz").append("  overruns ", DIM)
@@ -329,7 +329,7 @@ def _named(keys: dict[str, str]) -> Text:
 
 
 def _heights(width: int, height: int) -> tuple[int, int]:
-    """Return the line count of each map and the line count of the events for this page size."""
+    """Return the number of lines for each map and the number of lines for events."""
     spare = height - HEIGHT
     widest = (width - CENTRE - 2) // 4  # Each map has twice as many columns as lines.
     maps = max(MAP_LINES, min(widest, MAP_LINES + (2 * spare + 2) // 3))

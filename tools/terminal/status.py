@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the next state. Return 1 if the hand has a fault, 2 if no state arrives."""
+    """Print the next state. Return 1 if the hand has a fault, and 2 if no state arrives."""
     try:
         with Hand(arguments.address, keys=arguments.keys) as hand:
             state = hand.state()
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def describe(state: HandState) -> str:
-    """Return a line with mode, mean force and the object's angle and width, or the fault."""
+    """Return a line with mode, mean force, object angle and object width, or with the fault."""
     mode, *details = state_parts(state)
     separator = ": " if state.fault else " "
     return separator.join(filter(None, [mode, ", ".join(details)]))

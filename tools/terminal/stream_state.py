@@ -1,4 +1,4 @@
-"""Collect the live page's data from the daemon's sockets, without drawing it.
+"""Collect the data for a live page from the daemon's sockets.
 
 The contents of messages are not trusted. Fields that are missing or have the wrong type become NaN
 or empty. Messages that cannot be decoded are counted and skipped.
@@ -51,11 +51,11 @@ GLOSSARY = (  # meanings of the terms on the pages
     ("current, bound", "motor current and its limit in the latest goal"),
     ("object", "angle and width of the object between the tips"),
 )
-# Relative force increase above which the page reports an increased grip force.
+# Ratio of goal force to commanded force above which the page reports a force increase.
 _INCREASED_RATIO = 1.01
 # Maximum number of messages read per call, so that a flood of messages cannot block drawing.
 _DRAIN_COUNT_MAX = 4000
-_MESSAGE_SIZE_MAX = 4_000_000  # maximum message size [bytes]; the largest grid has 131 kB
+_MESSAGE_SIZE_MAX = 4_000_000  # maximum message size [bytes]; the largest frame has 131 kB
 
 
 def field(record: object, *path: str) -> Any:
@@ -116,8 +116,8 @@ class StreamState:
     """Process stream messages and store the data that a page shows.
 
     In all methods ``now`` is monotonic time [s]. ``events`` are sorted by time of occurrence,
-    whereas `news` returns events in the order of arrival. The two orders differ after a late
-    subscription.
+    whereas `news` returns events in the order of arrival. After a late subscription, the order of
+    arrival differs from the order of occurrence.
     """
 
     def __init__(self) -> None:
@@ -194,8 +194,8 @@ class StreamState:
         )
 
     def _read_event(self, event: schema.Event, _: float) -> None:
-        # A late subscriber receives repeated events with their original seq and time. If the time
-        # differs, the event comes from another daemon.
+        # A late subscriber receives repeated events with their original seq and time. An event with
+        # the same seq but another time comes from another daemon.
         name = event.seq, event.timestamp
         if event.again and name in self._event_times:
             return
@@ -280,7 +280,7 @@ class StreamState:
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
 
     def waited(self, now: float) -> float:
-        """Return the time [s] that a simulated hand has recently waited for a busy machine."""
+        """Return the time [s] for which a simulated hand recently waited for a busy machine."""
         while self._waits and self._waits[0][0] < now - RECENT_TIME:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)
@@ -330,8 +330,8 @@ class Commander:
 
     Each command uses its own request socket, so a missing reply does not delay other commands. If
     the same user runs the daemon on this machine, a stop bypasses the requests of all clients. The
-    daemon replies on the next tick. If the daemon is stalled, the client waits only briefly for the
-    reply to a stop.
+    daemon replies to the stop on the next tick. If the daemon is stalled, the client waits only
+    briefly for this reply.
     """
 
     OPEN_LIMIT = 8  # maximum number of open commands; further commands are dropped, except stop

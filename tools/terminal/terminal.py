@@ -1,7 +1,6 @@
-"""Control the terminal of a full-screen page: screen modes, key decoding, output, restoration.
+"""Switch a terminal to a full-screen page, decode its keys, draw, and restore the terminal.
 
-A redraw sends all changed lines in a single write operation, because a single write is fast over
-ssh and avoids flicker.
+A redraw sends all changed lines in a single write, which is fast over ssh and avoids flicker.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ _KEY = re.compile(
 
 
 class TerminalGone(SoftfingerError):
-    """Error raised if the terminal is not writable or a signal has interrupted a blocked write."""
+    """Error raised if writing to the terminal fails, or if a signal interrupts a blocked write."""
 
 
 class KeyDecoder:
@@ -70,7 +69,7 @@ class KeyDecoder:
 
 
 class Terminal:
-    """Context manager that gives the page control of the terminal and restores it afterwards."""
+    """Context manager that gives the page control of the terminal, then restores the terminal."""
 
     def __init__(self, output: int, keyboard: int | None, suspendable: bool = True) -> None:
         self._output = output

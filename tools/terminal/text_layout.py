@@ -64,7 +64,7 @@ def rule(width: int, title: Text, note: Text | None = None) -> Text:
 
 
 def dimmed(line: Text) -> Text:
-    """Return ``line`` in the faded style for outdated data, except for map characters."""
+    """Fade ``line``, except for map characters, to mark outdated data."""
     maps = [span for span in line.spans if isinstance(span.style, Style) and span.style.bgcolor]
     return Text(line.plain, DIM, spans=maps)
 
@@ -83,7 +83,7 @@ def format_narrow(value: float) -> str:
 
 
 def format_value(value: float, decimals: int) -> str:
-    """Format a number, or a dash if the number is missing."""
+    """Format a number, or return a dash if the number is missing."""
     return f"{value:.{decimals}f}" if math.isfinite(value) else "—"
 
 

@@ -1,4 +1,4 @@
-"""Combine the page's parts into one document, which is served or contains a recording."""
+"""Combine the page's parts into one HTML document, to be served or saved with a recording."""
 
 from __future__ import annotations
 

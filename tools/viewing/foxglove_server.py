@@ -1,8 +1,8 @@
 """Serve the stream to Foxglove via its WebSocket protocol (foxglove/ws-protocol, version 1).
 
-Channels have the same names, schemas and messages as in recordings (`tools.recordings.channels`),
-so the same layout works for both. The additional channel ``hand/scene`` contains the moving hand.
-Messages without subscribers are not packed.
+Recordings use the same channel names, schemas and messages (`tools.recordings.channels`). One
+Foxglove layout therefore works for the stream and for recordings. The additional channel
+``hand/scene`` contains the moving hand. Messages that no client has subscribed to are not packed.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _FRAME = "hand"  # coordinate frame [m]: x from the left to the right pivot, y a
 _LIST = {"type": "array", "items": {"type": "object", "properties": {}}}
 _ENTITIES = {"type": "object", "properties": {"deletions": _LIST, "entities": _LIST}}
 _HEAD = struct.Struct("<BIQ")  # message header with kind, subscription and time [ns]
-_EVENT_COUNT = 50  # number of events that are stored for new subscribers, as in the daemon
+_EVENT_COUNT = 50  # number of events stored for new subscribers, as in the daemon
 _QUEUE_LENGTH = 500  # maximum number of messages queued for a client; excess messages are dropped
 _SEND_TIMEOUT = 2.0  # timeout for a client to accept a message [s]
 
 
 class _Client:
-    """A client's subscriptions by channel, and its queued messages."""
+    """A client's subscriptions by channel, and the messages queued for the client."""
 
     def __init__(self) -> None:
         self.subscribed: dict[str, int] = {}

@@ -1,8 +1,9 @@
-"""Compute lines for drawings: fingers, soft tips, object, forces, and footprints on frames.
+"""Compute the lines of a drawing: fingers, tips, object, forces and contact footprints.
 
-Coordinates are in the hand's plane [m]: x from the left to the right pivot, y away from the palm. A
-tip's own axes are x along its base and z normal to the base. In the tip's own axes, the object's
-face is ``x sin θ + z cos θ = a − d``. `hand.geometry` computes the tip positions.
+Coordinates are in the hand's plane [m]. x points from the left to the right pivot, and y points
+away from the palm. A tip's own axes are x along its base and z normal to the base. In the tip's own
+axes, the equation of the object's face is ``x sin θ + z cos θ = a − d``. `hand.geometry` computes
+the tip positions.
 """
 
 from __future__ import annotations
@@ -104,10 +105,10 @@ def held_outline(
     width: float,
     height: float,
 ) -> FloatArray:
-    """Return the held object's closed outline [m], shape [5, 2], with the left finger first.
+    """Return the held object's closed outline [m], shape [5, 2], starting at the left finger.
 
-    The position perpendicular to the faces follows from the joint angles and contacts. Along the
-    faces, the object is assumed to be centred on the contacts.
+    The joint angles and contacts determine the object's position perpendicular to its faces. Along
+    the faces, the object is assumed to be centred on the contacts.
     """
     a, tips = hand.tip_radius, hand.tips(q)
     angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])
@@ -120,7 +121,7 @@ def held_outline(
 
 
 def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
-    """Return the outline [m] of the object in ``hand/truth``, [n, 2], or an empty array."""
+    """Return a list with the true object's outline [m], shape [n, 2], or an empty list."""
     pose = read(TrueState, truth).true_object
     try:
         shape = shape_of(settings)
@@ -152,7 +153,7 @@ def hand_parts(
 
 
 def _held(hand: HandGeometry, state: HandState, height: float) -> list[FloatArray]:
-    """Return the outline of the object between the tips, empty unless both tips hold it."""
+    """Return a list with the held object's outline; empty unless both tips touch the object."""
     tips = state.left, state.right
     if not state.object.valid or not all(map(touches, tips)):
         return []
@@ -179,12 +180,12 @@ def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
     return part
 
 
-# Picture coordinates are measured in cells from the corner of the first cell, with x along the
-# columns and y along the rows. In the sensor's axes, the footprint for displacement d and outward
-# normal n is an ellipse. With h = a − d and ρ² = 2ad − d², the centre of the ellipse is h·(n_x,
-# n_y), and the semi-axes are ρ n_z along the tilt and ρ across the tilt. The pressure centroid is
-# at (a − d/3)·(n_x, n_y). The centroid position is exact for any constant modulus, and a close
-# approximation for a measured material law.
+# Picture coordinates are in cells from the corner of the first cell. x counts columns, and y counts
+# rows. In the sensor's axes, the footprint for displacement d and outward normal n is an ellipse.
+# Let h = a − d and ρ² = 2ad − d². The centre of the ellipse is h·(n_x, n_y). The semi-axes are ρ
+# n_z along the tilt and ρ across the tilt. The pressure centroid is at (a − d/3)·(n_x, n_y). The
+# centroid position is exact for any constant modulus, and a close approximation for a measured
+# material law.
 
 
 def grid_of(frame: TactileFrame) -> SensorGrid | None:
@@ -201,7 +202,7 @@ def grid_of(frame: TactileFrame) -> SensorGrid | None:
 def footprint(
     grid: SensorGrid, radius: float, d: float, tilt_x: float, tilt_y: float
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return a contact's closed outline [n, 2] and centroid [2] in ``grid``'s picture.
+    """Return a contact's closed outline [n, 2] and centroid [2] in picture coordinates.
 
     ``radius`` and ``d`` are in m. The tilts are in rad, in the finger's axes. Returns None if the
     values do not describe a contact.
@@ -220,12 +221,12 @@ def footprint(
 
 
 def tip_circle(grid: SensorGrid, radius: float) -> FloatArray:
-    """Return the tip's rim in the picture, [n, 2]."""
+    """Return the tip's rim in picture coordinates, shape [n, 2]."""
     return on_picture(grid, radius * _UNIT_CIRCLE)
 
 
 def on_picture(grid: SensorGrid, points: FloatArray) -> FloatArray:
-    """Convert points [..., 2] in m, in the sensor's axes from the tip's centre, to cells."""
+    """Convert sensor coordinates [m] relative to the tip's centre to picture coordinates."""
     middle = np.array([0.5 * grid.cols, 0.5 * grid.rows])
     cells: FloatArray = (points + np.array(grid.centre)) / np.array(grid.pitches) + middle
     return cells

@@ -1,7 +1,7 @@
 """Read the settings in ``hand/settings``, and draw the tip's energy landscape U(d, θ).
 
-If a key comes from another version and cannot be read, its default value is used, so that the
-remaining data can be shown.
+A key that cannot be read, for example because it comes from another version, gets its default
+value.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from softfinger.tools.terminal import heatmap
 
 WIDTH, HEIGHT = 240, 200  # width and height of the landscape [pixels]
 THETA_END = 45.0  # maximum |θ| [degrees]
-_TOLERANCE = 1e-6  # relative tolerance of the table for the picture
+_TOLERANCE = 1e-6  # relative tolerance of the contact table
 
 
 class Landscape(NamedTuple):
     """A tip's energy, with θ on the horizontal axis and d on the vertical axis.
 
-    The colour changes in steps with the cube root of U. Because this root is proportional to d, the
+    The colour changes stepwise with the cube root of U. Because this root is proportional to d, the
     valley along θ = 0 is visible at every depth. The edges between colours are lines of constant
     energy.
     """

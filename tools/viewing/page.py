@@ -1,9 +1,9 @@
-"""Serve the ``softfinger view`` page, its pictures and its commands on the loopback interface.
+"""Serve the ``softfinger view`` page and its pictures, and carry out the page's commands.
 
 A single thread serves the pages. The main thread reads the stream or plays a recording, and creates
-each picture once for all pages. A page requests the next picture after drawing the last picture, so
-a slow page skips pictures without delaying other pages. The command prints a token in the terminal.
-Pages with this token may send commands, and each page is a separate client.
+each picture once for all pages. A page requests the next picture after drawing the last picture. A
+slow page therefore skips pictures and does not delay other pages. ``softfinger view`` prints a
+token in the terminal. Pages with this token may send commands, and each page is a separate client.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _say = to_stderr("view")
 
 
 class _Published(NamedTuple):
-    """Picture with additional data for the page."""
+    """Picture with its scene and plot rows."""
 
     scene: str
     picture: str
@@ -69,14 +69,13 @@ class _Published(NamedTuple):
 
 
 class Site:
-    """Serve the page and its pictures, carry out its commands, and stream to Foxglove clients.
+    """Serve the page, carry out commands, and stream to Foxglove clients.
 
-    Requests must name this server as their host. Requests from a browser must also come from this
-    server's pages. The host rule blocks DNS rebinding, because such requests name a different host.
-    The page rule blocks requests from pages of other sites, which have a different origin. Pages
+    Each request must name this server as its host; this rule blocks DNS rebinding. A browser's
+    request must also have the origin of this server's pages; this rule blocks other sites. Pages
     with the ``token`` may send commands through ``send``. All pages may control a recording's
     playback through ``wish``. If other machines can reach the server, the token is required even
-    for watching. A browser then obtains the token with a one-time code.
+    for watching. A browser then exchanges a one-time code for the token.
     """
 
     def __init__(
@@ -90,8 +89,8 @@ class Site:
     ) -> None:
         """Create a server; `run` serves the pages.
 
-        A command is dropped if its picture is older than ``stale`` [s]. If other machines can reach
-        the page, ``announce`` is called with each one-time code.
+        A command is dropped if the user's picture is older than ``stale`` [s]. If other machines
+        can reach the page, ``announce`` is called with each one-time code.
         """
         self._loop = loop
         self._token = token
@@ -100,12 +99,12 @@ class Site:
         self._send = send
         self._stale = stale
         self._ended = asyncio.Event()
-        self._hosts: set[str] = set()  # this server's valid host names
+        self._hosts: set[str] = set()  # valid host names of this server
         self._at_once = asyncio.Semaphore(_WAITING_COUNT_MAX)
         # Pages that are waiting for the next picture.
         self.waiting: list[asyncio.Future[_Published]] = []
         self.record: Callable[[], str] = lambda: ""  # function that starts or ends a recording
-        # Function that receives the request string for each picture.
+        # Function that receives a page's request for a picture.
         self.wish: Callable[[str], None] = lambda _: None
         self._routes: dict[str, Callable[[ServerConnection], Awaitable[None]]] = {
             "/pictures": self._show,
@@ -119,7 +118,7 @@ class Site:
         self._loop.call_soon_threadsafe(self._give, _Published(scene, picture, rows))
 
     def announce(self) -> None:
-        """Create a new one-time code and announce it, if codes are used."""
+        """If codes are used, create and announce a new one-time code."""
         if self._announce is not None:
             self._code = secrets.token_urlsafe(8)
             self._announce(self._code)
@@ -164,7 +163,7 @@ class Site:
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
-        # If each request contains a secret, the server accepts any host name.
+        # If codes are used, each request contains a secret, so any host name is accepted.
         if self._announce is not None:
             here = True
             if not self._allows(request):
@@ -183,7 +182,7 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Redirect a browser with the one-time code to the page with the token, or refuse it."""
+        """Redirect a browser that has the one-time code to the page with the token."""
         if not self._code or not _has(request, "code", self._code):
             said = (
                 "Open this page with the newest address printed by softfinger view; each "
@@ -210,7 +209,7 @@ class Site:
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Send a page the next picture and the missing rows, each time it requests a picture.
+        """Each time a page requests a picture, send the next picture and the missing rows.
 
         A new scene is sent before the picture.
         """
@@ -252,10 +251,10 @@ class Site:
         return future
 
     def _answer(self, text: str | bytes) -> str:
-        """Send the request ``text`` to the daemon for checking; return a line about the result.
+        """Send the request ``text`` to the daemon; return a line about the result.
 
-        A command other than stop is dropped if the user's picture (time ``seen``, monotonic [s]) is
-        too old.
+        Commands other than stop are dropped if the user's picture is too old. The field ``seen`` is
+        the picture's monotonic time [s].
         """
         try:
             asked = json.loads(text)
@@ -292,7 +291,7 @@ def _has(request: Request, name: str, secret: str) -> bool:
 
 
 def listen(host: str, port: int | None) -> socket.socket:
-    """Open a listening socket; without a port, use 9090, or a free port if 9090 is taken.
+    """Open a listening socket; the default port is 9090, or a free port if 9090 is taken.
 
     Raises ViewError.
     """

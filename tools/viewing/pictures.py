@@ -1,7 +1,7 @@
 """Convert the stream's messages to data for the web page: scene, pictures and plot rows.
 
-A picture is a JSON text with the lines, dots, texts and images for each panel at one time. The
-scene contains the constant parts: the layout and the energy landscape. A row contains the values of
+A picture is a JSON text that contains each panel's lines, dots, texts and images at one time. The
+scene contains the layout and the energy landscape, which are constant. A row contains the values of
 all plots at one time. A page receives each row once, even if it skips pictures. Colours are sent by
 name, and the page defines their RGB values.
 """
@@ -50,7 +50,7 @@ _DARK_SIGMA = 2.0  # minimum visible pressure, in standard deviations of the cel
 _FULL_SCALE_MIN = 10.0  # minimum full scale, in standard deviations of the cell noise
 _OLD_TIME = 0.35  # minimum age at which a message is shown as old [s]
 _OLD_PERIODS = 4.0  # minimum age at which a message is shown as old, in stream periods
-_NUMBER_MAX = 1e6  # limit for drawn numbers; messages may contain any value
+_NUMBER_MAX = 1e6  # maximum magnitude of drawn numbers; messages may contain any value
 _DEGREE = math.degrees(1.0)
 
 
@@ -90,8 +90,8 @@ _HEADLINE = (  # title, decimals and plotted fields
     ("Displacement d", 2, "left.d right.d"),
 )
 _SERVOS = ("q", "current")  # fields that are missing in a hand without servos
-_DEVIATED = ("force", "d", "theta")  # finger fields whose {}_std is also drawn
-_OTHERS = {  # names and colours of lines without a finger
+_DEVIATED = ("force", "d", "theta")  # finger fields whose standard deviation ({}_std) is also drawn
+_OTHERS = {  # names and colours of lines that belong to no finger
     "object.angle": ("object", OBJECT),
     "object.width": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
@@ -105,7 +105,7 @@ _FACTORS |= {
     for path, factor in _FACTORS.items()
     if path.rpartition(".")[2] in _DEVIATED
 }
-_COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # columns after number, time and mode
+_COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # columns 0 to 2: number, time, mode
 _values = attrgetter(*_FACTORS)
 
 
@@ -130,8 +130,8 @@ class Pictures:
     """Process untrusted messages, and pass the scene and each picture to ``publish``.
 
     ``watched`` returns True if a page is open. ``say`` is called for messages that cannot be read.
-    Times are taken from the machine's clock for a ``live`` stream, and from the messages for a
-    recording. ``foxglove`` also receives the messages.
+    A ``live`` stream uses the machine's clock, and a recording uses the times in the messages.
+    ``foxglove`` also receives the messages.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ class Pictures:
             self._foxglove.take(topic, message)
 
     def _read_settings(self, settings: Settings) -> None:
-        """Lay out the scene for a hand, with panels and plots for its existing parts only."""
+        """Lay out the scene, with panels and plots only for parts that the hand has."""
         self._settings, self._fingers = settings, fingers_of(settings)
         self._pressure = heatmap.FullScale(
             heatmap.round_up(_FULL_SCALE_MIN * settings.tactile.noise)
@@ -270,7 +270,7 @@ class Pictures:
         )
 
     def draw(self, place: dict[str, Any] | None = None) -> None:
-        """Publish a picture of the current data if a page is waiting for one.
+        """If a page is waiting, publish a picture of the current data.
 
         ``place`` is the position in a recording; see `sources.Playback`.
         """
@@ -354,7 +354,7 @@ class Pictures:
         return maps
 
     def _contacts(self) -> dict[str, Any]:
-        """Draw each contact on the landscape, in mm and degrees, with its trail."""
+        """Draw each contact and its trail on the landscape, in mm and degrees."""
         lines, dots = [], []
         states = [self.feed.state, *(state for state, _ in reversed(self._past))][
             : 1 + _TRAIL_LENGTH
@@ -422,7 +422,7 @@ class Pictures:
 
 
 def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
-    """Describe a plot with lines for the fields at ``paths``, for the page's layout."""
+    """Describe a plot for the page's layout, with one line per field in ``paths``."""
     lines = []
     for path in paths:
         finger, _, key = path.rpartition(".")
@@ -445,7 +445,7 @@ def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
 
 
 def _flat(points: FloatArray) -> FloatArray:
-    """Return x and y alternately, rounded to four decimals (an error below a tenth of a pixel)."""
+    """Return x and y alternately, rounded to four decimals (less than a tenth of a pixel)."""
     return np.clip(points, -_NUMBER_MAX, _NUMBER_MAX).round(4).ravel()
 
 

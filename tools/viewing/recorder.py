@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 class PageRecorder:
     """Run one `softfinger record` process at a time, in the current folder.
 
-    ``show`` is called with a map that contains the running recording's ``file`` and its start time
-    ``since`` (Unix time [s]). If the recording failed, the map contains the reason as ``failed``.
-    Without a recording, the map is empty.
+    ``show`` receives a map with the running recording's ``file`` and its start time ``since`` (Unix
+    time [s]). If the recording failed, the map contains the reason as ``failed``. Without a
+    recording, the map is empty.
     """
 
     def __init__(self, address: str, keys: str, show: Callable[[dict[str, Any]], None]) -> None:

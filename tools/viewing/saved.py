@@ -1,4 +1,4 @@
-"""Save a recording as a page that plays without a server, or as a moving picture of the hand."""
+"""Save a recording as a page that plays without a server, or as an animation of the hand."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from softfinger.tools.viewing.sources import Playback, ViewError, marks_of
 
 _PICTURE_COUNT_MAX = 6000  # maximum number of pictures in the page's memory; each has about 10 kB
 _SCALE = 3000.0  # SVG user units per metre
-_ARC = 30  # lines with more points than this omit every second point
+_ARC = 30  # number of points above which a line omits every second point
 
 
 def save(path: Path, recording: Recording, period: float, say: Callable[[str], None]) -> None:
@@ -55,7 +55,7 @@ def _pictures(
 ) -> tuple[list[tuple[str, list[str]]], str, int]:
     """Return each scene with its pictures, all plot rows, and the number of states.
 
-    All results except the number are JSON texts in the form that the server sends to a page.
+    The scenes, pictures and rows are JSON texts, as the server sends them to a page.
     """
     scenes: list[tuple[str, list[str]]] = []
     kept: dict[int, str] = {}

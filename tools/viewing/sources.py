@@ -79,7 +79,7 @@ def follow(
 
 
 def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
-    """Return time [s], level, kind and text for each mode change, warning and error."""
+    """Return the time [s], level, kind and text of each mode change, warning and error."""
     marks = []
     for _, message in recording.messages([schema.EVENT]):
         event = read(schema.Event, message)
@@ -126,10 +126,10 @@ class Playback:
                 self._target = min(max(place, 0.0), self._recording.duration)
 
     def run(self, ending: StopCondition) -> None:
-        """Play until the end is requested."""
+        """Play until ``ending`` is met."""
         recording, pictures = self._recording, self._pictures
-        # Search for marks with a separate reader. Searching a long recording takes seconds and must
-        # not delay the first picture.
+        # Use a separate reader to search for marks. Searching a long recording takes seconds and
+        # must not delay the first picture.
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
@@ -145,12 +145,12 @@ class Playback:
                 self.position = min(self.position + elapsed, recording.duration)
 
     def show(self) -> None:
-        """Read the messages up to the position, and draw a picture."""
+        """Read the messages up to the current position, and draw a picture."""
         recording, pictures = self._recording, self._pictures
         if (target := self._target) is not None:
             self._target, self.position = None, target
             pictures.clear()
-            # Include the history for the plots.
+            # Start early enough to include the plots' history.
             self._messages = recording.messages(TOPICS, target - SECONDS)
             self._ahead = next(self._messages, None)
         while self._ahead is not None and (self._is_past(self._ahead[1]) or not pictures.states):
