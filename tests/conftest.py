@@ -1,4 +1,4 @@
-"""Provide shared fixtures for private addresses, complete daemons and polling.
+"""Define fixtures shared by all tests.
 
 Each test process has its own loopback addresses and folders, so that tests can run in parallel. All
 processes that a test starts, directly or indirectly, are killed when the test ends.
@@ -56,7 +56,7 @@ def pytest_report_header() -> str:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Treat SIGTERM like Ctrl-C, and adopt orphaned descendants of tests."""
+    """Treat SIGTERM like Ctrl-C, and adopt orphaned processes that tests started."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     descendants.adopt_orphans()
     # Start the resource tracker here, because a tracker started by a test would be killed with that
@@ -72,9 +72,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip extended tests unless ``-m`` selects tests or the command line names their file.
+    """Skip an extended test unless ``-m`` is given or the command line names the test's file.
 
-    Tests that mostly wait run first, in parallel with tests that compute.
+    Tests that mostly wait start first, and other tests run while they wait.
     """
     if not config.option.markexpr:
         named = {Path(each.partition("::")[0]).resolve() for each in config.args}
@@ -87,7 +87,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Exclude about a million permanent objects of imported modules from garbage collection."""
+    """Make garbage collection skip the million objects of imported modules."""
     if session.config.stash.get(PERTURBATION, None) is not None:
         session.config.stash[PERTURBATION].enter_modules()
     gc.collect()
@@ -95,13 +95,13 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_unconfigure() -> None:
-    """Kill processes that a crashed test process left behind and that this process has adopted."""
+    """Kill the adopted processes that a crashed test process left behind."""
     descendants.end(descendants.running() - _OUR_OWN)
 
 
 @pytest.fixture(autouse=True)
 def ended_with_the_test() -> Iterator[None]:
-    """After each test, kill its child processes; restore signal handlers and garbage collection."""
+    """After a test, kill the test's processes, restore signal handlers and enable the collector."""
     before = descendants.running()
     handlers = {each: signal.getsignal(each) for each in _SIGNALS}
     yield
@@ -138,8 +138,7 @@ def addresses() -> tuple[str, str]:
 def write_profile(path: Path, addresses: tuple[str, str], text: str = "") -> Path:
     """Write a profile that contains ``addresses`` and ``text``.
 
-    Unless ``text`` sets the loop rate, the rate is 100 Hz, because the daemons of several tests
-    share the processors.
+    The default loop rate is 100 Hz, because the daemons of several tests share the processors.
     """
     stream, commands = addresses
     rate = "" if "loop.rate" in text else "loop.rate = 100.0\n"
@@ -200,7 +199,7 @@ def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
 
 
 def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
-    """Poll ``condition`` at increasing intervals; the timeout only detects hangs."""
+    """Poll ``condition`` until it is true; raise TimeoutError if this takes too long."""
     begin = time.monotonic()
     while not condition():
         waited = time.monotonic() - begin
@@ -230,7 +229,7 @@ def make() -> Iterator[Make]:
 
 @pytest.fixture
 def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set the solid tip's data errors to zero, for frames generated from the same data."""
+    """Set the errors of solid tip data to zero, because tests simulate frames from that data."""
     from softfinger.kinematics.estimation import error_budget, estimator
 
     data = estimator.solid_data

@@ -1,7 +1,7 @@
-"""Fuzz the given targets (default: all): ``python -m tests.fuzz TARGET … --count N --seed S``.
+"""Fuzz some or all targets with ``python -m tests.fuzz TARGET … --count N --seed S``.
 
 Each target receives N inputs. The run stops at the first input that raises an unexpected exception.
-Errors of any other kind are printed, and the run continues.
+Errors that do not raise an exception are printed, and the run continues.
 """
 
 import argparse

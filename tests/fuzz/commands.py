@@ -63,7 +63,7 @@ def some_message(rng: random.Random) -> bytes:
         return rng.randbytes(rng.randrange(0, 200))
     if kind < 0.12:
         return rng.randbytes(rng.choice((_MAX_BYTES - 1, _MAX_BYTES + 1, 4 * _MAX_BYTES + 1)))
-    if kind < 0.15:  # The value is deeply nested, or its length exceeds the data.
+    if kind < 0.15:  # The value is deeply nested, or its header states more bytes than follow.
         deep = rng.choice((b"\x91" * 3000, b"\x81\xa1a" * 1000, b"\xdf\xff\xff\xff\xff"))
         return deep + rng.randbytes(rng.randrange(8))
     try:
@@ -74,10 +74,10 @@ def some_message(rng: random.Random) -> bytes:
 
 
 class CommandTarget:
-    """Hand on the virtual clock; its command server is called directly and through a socket.
+    """Hand in virtual time; messages are passed to the hand directly or through a socket.
 
-    After every message the hand must keep working: it ticks, its goals are within the limits, and
-    torque is off in modes without torque.
+    After every message, the loop must still run and the goals must be within the limits. In modes
+    without torque, torque must be off.
     """
 
     def __init__(self) -> None:
@@ -122,7 +122,7 @@ class CommandTarget:
             commands._take([b"%d" % self.asked, message], "", machine_time())
             for _ in range(3):
                 self.served.serve(self.loop.command)
-                sent.extend(commands._replies)  # replies that are held back after a stop
+                sent.extend(commands._replies)  # replies that the gateway delays after a stop
                 commands._replies.clear()
                 if sent:
                     break
@@ -223,7 +223,7 @@ def settings_target() -> FileTarget:
 
 
 def calibration_target() -> FileTarget:
-    """Return the fuzz target for calibration files, with a small sensor to keep the files short."""
+    """Return the fuzz target for calibration files of a sensor with few cells."""
     rows, cols = 4, 5
     sensor = {"finger": "left", "label": "x", "rows": rows, "cols": cols, "full_count": 255}
     table = [[1.0 + 0.1 * column for column in range(cols)] for _ in range(rows)]

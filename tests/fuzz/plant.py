@@ -15,8 +15,8 @@ from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 LONGER = 10  # One in three hands uses a time step that is longer by this factor.
 EACH = 400  # number of commands per hand
 SHAPES = ("rectangle", "rectangle", "disc", "wedge", "none")
-# The columns are joint, mode, torque on, goal, current, three load components, load set, reset,
-# seconds and quiet.
+# Columns of a command: joint, mode, torque on, goal, current, three load components, load set,
+# reset, seconds, quiet.
 _COLUMNS = 12
 
 FINE, NOT_FINITE, UNTOLD, RUNAWAY, CREATED = range(5)
@@ -57,7 +57,7 @@ def is_sound(plant):
 
 @kernel
 def carry_out(plants, data, ring, commands):
-    """Execute the commands one by one; return the error found and the index of its command."""
+    """Execute the commands; return the first error and the index of the faulty command."""
     plant = plants[0]
     goals, state, felt = plant.goals, plant.state, plant.sensed_contact
     for k in range(commands.shape[0]):
@@ -72,7 +72,7 @@ def carry_out(plants, data, ring, commands):
             state.position[:] = 0.0
             state.velocity[:] = 0.0
             state.position[3] = 0.08
-        if commands[k, 11] > 0.0:  # Without input, the energy may only decrease from now on.
+        if commands[k, 11] > 0.0:  # Without input, the energy may only decrease.
             goals.torque_on[:] = 0
             state.current[:] = 0.0
             goals.load[:] = 0.0
@@ -146,7 +146,7 @@ def random_commands(generator: np.random.Generator, count: int) -> np.ndarray:
 
 
 def abuse(seed: int, count: int = EACH) -> str:
-    """Send ``count`` random commands to a random hand; return the error found, or \"\"."""
+    """Send ``count`` random commands to a random hand; return the error, or an empty string."""
     generator = np.random.default_rng(seed)
     hand = random_hand(generator, seed % 3 == 0)
     commands = random_commands(generator, count)

@@ -51,7 +51,7 @@ def fuzz(count: int, seed: int) -> Report:
 def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
     """Return True if the servo replies to a ping while all other servos are silent.
 
-    All other servos are silenced, because several servos may have the same ID.
+    The other servos are silenced, because a servo may have the same ID as another servo.
     """
     for each in bus.servos:
         each.silent = each is not servo

@@ -56,7 +56,7 @@ def _stream(source: random.Random, target: str, sent: dict[bytes, int]) -> bytes
 
 
 def fuzz_framing(target: str, count: int, seed: int) -> Report:
-    """Feed a decoder ``count`` mutated streams in pieces; it must still find valid frames."""
+    """Feed ``count`` mutated streams to a decoder, which must still find the valid frames."""
     source = random.Random(seed)
     decoder: Decoder = DECODERS[target](ROWS, COLS)
     fed, frames, foreign = 0, 0, 0

@@ -1,10 +1,9 @@
-"""Report or change the floating-point environment, which affects the last bits of results.
+"""Report or change the floating-point environment, on which the last bits of results depend.
 
 ``python -m tests.harness.arithmetic MODULE …`` runs ``python -m MODULE …`` in a different
-environment: OpenBLAS uses the kernels of an older processor, NumPy uses only its baseline SIMD
-loops, and Numba compiles for a generic processor. The generic Numba kernels have their own cache
-folder, because the folder name depends on the target processor
-(`kinematics.compiled.kernel_folder`).
+environment. In this environment, OpenBLAS uses the kernels of an older processor. NumPy uses only
+its baseline SIMD loops, and Numba compiles for a generic processor. The generic kernels are cached
+in their own folder (see `kinematics.compiled.kernel_folder`).
 """
 
 import ctypes
@@ -70,7 +69,7 @@ def other() -> dict[str, str]:
 
 
 def main() -> None:
-    """Execute the command in the other environment, in place of the current process."""
+    """Replace the current process with the command in the other environment."""
     variables = other()
     named = " ".join(f"{name}='{value}'" for name, value in variables.items())
     print(f"usual arithmetic: {described()}", f"now with {named}", sep="\n", flush=True)

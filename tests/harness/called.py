@@ -1,4 +1,4 @@
-"""Compile test wrappers for inner kernels, which Python cannot call directly."""
+"""Compile inner kernels, which Python cannot call directly, as kernels for tests."""
 
 from typing import Any
 
@@ -6,5 +6,5 @@ from softfinger.kinematics.compiled.kernel import kernel
 
 
 def called(inner: Any) -> Any:
-    """Recompile an inner kernel's source as a kernel that Python can call."""
+    """Compile an inner kernel's source as a kernel that Python can call."""
     return kernel(inner.py_func)

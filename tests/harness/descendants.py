@@ -1,7 +1,7 @@
 """Find and kill processes that tests started, directly or indirectly.
 
-When run as a program with a word as its argument, this module waits until its standard input
-closes. The module then kills every process whose environment contains the word.
+As a program, this module waits until its standard input closes. The program then kills every
+process whose environment contains the program's argument.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ _PR_SET_CHILD_SUBREAPER = 36  # from <linux/prctl.h>
 
 @contextlib.contextmanager
 def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
-    """Context manager that kills a process on exit; a plain ``with`` would wait forever."""
+    """Kill the process on exit; ``with process`` alone would wait for it forever."""
     with process:
         try:
             yield process
@@ -28,12 +28,12 @@ def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
 
 
 def adopt_orphans() -> None:
-    """Adopt descendants whose parent process exits."""
+    """Adopt every descendant whose parent process exits."""
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def end_with_this_process() -> None:
-    """Ensure that child processes are killed when this process ends, even by SIGKILL."""
+    """Ensure that child processes are killed when this process ends, even if SIGKILL ends it."""
     word = f"TESTS_OF_PROCESS={os.getpid()}"
     _watching.append(
         subprocess.Popen(
@@ -51,7 +51,7 @@ _watching: list[subprocess.Popen[bytes]] = []
 
 
 def running(process: int | None = None) -> set[int]:
-    """Return the IDs of a process's children (default: this process)."""
+    """Return the IDs of a process's children, by default of this process."""
     tasks = Path(f"/proc/{process or os.getpid()}/task").glob("*/children")
     found: set[int] = set()
     for task in tasks:
@@ -68,7 +68,7 @@ def end(processes: set[int]) -> None:
             os.kill(process, signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             os.waitpid(process, 0)
-        end(below)  # This process has adopted these descendants.
+        end(below)  # This process has adopted the children of the killed process.
 
 
 def _sweep(word: bytes) -> bool:

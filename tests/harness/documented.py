@@ -1,7 +1,7 @@
-"""Execute `softfinger` commands from the documentation's shell blocks in the test process.
+"""Execute the `softfinger` commands of the documentation in the test process.
 
-Commands that run until interrupted are only parsed, together with their profile. An emulated hand
-runs in a separate process and replaces any earlier emulated hand.
+If a command would run until it is interrupted, only the command's arguments and profile are
+checked. Each emulated hand runs in a separate process and replaces the previous emulated hand.
 """
 
 import contextlib
@@ -43,14 +43,14 @@ sys.exit(status)
 
 
 def parse(words: list[str]) -> None:
-    """Parse arguments and load their profile; exit or raise SettingsError if they are invalid."""
+    """Parse arguments and load the profile; exit or raise SettingsError if either is invalid."""
     arguments = make_parser({words[0]})[0].parse_args(words)
     if hasattr(arguments, "set"):
         profile(arguments)
 
 
 class Softfinger:
-    """Stand-in ``softfinger`` program in ``folder``; `serve` executes one call."""
+    """Stand-in for the ``softfinger`` program, in ``folder``; `serve` executes one call."""
 
     def __init__(self, folder: Path) -> None:
         client, command = folder / "client.py", folder / "softfinger"
@@ -97,7 +97,7 @@ class Softfinger:
             return _await(words[1])
         if name == "emulate" and "--send" not in words:
             return self._emulate(words)
-        if name == "run":  # A recording uses the default addresses.
+        if name == "run":  # Replace the default addresses.
             for each in ("stream", "commands"):
                 words += ["--set", f"{each}.address=ipc://{Path.cwd()}/{each}"]
             return subprocess.run([*SOFTFINGER, *words, "--duration", "1"], check=False).returncode
@@ -108,7 +108,7 @@ class Softfinger:
                 return main(words)
 
     def _run(self, words: list[str]) -> int:
-        """Run the daemon for an emulated hand; later commands go to this daemon."""
+        """Run the daemon of an emulated hand, which receives all later commands."""
         self._end_daemon()
         stream, commands = (f"ipc://{Path.cwd()}/{each}" for each in ("stream", "commands"))
         own = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
@@ -163,7 +163,7 @@ def _await(shown: str) -> int:
 
 
 def _patient_doctor() -> contextlib.ExitStack:
-    """Patch the doctor for a busy machine on which other processes use sockets."""
+    """Skip the doctor's address check, and shorten its wake-up measurement."""
     from softfinger.daemon.diagnosis import machine
     from softfinger.tools.setup import doctor
 

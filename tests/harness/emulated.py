@@ -31,7 +31,7 @@ READY_WITHIN = 200.0  # time limit for the start [s], which includes kernel comp
 def emulated(
     folder: Path, *faults: str, settings: Settings | None = None, **options: Any
 ) -> Iterator[Emulator]:
-    """Run an emulator in a thread; the context is entered once the emulator is ready."""
+    """Run an emulator in a thread; enter the context once the emulator is ready."""
     made = Emulator(settings or Settings(), folder, faults=faults, **options)
     ready = threading.Event()
     runner = threading.Thread(target=made.run, args=(ready.set,), daemon=True)
@@ -64,7 +64,7 @@ class EmulatorProcess:
         return self
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Send a signal; return the exit status and the output without compilation messages."""
+        """Send a signal; return the exit status, and the output without compilation messages."""
         self.popen.send_signal(number)
         out, err = self.popen.communicate(timeout=300)
         return self.popen.returncode, out, _COMPILED.sub("", err)
@@ -79,7 +79,7 @@ class EmulatorProcess:
 
 
 class PatientPort(PortHandler):
-    """Port that waits longer than the SDK's 34 ms for a reply, because the machine may be busy."""
+    """Port that waits a minute for a reply, because a busy machine may exceed the SDK's 34 ms."""
 
     patience = 60_000.0  # ms
 
@@ -88,7 +88,7 @@ class PatientPort(PortHandler):
 
 
 class SdkServos:
-    """Access to the servos through the manufacturer's SDK."""
+    """Access to the emulated servos through the manufacturer's SDK."""
 
     def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
         self.port = PatientPort(str(folder / "servos"))

@@ -1,6 +1,6 @@
-"""Publish states and serve commands on real sockets; formulas replace the hand and its daemon.
+"""Publish computed states and serve commands on real sockets, without a hand or a daemon.
 
-Client tests connect to these sockets and control all messages.
+Client tests connect to these sockets and choose all messages.
 """
 
 from __future__ import annotations
@@ -81,10 +81,10 @@ def event(seq: int, kind: str, text: str, level: str = "info") -> dict[str, Any]
 class FakeDaemon:
     """Publish states at 100 Hz and frames at 25 Hz until closed.
 
-    ``changes`` are merged into every state. ``requests`` contains the received commands and
-    ``keys`` the client key of each. ``replies`` maps a command to its reply, or to a list of
-    successive replies. ``silent`` suppresses all states, ``deaf`` suppresses all replies, and
-    ``dead`` names the fingers whose frames are suppressed.
+    ``changes`` are merged into every state. ``requests`` contains the received commands, and
+    ``keys`` contains each command's client key. ``replies`` maps a command to its reply, or to a
+    list of successive replies. ``silent`` suppresses all states, ``deaf`` suppresses all replies,
+    and ``dead`` names the fingers whose frames are suppressed.
     """
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ from tests.conftest import until
 
 
 class Served:
-    """Both ends of a link: clients connect to the gateway's end, and tests use the loop's end."""
+    """A gateway and the loop's end of its link; clients connect to the gateway."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class Served:
             self.service.step(0.0)
 
     def has_request(self) -> bool:
-        """Accept new clients, and return True if libzmq has received a request."""
+        """Authenticate new clients, and return True if libzmq has received a request."""
         self.service._sockets.authenticate(0.0)
         return bool(self.service.commands.socket.poll(0))
 

@@ -1,4 +1,4 @@
-"""Generate the golden recording: a grasp, a turn, a refused command, a release and a stop.
+"""Generate the golden recording of a grasp, a turn, a refused command, a release and a stop.
 
 Run ``python -m tests.harness.golden_recording`` after an intended change in the hand's behaviour.
 The JSON file next to the recording lists the machine and package versions used.

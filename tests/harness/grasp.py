@@ -1,16 +1,16 @@
-"""Reference model of a grasp: two rotational fingers, two soft tips, and an object at equilibrium.
+"""Reference model of a grasp, in which two soft tips hold an object at equilibrium.
 
 The energy is the sum of both tips' energies and the potential energy of gravity. With the shear
 d_t, a tip's energy is
 
     U(d, θ, d_t) = U₀(d, θ) + F(d, θ) (sin θ d_t + cos θ d_t²/d)
 
-where U₀ and F are taken from the contact table. For a constant modulus, U is the energy of the
-parallel-distributed model, πE[d³/(3cos²θ) + d² d_t tan θ + d d_t²]. The shear force is T = ∂U/∂d_t
-and the normal force is N = ∂U/∂d − T tan θ. The shear displacements are computed from the rolling
+where U₀ and F are taken from the contact table. For a constant modulus, the parallel-distributed
+model gives U = πE[d³/(3cos²θ) + d² d_t tan θ + d d_t²]. The shear force is T = ∂U/∂d_t and the
+normal force is N = ∂U/∂d − T tan θ. The shear displacements are computed from the rolling
 increments of `reference_hand`. The increments are not integrable in general, so a grasp depends on
-its path: motions are divided into small steps, and the shears of the steps are summed. The grasp is
-at equilibrium if the energy is stationary along the increments.
+its path. Motions are therefore divided into small steps, and the shears of the steps are summed.
+The grasp is at equilibrium if the energy is stationary along the rolling increments.
 """
 
 from dataclasses import dataclass
@@ -27,17 +27,17 @@ FloatArray = NDArray[np.float64]
 
 # Equilibrium tolerance relative to the contact forces. Rounding errors are about 1e-14.
 _TOLERANCE = 1e-11
-_STEP = 1e-6  # Step for finite differences of forces, in rad or in tip radii.
+_STEP = 1e-6  # step for finite differences of forces [rad or tip radii]
 
 
 class GraspError(SoftfingerError, ValueError):
-    """Error raised if a contact opens or leaves its range, or if no equilibrium is found."""
+    """Error raised if a contact opens or leaves the table's range, or if no equilibrium exists."""
 
 
 def sheared_contact(
     table: ContactTable, d: Any, theta: Any, shear: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, Any]:
-    """Return (U, ∂U/∂d, ∂U/∂θ, T = ∂U/∂d_t, inside) for shears ``shear`` [m]; zeros for d ≤ 0."""
+    """Return (U, ∂U/∂d, ∂U/∂θ, ∂U/∂d_t, inside) for the shears [m]; all values are 0 for d ≤ 0."""
     c = table(d, theta, edge=True)
     sine, cosine = np.sin(theta), np.cos(theta)
     bend = np.where(np.greater(d, 0.0), shear / np.where(np.greater(d, 0.0), d, 1.0), 0.0)
@@ -53,7 +53,7 @@ def sheared_contact(
 
 @dataclass(frozen=True)
 class GraspState:
-    """Joint angles (2,) [rad], object pose (x, y, φ) and shears (2,) [m]; treated as immutable."""
+    """Joint angles (2,) [rad], object pose (x, y, φ) and shears (2,) [m]."""
 
     q: FloatArray
     pose: FloatArray
@@ -67,9 +67,9 @@ class GraspState:
 
 @dataclass(frozen=True)
 class GraspForces:
-    """Grasp forces, each of shape (2,), left finger first."""
+    """Forces of a grasp, in arrays of shape (2,) with the left finger first."""
 
-    force: FloatArray  # force F on the tip's base, equal to the sum over a pressure grid [N]
+    force: FloatArray  # force F on the tip's base, which is the integral of the pressure [N]
     normal: FloatArray  # N [N]
     tangential: FloatArray  # T [N]
     turning: FloatArray  # ∂U/∂θ, the moment that turns the object relative to the tip [N·m]
@@ -93,9 +93,9 @@ class Grasp:
         self._weight = np.array(weight, dtype=np.float64)
 
     def symmetric(self, d: float) -> GraspState:
-        """Return a state with both tips indented by ``d`` [m], an upright object and no shear.
+        """Return the state in which an upright object indents both tips by ``d`` [m] without shear.
 
-        Raise ValueError if the fingers cannot reach this state, and GraspError if the state is
+        Raise ValueError if the fingers cannot reach this state. Raise GraspError if the state is
         outside the tip's range.
         """
         q = self.hand.inverse((0.0, 0.0, 0.0), (d, d), self.width)
@@ -106,15 +106,14 @@ class Grasp:
         return state
 
     def gradient(self, state: GraspState) -> FloatArray:
-        """Return the energy derivative (5,) along the rolling increments of (q1, q2, x, y, φ).
+        """Return the energy's derivatives (5,) along the rolling increments of (q1, q2, x, y, φ).
 
-        The first two elements are the equilibrium joint torques; the last three vanish at
-        equilibrium.
+        At equilibrium, the first two elements are the joint torques, and the last three are zero.
         """
         return self._evaluate(state.coordinates, state)[0]
 
     def forces(self, state: GraspState) -> GraspForces:
-        """Return the forces and moments of both contacts and the joint torques."""
+        """Return the joint torques, and the forces and moments of both contacts."""
         d, theta, _ = self.hand.variables(state.coordinates, self.width).T
         _, by_d, turning, tangential, _ = sheared_contact(self.table, d, theta, state.shear)
         normal, torque = by_d - tangential * np.tan(theta), self.gradient(state)[:2]
@@ -129,7 +128,8 @@ class Grasp:
         x = state.coordinates
         if q is not None:
             x[:2] = q
-        # Scale displacements and moments by the tip radius to balance rows and columns.
+        # Scale displacements and moments by the tip radius, so that all matrix entries have similar
+        # sizes.
         unit = np.array([self.hand.tip_radius, self.hand.tip_radius, 1.0])
 
         def residual(pose: FloatArray) -> FloatArray:
@@ -153,8 +153,8 @@ class Grasp:
     def steer(self, state: GraspState, delta: float) -> GraspState:
         """Return the equilibrium after both fingers rotate by ``delta`` [rad] to the right.
 
-        The joints are then at q1 + δ and q2 − δ. The object turns in the opposite direction, by
-        about 2(a − d + L sin q + e cos q)/W per radian.
+        The joints are then at q1 + δ and q2 − δ. Per radian, the object turns by about 2(a − d + L
+        sin q + e cos q)/W in the opposite direction.
         """
         ways = state.q + np.outer(np.arange(1, 17) / 16, [delta, -delta])
         for q in ways:
@@ -164,7 +164,7 @@ class Grasp:
     def _evaluate(
         self, coordinates: FloatArray, start: GraspState
     ) -> tuple[FloatArray, FloatArray, bool]:
-        """Return gradient (5,), both shears, and True if both contacts are closed and in range."""
+        """Return the gradient (5,), the shears (2,), and True if both contacts are valid."""
         moved = coordinates - start.coordinates
         middle = start.coordinates + 0.5 * moved
         shear = start.shear + self.hand.rolling_rows(middle, self.width) @ moved

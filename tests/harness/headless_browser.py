@@ -1,6 +1,6 @@
 """Control a headless Chromium through DevTools: open pages and evaluate scripts.
 
-The browser stores all data in a test folder and sends only the requests that the page makes.
+The browser stores all data in a test folder and sends no requests except the page's requests.
 """
 
 import json
@@ -40,7 +40,7 @@ def browser_path() -> str | None:
 
 
 class Browser:
-    """One page in one browser; ``requests`` contains the addresses that the page requested."""
+    """A browser with one page; ``requests`` contains the addresses that the page requested."""
 
     def __init__(self, path: str, folder: Path) -> None:
         words = [*_FLAGS, f"--user-data-dir={folder}"]

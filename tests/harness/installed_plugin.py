@@ -1,4 +1,4 @@
-"""Make this tree's pytest plugin visible to other processes, as if it were installed."""
+"""Make this repository's pytest plugin visible to other processes, as if it were installed."""
 
 import os
 import tomllib
@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def plugin_path(folder: Path) -> str:
-    """Write an installed package's metadata to ``folder``; return a PYTHONPATH that includes it.
+    """Write the metadata of an installed package to ``folder``; return a PYTHONPATH for it.
 
     The entry points are taken from pyproject.toml.
     """

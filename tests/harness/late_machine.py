@@ -4,7 +4,7 @@ from softfinger.daemon.clock import VirtualClock
 
 
 class LateMachine(VirtualClock):
-    """Replacement for the real clock. Only `work` and sleeps advance the time.
+    """Replacement for the real clock, for tests. Only `work` and sleeps advance the time.
 
     ``late_by`` holds the delays of the next wake-ups [s].
     """

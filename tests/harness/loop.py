@@ -1,4 +1,4 @@
-"""Run a complete daemon on the virtual clock without sockets."""
+"""Run a complete daemon in virtual time, without sockets."""
 
 from collections.abc import Callable
 from typing import Any
@@ -44,14 +44,14 @@ def refusal(daemon: Daemon, name: str, **numbers: float) -> str:
 
 
 def heard(daemon: Daemon) -> list[Event]:
-    """Return a list that collects the daemon's future events."""
+    """Return a list to which all later events of the daemon are appended."""
     events: list[Event] = []
     daemon.loop._on_event = lambda *event: events.append(event)
     return events
 
 
 def change_frames(daemon: Daemon, finger: int, change: Callable[[Frame], Frame | None]) -> None:
-    """Pass each new frame of one sensor through ``change`` from now on."""
+    """Replace each later frame of one sensor with the result of ``change``."""
     sensor = daemon.loop.perception.fingers[finger].sensor
     really, last = sensor.latest, [None, None]
 
@@ -65,6 +65,6 @@ def change_frames(daemon: Daemon, finger: int, change: Callable[[Frame], Frame |
 
 
 def silence(daemon: Daemon) -> None:
-    """Suppress all frames from now on."""
+    """Suppress all later frames of both sensors."""
     for perception in daemon.loop.perception.fingers:
         perception.sensor.latest = lambda kept=perception.frame: kept

@@ -1,4 +1,4 @@
-"""Print the newest Python release on this machine, found on PATH or in pyenv."""
+"""Print the newest Python release that PATH or pyenv provides on this machine."""
 
 import os
 import re

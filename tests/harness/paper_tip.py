@@ -1,4 +1,4 @@
-"""Provide the paper's tip and sensor, which most tests use.
+"""Define the paper's tip and sensor, which most tests use.
 
 The tip has a radius of 20 mm and a modulus of 0.304 MPa. The sensor has 44 × 44 cells on a 58 mm
 square.
@@ -41,7 +41,7 @@ CHECKPOINTS = (
 
 
 def tilts(theta: float, azimuth: float) -> tuple[float, float]:
-    """Return (tilt_x, tilt_y) for a total tilt towards ``azimuth`` [rad]."""
+    """Return (tilt_x, tilt_y) for a tilt of ``theta`` [rad] towards ``azimuth`` [rad]."""
     return (
         math.asin(math.sin(theta) * math.cos(azimuth)),
         math.asin(math.sin(theta) * math.sin(azimuth)),
@@ -51,8 +51,8 @@ def tilts(theta: float, azimuth: float) -> tuple[float, float]:
 def dense(
     grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
 ) -> np.ndarray[Any, Any]:
-    """Return the blurred pressure averaged over cells, with ``pieces`` samples per cell side."""
-    from scipy.ndimage import gaussian_filter  # Importing SciPy is slow; few tests need it.
+    """Return the mean blurred pressure of each cell, from ``pieces``² samples per cell."""
+    from scipy.ndimage import gaussian_filter  # Importing SciPy takes long, and few tests need it.
 
     d, tilt_x, tilt_y = contact
     axes = []
@@ -76,7 +76,7 @@ def dense(
 def fisher(
     grid: SensorGrid, material: Material, truth: Any, noise: float, free_gain: bool
 ) -> np.ndarray[Any, Any]:
-    """Return the numerical inverse of the Fisher information for (d, tilt_x, tilt_y[, gain])."""
+    """Return the inverse of the Fisher information of (d, tilt_x, tilt_y[, gain])."""
     columns = []
     for k, step in enumerate((1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free_gain else 3]):
         ends = []
@@ -95,7 +95,7 @@ def errors(estimate: Any, truth: Any) -> np.ndarray[Any, Any]:
 
 
 def board(pascal_per_count: float = 1.0, **range_: int) -> TactileSettings:
-    """Return board settings for the paper's sensor, with 16 bits by default."""
+    """Return the board settings of the paper's sensor; frames have 16 bits by default."""
     return TactileSettings(pascal_per_count=pascal_per_count, **range_)
 
 

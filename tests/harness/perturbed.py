@@ -2,21 +2,21 @@
 
 ``pytest --perturb SEED`` changes the following values by -1, 0 or 1 unit in the last place:
 
-- the results of elementary functions, sums and products of NumPy and `math`, in test modules and in
-  softfinger modules without kernels;
+- the results of NumPy's and `math`'s elementary functions, sums and products, in modules of tests
+  and of softfinger that contain no kernels;
 - the results of `numpy.linalg` in all modules;
 - the results of functions passed to `solve_ivp` and `curve_fit`;
 - the results of contact tables, closed forms, quadrature, material laws and pressure grids;
 - the parameters of each simulated plant, which affect transitions between stick and slip.
 
-The change depends only on the number, the position in the array, and SEED. Repeating a computation
-therefore gives the same bits, but arrays and single numbers give different results, and values that
-are equal by symmetry become different. Integers are not changed, because every library computes sin
-0 and cos 0 exactly.
+The change depends only on the number, the position in the array, and SEED, so a repeated
+computation gives the same bits. An array and a single number give different results, and values
+that are equal by symmetry become different. Integers are not changed, because every library
+computes sin 0 and cos 0 exactly.
 
 The option does not affect operators (``+``, ``@``), array methods, intermediate results of kernels,
-modules imported within a function, or other processes. `tests.harness.arithmetic` covers these
-cases with another BLAS and other machine code.
+modules imported within a function, or other processes. `tests.harness.arithmetic` covers the
+omitted cases with another BLAS and other machine code.
 """
 
 import importlib
@@ -75,7 +75,7 @@ class Perturbation:
         self._wrap(importlib.import_module(_PLANT), "SimulatedHand.__init__", self._moving_plant)
 
     def enter_modules(self) -> None:
-        """Replace `np` and `math` in modules without kernels once all imports are complete."""
+        """Replace `np` and `math` in all imported modules without kernels."""
         own = {"np": self._own(np, _NUMPY), "math": self._own(math, _MATH)}
         for name, module in list(sys.modules.items()):
             names = vars(module)
@@ -85,7 +85,7 @@ class Perturbation:
                 names.update({key: own[key] for key in own if names.get(key) in (np, math)})
 
     def moved(self, value: Any) -> Any:
-        """Return ``value`` with its floats perturbed; arrays are changed in place."""
+        """Return ``value`` with all floats perturbed; arrays are changed in place."""
         if isinstance(value, tuple):
             parts = [self.moved(each) for each in value]
             return value._make(parts) if hasattr(value, "_make") else tuple(parts)

@@ -36,7 +36,7 @@ def place(hand: SimulatedHand, q, pose, dq=(0, 0), velocity=(0, 0, 0)) -> None:
 
 
 def hold_with(hand: SimulatedHand, currents) -> None:
-    """Apply constant currents from the start, regardless of joint velocity."""
+    """Apply constant motor currents, which do not decrease with the joint velocity."""
     hand.plant.parameters.no_load_speed = 1e9
     hand.current[:] = currents
     for joint in range(2):
@@ -56,7 +56,7 @@ def settled(hand: SimulatedHand, goals, current: float, seconds: float = 2.0) ->
 def push_along(hand: SimulatedDaemon, force: float, rate: float, start: float = 0.0) -> float:
     """Push the object along its faces from ``start`` to ``force`` [N] at ``rate`` [N/s].
 
-    A positive force points away from the palm and remains applied. Returns the tips' maximum
+    The force remains applied; a positive force points away from the palm. Returns the tips' maximum
     friction utilisation.
     """
     dt, used = 0.02, 0.0

@@ -1,4 +1,4 @@
-"""Record the simulated hand on the virtual clock while it executes commands at given ticks."""
+"""Record the simulated hand while it executes commands at given ticks of the virtual clock."""
 
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,10 @@ def record_hand(
     profile: str | None = None,
     hand: tuple[str, ...] = (),
 ) -> list[str]:
-    """Record a run in which each command in ``due`` is sent at its tick (500 per second).
+    """Record a run; ``due`` maps ticks (500 per second) to the commands that are sent then.
 
     ``hand`` contains settings that apply only to the simulated hand, not to the daemon. Returns the
-    reasons for the refused commands.
+    reasons for which commands were refused.
     """
     refused = []
     with VirtualHand(profile, changes, hand) as made, made.record(path):

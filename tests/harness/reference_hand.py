@@ -1,10 +1,11 @@
-"""Reference for tests: the hand's contact Jacobian, rolling constraint and inverse kinematics.
+"""Compute the hand's contact Jacobian, rolling constraint and inverse kinematics as a reference.
 
 A tip that rolls without slip is sheared by
 
     ḋ_t1 = (a − d1) θ̇1 − ṡ1 − tan θ1 ḋ1        ḋ_t2 = (a − d2) θ̇2 + ṡ2 − tan θ2 ḋ2
 
-where the tan θ term keeps the virtual work consistent. Coordinates are ordered (q1, q2, x, y, φ).
+where the tan θ term makes the virtual work of the contact forces consistent. Coordinates are
+ordered (q1, q2, x, y, φ).
 """
 
 import math
@@ -51,11 +52,11 @@ class ReferenceHand(HandGeometry):
         return np.asarray((self.tip_radius - d) * by_theta + along * by_s - np.tan(theta) * by_d)
 
     def inverse(self, pose: ArrayLike, d: ArrayLike, width: float) -> FloatArray:
-        """Return joint angles (2,) at which an object at ``pose`` indents the tips by ``d`` [m].
+        """Return the joint angles (2,) for which an object at ``pose`` indents the tips by ``d``.
 
-        The solution for the left finger follows from O1·n = −B cos φ + L sin θ1 + e cos θ1. The
-        mirror image of this equation holds for the right finger. A negative ``d`` is a gap. Raises
-        ValueError if a finger cannot reach this position.
+        The left joint angle is computed from O1·n = −B cos φ + L sin θ1 + e cos θ1. The mirror
+        image of this equation gives the right joint angle. The indentations are in metres; a
+        negative ``d`` is a gap. Raises ValueError if a finger cannot reach this position.
         """
         x, y, angle = vector(pose, 3, "pose")
         d1, d2 = vector(d, 2, "d")
@@ -69,5 +70,5 @@ class ReferenceHand(HandGeometry):
         )
 
     def _angle_for(self, inward: float) -> float:
-        """Return ψ with L sin ψ + e cos ψ = ``inward``, on the branch around 0."""
+        """Return the solution ψ of L sin ψ + e cos ψ = ``inward`` on the branch around 0."""
         return math.asin(inward / self.reach) - math.atan2(self.finger_offset, self.finger_length)

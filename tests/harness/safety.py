@@ -1,4 +1,4 @@
-"""Provide states for tests of the limits, and a `Safety` object that checks these states."""
+"""Create states, and `Safety` objects that check these states, for tests of the limits."""
 
 from typing import Any, cast
 
@@ -21,7 +21,7 @@ BOUNDS = SETTINGS.safety
 
 
 class Sensor:
-    """Sensor properties that the limits use."""
+    """Sensor with the properties that the limits use."""
 
     def __init__(self, finger: int) -> None:
         self.finger = finger
@@ -79,7 +79,7 @@ class Deaf:
 
 
 def bounded(judge: Safety, state: State) -> None:
-    """Limit the state's goal, as the daemon does before sending it to the servos."""
+    """Limit the state's goal as the daemon limits each goal for the servos."""
     judge.write(cast(Servos, Deaf()), state)
 
 
@@ -104,7 +104,7 @@ def levers(lever: float) -> GraspState:
 
 
 def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
-    """Hold the state for ``seconds`` and return the fault; check every limit at least once."""
+    """Check the unchanged state for ``seconds``, each limit at least once; return the fault."""
     found = None
     for _ in range(max(round(seconds / 0.002), len(LIMITS)) + len(LIMITS)):
         found = judge.judge(state)

@@ -1,6 +1,6 @@
-"""Emulated servo buses, called directly or served on a pty by a thread.
+"""Create emulated servo buses, which are called directly or served on a pty by a thread.
 
-Timing tests run the bus in a separate process instead of a thread.
+Tests of the timing run the bus in a separate process instead.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 
 
 def make_bus(model: str = "XM430-W210", ids: Sequence[int] = (1, 2), **options: Any) -> ServoBus:
-    """Return factory-new servos on free joints, by default at angle 0; see `free_servos`."""
+    """Return a bus with factory-new servos on free joints, by default at angle 0."""
     return free_servos(model, ids, **options)
 
 
 def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: Any) -> ServoBus:
-    """Return servos on free joints, configured for the hand with the given ``servos`` settings."""
+    """Return a bus of servos on free joints, configured according to the ``servos`` settings."""
     settings = Settings.model_validate({"servos": servos or {}})
     return ServoBus.from_settings(settings, FreeJoints(2, t), t=t, **options)
 
 
 def put_fault(bus: ServoBus, text: str, t: float) -> None:
-    """Apply a fault given as text, e.g. ``silent=2``."""
+    """Apply a fault that is given as text, such as ``silent=2``."""
     kind, _, value = text.partition("=")
     bus.fault(kind, float(value), t)
 
 
 def backend_settings(path: str, **servos: Any) -> Settings:
-    """Return Dynamixel backend settings for the port, with timeouts for a busy machine."""
+    """Return settings for the Dynamixel backend, with timeouts that allow for a busy machine."""
     waits = {"reply_timeout": 1.0, "watchdog": 2.0}
     values = {"backend": "dynamixel", "port": path} | waits | servos
     return Settings.model_validate({"servos": values})
@@ -57,7 +57,7 @@ def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
 
 
 class BusClient:
-    """Bus client with its own time and an independent parser for the replies."""
+    """Bus client that has its own time and parses the replies of one servo."""
 
     def __init__(self, bus: ServoBus) -> None:
         self.bus = bus
@@ -91,11 +91,11 @@ class BusClient:
 
 
 class DirectPort(SerialPort):
-    """Port connected to a bus in this thread: a reply is available immediately or never.
+    """Port connected directly to a bus, so a reply is available immediately or never.
 
     The bus takes its time from ``clock``. Without a clock, the bus uses ``t``, which the test sets.
-    If a reply is missing, the wait advances ``t`` to the deadline. With ``baud`` 0, the port
-    receives at any rate.
+    If a reply is missing, the wait advances ``t`` by the reply timeout. If ``baud`` is 0, the
+    servos accept any baud rate.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class DirectPort(SerialPort):
 
 
 class RunningBus(EmulatedBus):
-    """Bus served by a thread; by default with the servos listed in the settings."""
+    """Bus served by a thread, by default with the servos of the settings."""
 
     def __init__(self, bus: ServoBus | None = None, baud: int = 0, **options: Any) -> None:
         super().__init__(baud=baud, bus=bus or hand_bus(baud=baud, **options))

@@ -1,8 +1,8 @@
 """Compute frames of a solid tip with finite elements, for tests/golden/solid_frames.npz.
 
-``python -m tests.harness.solid_reference OUT`` uses neo-Hookean elements. The meshes differ from
-the meshes that were used to fit the data file, and the program does not use the fit's polynomials,
-modes or linear material law. The program requires pypardiso.
+``python -m tests.harness.solid_reference OUT`` uses neo-Hookean elements. The program's meshes
+differ from the meshes to which the data file was fitted. The program does not use the fit's
+polynomials, modes or linear material law. The program requires pypardiso.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from research.solid_tip.rubber import Body, Strained
 POISSON, RADIUS, PITCH, CELLS = 0.49, 20.0, 58.0 / 44, 44  # mm
 AREAS = np.pi * np.diff(RING_EDGES**2)
 BLOCKS = ("bonded", "lying", "bonded-sticking", "lying-sticking")
-# Block, tilt [°], mesh, slices, and depths [mm] of the stored frames.
+# block, tilt [°], mesh and number of slices of each tilted contact
 COARSE = Meridian(9, 2, 0.2)
 TILTED = (
     ("bonded", 15.0, Meridian(9, 8, 0.2), 8),  # mesh that is refined at the rim
@@ -32,11 +32,11 @@ class _Rings(SolidTip):
     edges = RING_EDGES
 
     def __init__(self) -> None:
-        """Create only the rings, which are sufficient for computing frames."""
+        """Skip the fitted data, because frames need only the rings."""
 
 
 def row(block: str, theta: float, press: Strained) -> dict[str, object]:
-    """Return one row of the data file; lengths are relative to the tip radius, stresses to E."""
+    """Return one row of the data file, with lengths in tip radii and stresses in units of E."""
     force = press.push * np.cos(theta) - press.shear * np.sin(theta)
     pressure = press.base * (force / (press.base[0] @ AREAS))
     frame = _Rings().frame(pressure, PITCH / RADIUS, CELLS)

@@ -1,4 +1,4 @@
-"""Work for sweeps in worker processes, in a module that each worker imports quickly."""
+"""Define cases for sweeps, in a module that worker processes import quickly."""
 
 import os
 import random
@@ -46,5 +46,5 @@ def hangs(folder: Path, seed: int) -> float:
 
 
 def run_hanging_sweep(folder: Path) -> None:
-    """Run a sweep in two processes that never ends."""
+    """Run an endless sweep in two processes."""
     list(Sweep("hangs", partial(hangs, folder), CASES).run(2))

@@ -1,4 +1,4 @@
-"""Run every tactile backend with known images, for the conformance tests."""
+"""Run any tactile backend with known images, for the conformance tests."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def why_not_open(sensor: TactileSensor) -> str:
 
 
 class Rig:
-    """Test context with one backend and its environment."""
+    """One backend, and the board, hand or recording that generates its frames."""
 
     def __init__(
         self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None
@@ -120,7 +120,7 @@ class Rig:
         return self.sensor.latest()
 
     def unplug(self) -> None:
-        """Simulate unplugging the board, from the thread that serves its port."""
+        """Let the thread that serves the board's port unplug the board."""
         self._unplug.set()
 
     def _serve(self) -> None:

@@ -48,7 +48,7 @@ class TerminalProcess:
             self.screen.reset()
 
     def pump(self, seconds: float = 0.02) -> None:
-        """Read the available output; if there is none, wait up to ``seconds`` for it.
+        """Read the available output; if there is none, wait for output for up to ``seconds``.
 
         At most one terminal buffer is read, because the process may write faster than the test
         reads.
@@ -64,7 +64,7 @@ class TerminalProcess:
         return "\n".join(self.screen.display)
 
     def wait(self, condition: Callable[[], Any], seconds: float = 150.0) -> None:
-        """Read output until ``condition`` is true; fail with the screen's text otherwise."""
+        """Read output until ``condition`` is true; on a timeout, fail with the screen's text."""
         deadline = time.monotonic() + seconds
         while not condition():
             self.pump()
@@ -82,7 +82,7 @@ class TerminalProcess:
         os.write(self.master, keys)
 
     def press(self, key: bytes, text: str) -> None:
-        """Press a key until ``text`` appears, because a busy machine may lose a key press."""
+        """Press a key until ``text`` appears; a busy machine may lose a single key press."""
         while text not in self.text():
             self.type(key)
             later = time.monotonic() + 1.0
@@ -99,7 +99,7 @@ class TerminalProcess:
         self.pump()
         pairs = ((b"\x1b[?1049h", b"\x1b[?1049l"), (b"\x1b[?25l", b"\x1b[?25h"))
         pairs += ((b"\x1b[?2004h", b"\x1b[?2004l"),)
-        # Both sequences of each pair must have been sent, with the restoring sequence last.
+        # The process must have sent both sequences of each pair, and the restoring sequence last.
         given = all(0 <= self.written.rfind(a) < self.written.rfind(b) for a, b in pairs)
         return given and termios.tcgetattr(self.slave) == self.attributes
 

@@ -16,8 +16,8 @@ WAIT = 60.0  # timeout for one picture [s]
 class Viewed:
     """A ``softfinger view`` process; the constructor returns once the process is serving.
 
-    ``address`` is the page's address, and ``commanding`` is the address with the token. ``folder``
-    is the working directory, where recordings are also stored.
+    ``address`` is the page's address, and ``commanding`` is the same address with the token.
+    ``folder`` is the working directory, where recordings are also stored.
     """
 
     def __init__(self, *words: str, folder: Path | None = None) -> None:
@@ -53,7 +53,7 @@ class Viewed:
 
 
 class Watcher:
-    """A page's connection, which requests pictures."""
+    """WebSocket connection that requests pictures as a page does."""
 
     def __init__(self, host: str, query: str = "", **more: Any) -> None:
         waits: Any = {"open_timeout": WAIT, "ping_timeout": None}

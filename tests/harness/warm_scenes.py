@@ -1,9 +1,9 @@
-"""Run many kinds of scene in a process and report the kernels compiled or loaded.
+"""Run scenes of many kinds, and report each scene's compiled and loaded kernels.
 
 ``python -m tests.harness.warm_scenes FOLDER SCENE…`` prints one line of JSON per scene. A
 calibration file is written to FOLDER. For the scene with an emulated hand, FOLDER must contain the
-hand's ports. Each scene runs in a fork of a process that has not called any kernel yet, so scenes
-do not warm up kernels for each other.
+hand's ports. Each scene runs in a fork of a process that has not called any kernel yet. A scene
+therefore cannot warm up kernels for other scenes.
 """
 
 import contextlib
@@ -61,7 +61,7 @@ SCRIPT: list[tuple[float, dict[str, Any]]] = [
 
 
 class Watch(event.Listener):
-    """Record each compilation of a kernel and each load from the cache; both delay a tick."""
+    """Record when kernels are compiled or loaded from the cache, because either delays a tick."""
 
     def __init__(self) -> None:
         self.heard: list[str] = []
@@ -80,7 +80,7 @@ class Watch(event.Listener):
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Run the script; report compilations at startup, outside all warm-up parts, and later."""
+    """Run the script; report the compilations before the script, and those the warm-up missed."""
     watch = Watch()
     modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch):
@@ -107,7 +107,7 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 def calibrated(folder: Path) -> dict[str, Any]:
-    """Return settings with a calibrated left sensor, so its frames contain pressures."""
+    """Return settings with a calibrated left sensor, whose frames contain pressures."""
     settings = Settings()
     cells = [[0.0] * settings.tactile.cols for _ in range(settings.tactile.rows)]
     tare = TareStep(date=now(), zero=cells, noise=1520.0, frames=16)

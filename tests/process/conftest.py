@@ -1,4 +1,4 @@
-"""Provide shared fixtures: servo buses, connected backends, a daemon and a fake daemon."""
+"""Define shared fixtures, such as servo buses, connected backends and a daemon."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -19,14 +19,14 @@ Connect = Callable[..., DynamixelServos]
 
 @pytest.fixture
 def running() -> Iterator[Run]:
-    """Return a function that runs a given bus, or the settings' servos, until the test ends."""
+    """Return a function that starts a bus, which runs until the test ends."""
     with ExitStack() as stack:
         yield lambda *bus, **options: stack.enter_context(closing(RunningBus(*bus, **options)))
 
 
 @pytest.fixture
 def bus(running: Run) -> RunningBus:
-    """Return a running bus with the servos defined in the settings."""
+    """Return a running bus with the servos of the settings."""
     return running()
 
 
@@ -39,13 +39,13 @@ def connect(running: Run) -> Iterator[Connect]:
 
 @pytest.fixture
 def fake() -> Iterator[FakeDaemon]:
-    """Return a fake daemon that has real sockets and computes its states from formulas."""
+    """Return a fake daemon that publishes computed states on real sockets."""
     with FakeDaemon() as fake:
         yield fake
 
 
 class Shared(NamedTuple):
-    """Daemon shared by several tests, each of which leaves it disarmed."""
+    """Daemon that several tests share; each test leaves the daemon disarmed."""
 
     running: Running
     profile: Path
@@ -67,7 +67,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
 
 @pytest.fixture
 def daemon(shared: Shared) -> Iterator[Shared]:
-    """Return the module's daemon, disarmed and without faults before and after the test."""
+    """Return the module's daemon; after the test, disarm the hand and clear any fault."""
     yield shared
     assert ask(shared.commands, "stop")["ok"]
     ask(shared.commands, "clear")  # The daemon refuses `clear` if there is no fault.

@@ -1,4 +1,4 @@
-"""Test the bus traffic record when it is read directly and through the control socket."""
+"""Test the record of the bus traffic, read directly and through the control socket."""
 
 import json
 import struct
@@ -17,7 +17,7 @@ UNIT = by_name("XM430-W350").current_unit
 
 
 class Hand(BusClient):
-    """Configured servos; rising counts close the left finger and open the right finger."""
+    """Client of a configured hand; higher counts close the left and open the right finger."""
 
     def __init__(self) -> None:
         super().__init__(hand_bus(10.0))

@@ -11,7 +11,7 @@ from softfinger.tools.calibration.joints import put
 from softfinger.tools.cli import main
 from tests.harness.emulated import HIL, SdkServos, emulated
 
-# True values of the emulated hand, which differ from the profile. The object is out of reach.
+# True values of the emulated hand; the profile has other values. The object is out of reach.
 TRUTH = [
     "servos.ids=[2,1]",
     "servos.direction=[-1,1]",
@@ -52,8 +52,8 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
     found = load(file, folder)
     assert (found.servos.ids, found.servos.direction) == ((2, 1), (-1, 1))
     assert found.servos.zero == pytest.approx((1500, 5300), abs=5)
-    # The emulated stops are 0.05 rad outside the limits. The calibration keeps a margin of 0.03
-    # rad, so the limits move outwards by 0.02 rad.
+    # The joints stop 0.05 rad outside the limits. The calibration sets each limit 0.03 rad inside a
+    # stop, so the limits move outwards by 0.02 rad.
     assert found.hand.q_min == pytest.approx((-0.42, -0.32), abs=0.01)
     assert found.hand.q_max == pytest.approx((0.92, 0.82), abs=0.01)
     assert "ids = [2, 1] # left, right" in file.read_text()

@@ -22,7 +22,7 @@ FRAMES = 12
 
 
 class Bench:
-    """Frames of the simulated sensor's board; each press of Enter applies the next load."""
+    """Frame source for a live board; each press of Enter applies the next load."""
 
     def __init__(self) -> None:
         self.sensor = MadeUp()
@@ -47,7 +47,7 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory):
-    """Run all load-by-load steps live; return the folder, the sensor and all messages."""
+    """Run all steps that need loads; return the folder, the sensor and all messages."""
     folder = tmp_path_factory.mktemp("live")
     bench = Bench()
     rig = Rig("cobs", folder, source=bench)

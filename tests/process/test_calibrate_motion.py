@@ -48,7 +48,7 @@ def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Hand]
 
 @pytest.fixture
 def calibrate(hand: tuple[Path, Hand]) -> Calibrate:
-    """Return a function that runs a step on the module's hand, which is disarmed afterwards."""
+    """Return a function that runs a calibration step on the module's hand and then disarms it."""
     profile, client = hand
     address = f"{client.stream_address},{client.command_address}"
     where = ["--dir", str(profile.parent), "--address", address, "--move", "true"]
@@ -66,7 +66,7 @@ def test_friction_is_calibrated_by_sweeping_a_joint(hand, calibrate, capsys):
     assert (
         "keep the space around the fingers free; the joints will sweep left 0° to -23°" in told.err
     )
-    # At the sweep velocities, a tenth of the additional static friction remains.
+    # At the velocities of the sweeps, a tenth of the additional static friction remains.
     found = load(profile, profile.parent)
     assert found.control.joint_friction == pytest.approx(FRICTION, abs=2 * COUNT)
     shown = float(told.out.split("at break-away ")[1].split(" ")[0])

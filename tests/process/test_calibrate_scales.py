@@ -1,4 +1,4 @@
-"""Test that `calibrate scales` stores factors from grips, and the next daemon uses them."""
+"""Test that `calibrate scales` stores factors that the next daemon uses."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Test the command line in processes: `run`, `send`, signals, a second daemon, invalid settings."""
+"""Test `run` and `send` in processes, with signals, a second daemon and invalid settings."""
 
 import json
 import os
@@ -59,7 +59,7 @@ def test_duration_and_settings_on_the_command_line(profile, inline):
 def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
     second = softfinger("run", "--config", str(daemon.profile))
     assert second.returncode == 1
-    # Both addresses are in use. The start-up order determines which address is found first.
+    # Both addresses are in use, and the daemon reports either of them.
     taken = (f"stream.address: {daemon.addresses[0]}", f"commands.address: {daemon.commands}")
     assert any(f"{each} is in use; is another softfinger" in second.stderr for each in taken)
 
@@ -90,7 +90,7 @@ def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
 )
 def test_a_signal_during_start_up_exits_without_a_traceback(profile, number):
     process = started("run", "--config", profile(""))
-    # The daemon prints this line once the signal handlers are installed, before compilation.
+    # The daemon prints this line after installing signal handlers and before compiling.
     first = process.stderr.readline()
     process.send_signal(number)
     said = first + process.communicate(timeout=300)[1]
@@ -127,7 +127,7 @@ def test_a_log_reader_that_stops_reading_does_not_block_the_daemon(profile, addr
 
 
 def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return replies to requests that waited while the daemon was stalled for half a second."""
+    """Suspend the daemon for half a second; return its replies to the requests sent meanwhile."""
     socket = context.socket(zmq.DEALER)
     socket.connect(daemon.commands)
     socket.send_multipart([b"", msgpack.packb({"command": "status"})])

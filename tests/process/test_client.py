@@ -1,4 +1,4 @@
-"""Test the Python client with a real daemon and with streams that a real daemon never sends."""
+"""Test the Python client with a real daemon, and with streams that no real daemon sends."""
 
 import asyncio
 import inspect
@@ -41,7 +41,7 @@ from tests.harness import fake_daemon
 from tests.harness.daemon_process import python
 from tests.harness.fake_daemon import FakeDaemon
 
-IN_VAIN = 6.0  # timeout of waits that must fail; a state arrives sooner even on a busy machine [s]
+IN_VAIN = 6.0  # timeout [s] of waits that must fail; even a busy machine delivers a state sooner
 
 
 @pytest.fixture
@@ -216,7 +216,7 @@ def test_a_late_command_is_repeated_with_its_key_and_a_refused_one_is_not(fake, 
     assert caught.value.reason == "mode"
     assert len(fake.requests) == 4
     assert len(set(fake.keys)) == 2
-    # The long delay leaves no time for a second attempt.
+    # The delay before a second attempt exceeds the timeout.
     monkeypatch.setattr(command_client, "RETRY_DELAY", 100.0)
     fake.replies["arm"] = LATE
     with pytest.raises(Refused, match="old when it was processed") as caught:
@@ -236,7 +236,7 @@ def test_a_cancelled_command_is_not_repeated(fake):
                 await arming
 
     fake.replies["arm"] = LATE
-    asyncio.run(cancelled())  # The cancellation waits for the attempt in progress.
+    asyncio.run(cancelled())  # This call returns after the current attempt.
     count, published = len(fake.requests), fake.published
     until(lambda: fake.published > published + 50)  # Wait for half a second.
     assert len(fake.requests) == count
@@ -255,10 +255,10 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     for seq in (5, 10, 16, 30, 36):  # The publisher sends every fifth state.
         gaps.take({"seq": seq, "seq_step": 5})
     assert gaps.lost == 2
-    gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, and nothing was lost.
+    gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, and no message was lost.
     gaps.take({"seq": 10, "seq_step": 5})
     assert gaps.lost == 2
-    for finger in ("left", "right"):  # Losses are counted separately per finger.
+    for finger in ("left", "right"):  # Losses are counted for each finger.
         for seq in (1, 2, 4):
             gaps.take({"seq": seq, "finger": finger})
     assert gaps.lost == 4
@@ -457,7 +457,7 @@ def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeyp
         pass  # An IPC address has no host.
     monkeypatch.undo()
     with Hand("tcp://127.0.0.1:0;127.0.0.1:9872", "tcp://[::1]:9873"):
-        pass  # The first address includes a source address; the second is numeric.
+        pass  # The first address includes a source address, and the second address is numeric.
 
 
 @pytest.mark.parametrize("words", [["monitor"], ["send", "stop"], ["status"], ["record", "a.mcap"]])

@@ -38,7 +38,7 @@ def compiled(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 def steep(folder: Path) -> Path:
-    """Return a profile whose material cannot meet the table tolerance."""
+    """Return a profile with a material for which no contact table meets the tolerance."""
     strain = [0.1 * k for k in range(11)]
     stress = [1e5 * (math.exp(9.0 * each) - 1.0) for each in strain]
     file = folder / "steep.toml"
@@ -54,9 +54,10 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     done = python("-m", "softfinger.tools.processes.compile", **own)
     *kernels, last = done.stdout.splitlines()
     assert last == "done"
-    # The count is for the newest Numba. The oldest supported version reports a third fewer kernels.
+    # `table.kernels` is the count for the newest Numba version. The oldest supported version
+    # reports a third fewer kernels.
     assert 0.6 * table.kernels <= len(kernels) <= 1.2 * table.kernels
-    # Mark the other set of kernels as compiled.
+    # Mark the second set of kernels as compiled, in addition to the contact tables.
     (mark,) = (tmp_path / "softfinger").glob("kernels-*/contact-table-springs.built")
     mark.with_name("joints-and-timing-springs.built").touch()
     again = compiled(tmp_path)
@@ -135,7 +136,7 @@ def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path, names):
         blind = name in ("servos without sensors", "position mode")
         wanted = {"disarmed"} | ({"armed"} if servos else set())
         wanted |= {"grasping"} if servos and not blind else set()
-        # On a busy machine, the real-time scene may miss some modes.
+        # On a busy machine, the real-time scene may not reach all modes.
         timely = name != STAND_IN
         wanted |= {"holding", "releasing"} if servos and not blind and timely else set()
         assert wanted <= set(scene["modes"]), (name, scene["faults"])

@@ -1,4 +1,4 @@
-"""Test that a test's processes end with the test, including orphaned descendants."""
+"""Test that all processes that a test has started, even orphans, end with the test."""
 
 import subprocess
 import sys

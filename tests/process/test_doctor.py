@@ -1,4 +1,4 @@
-"""Test `softfinger doctor` and `softfinger scan` on emulated hands, and single checks."""
+"""Test `softfinger doctor`, its checks, and `softfinger scan` on emulated hands."""
 
 import contextlib
 import os
@@ -37,7 +37,7 @@ from tests.harness.gateway import Served
 
 
 class Hand:
-    """Emulated hand in a thread that the doctor can examine."""
+    """Emulated hand that runs in a thread and that the doctor examines."""
 
     def __init__(self, folder: Path, **options: Any) -> None:
         self.folder = folder
@@ -48,14 +48,14 @@ class Hand:
         self.emulator = self._stack.enter_context(running)
 
     def registers(self) -> list[bytes]:
-        """Return the servos' registers, except those that change by themselves."""
+        """Return the registers of both servos, except the registers that change by themselves."""
         live = slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
         bus = self.emulator._servos.bus
         memories = [bytes(servo.table.memory) for servo in bus.servos]
         return [memory[: live.start] + memory[live.stop :] for memory in memories]
 
     def doctor(self, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, list[str]]:
-        """Return the doctor's status and lines, with settings that tolerate late replies."""
+        """Run the doctor with settings that tolerate late replies; return its status and output."""
         late = ("servos.reply_timeout=1", "servos.open_timeout=0.1", "loop.rate=20")
         words += ("--set", "servos.watchdog=0.5", "--set", "servos.fault_after=0.5")
         words += tuple(word for each in late for word in ("--set", each))
@@ -75,7 +75,7 @@ def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the machine measurements of `doctor`, and skip the address check."""
+    """Skip the doctor's address check, and shorten its wake-up measurement."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UP_COUNT", 5)
 
@@ -273,7 +273,7 @@ def test_the_process_using_a_port_is_named(terminal, locked):
         "print('open', flush=True); sys.stdin.read()"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    # The command line belongs to a daemon process.
+    # The command line of this process looks like the daemon's command line.
     words = [sys.executable, "-c", script, path, "softfinger", "run"]
     with ending(subprocess.Popen(words, **pipes)) as other:
         assert other.stdout.readline() == "open\n"

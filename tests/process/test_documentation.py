@@ -1,16 +1,15 @@
 """Run all shell, Python and profile blocks of the README and the docs unchanged.
 
 Each page runs from top to bottom in its own folder, with one simulated hand. `harness.documented`
-provides the `softfinger` command and describes which commands are only parsed. A block with a title
-is saved in a file with that name, which later blocks can use. A mark above a block defines an
-exception:
+provides the `softfinger` command, which only checks the arguments of endless commands. If a block
+has a title, the block is saved in a file with this name for later blocks. A mark above a block
+defines an exception:
 
     <!-- not run: why -->                  the block cannot be run, with the reason
     <!-- not run without gymnasium -->     the block needs a package that is not installed here
     <!-- exits 1: why -->                  the last command of the block must fail
 
-A comment after `softfinger status` gives the expected output; the test waits until the hand has
-this mode, force and angle.
+A comment after `softfinger status` gives the mode, force and angle for which the test waits.
 """
 
 import contextlib
@@ -47,14 +46,14 @@ FENCE = re.compile(
     r'(?ms)^(?P<indent> *)```(?P<language>\w*)(?: title="(?P<title>[^"\n]+)")?[^\n]*\n'
     r"(?P<text>.*?)^(?P=indent)```$"
 )
-# `softfinger status` with its expected exit status.
+# `softfinger status` with the expected output in a comment.
 STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")
-PRINTS = 20  # number of output lines after which a program that runs forever is stopped
+PRINTS = 20  # number of output lines after which an endless program is stopped
 PATIENCE = 300.0  # time limit for one code block [s]
 
 
 class Block(NamedTuple):
-    """A code block with its line number, the mark above it, and the file it is saved as."""
+    """Code block of a page; ``mark`` is the mark above it, and ``title`` is its file name."""
 
     line: int
     language: str
@@ -64,7 +63,7 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    """Return a page's code blocks; every mark must be valid and directly above a block."""
+    """Return a page's code blocks; check that every mark is valid and directly above a block."""
     text = page.read_text(encoding="utf-8")
     marks = {found.end() + 1: found[0].strip()[5:-4] for found in MARK.finditer(text)}
     found = []
@@ -84,7 +83,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 class Shell:
-    """Shell shared by all blocks of a page; it keeps variables and reports failed commands."""
+    """Shell that runs all blocks of a page, keeps their variables and reports failed commands."""
 
     def __init__(self, folder: Path, softfinger: Softfinger) -> None:
         self._folder, self._softfinger = folder, softfinger
@@ -97,7 +96,7 @@ class Shell:
             )  # fmt: skip
 
     def run(self, text: str) -> str:
-        """Run commands; return the failed commands with their exit statuses."""
+        """Run commands; return the exit status and text of each failed command."""
         (self._folder / "block.sh").write_text(text)
         print(
             "failed=; trap 'failed+=\"$? $BASH_COMMAND; \"' ERR; "
@@ -129,7 +128,7 @@ class Shared(NamedTuple):
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
-    """Yield the simulated hand and the command connected to it."""
+    """Run a simulated hand; yield its addresses and the `softfinger` command."""
     place = tmp_path_factory.mktemp("hand")
     place.chmod(0o700)
     stream, commands = addresses = own_addresses()
@@ -214,7 +213,7 @@ def test_code_blocks_run(page, shared, tmp_path, monkeypatch):
 
 
 def parse_only(block: Block, at: str) -> None:
-    """Check at least the commands and syntax of a block that is not run."""
+    """Check the commands and the syntax of a block that is not run."""
     if block.language == "python":
         compile(block.text, at, "exec")
     for line in block.text.replace("\\\n", "").splitlines():

@@ -1,4 +1,4 @@
-"""Test the Dynamixel backend with the real SDK and pyserial, on emulated servos on a pty."""
+"""Test the Dynamixel backend, with the real SDK and pyserial, on emulated servos behind a pty."""
 
 import math
 import struct
@@ -22,7 +22,7 @@ FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fas
 
 
 def placed(firmware: int, *counts: int) -> ServoBus:
-    """Return servos with the given firmware and positions [counts], configured for the hand."""
+    """Return servos configured for the hand, with the given firmware and positions [counts]."""
     return make_bus("XM430-W350", firmware=firmware, for_daemon=True, counts=counts)
 
 
@@ -77,7 +77,7 @@ def test_torque_on_starts_at_the_current_position(bus, connect):
         assert goal == expected
         assert struct.unpack_from("<h", memory, reg.GOAL_CURRENT)[0] == 0
         assert memory[reg.TORQUE_ENABLE] == 1
-        assert memory[reg.BUS_WATCHDOG] == 100  # The register has units of 0.02 s.
+        assert memory[reg.BUS_WATCHDOG] == 100  # in units of 0.02 s
     assert read(backend).q == pytest.approx([0.4, -0.3], abs=RADIAN)
     assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
@@ -194,14 +194,14 @@ def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connec
     reading = Reading()
 
     def at_another_place(count: int) -> None:
-        """Read the joints at ``count``, which differs from the positions in earlier replies."""
+        """Move the joints to ``count``, and check that a reading does not show an earlier angle."""
         bus.call(lambda: bus.bus.plant.q.__setitem__(slice(2), count * RADIAN))
         backend.read(reading)
         if reading.valid:  # The reading may also be invalid because this thread was suspended.
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")
-    # On a busy machine, few replies count as late, so this loop may need many readings.
+    # On a busy machine, few replies count as late, so the loop may need many readings.
     while backend.counters()["late"] <= 20 and reading.seq < 1000:
         at_another_place(reading.seq)
     bus.fault("late=0")

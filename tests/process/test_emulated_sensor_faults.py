@@ -1,4 +1,4 @@
-"""Test sensor faults, and a hand that differs from its settings, over serial lines.
+"""Test sensor faults, and a hand that differs from the daemon's settings, over serial lines.
 
 The emulated hand's true force is the reference.
 """
@@ -17,7 +17,8 @@ from tests.soak.rig import Rig
 
 pytestmark = pytest.mark.extended
 FORCE = 6.0  # N
-# Total duration, and duration of the final interval for means, on the emulated hand's clock [s].
+# Durations of a test, and of the final interval over which means are taken, on the hand's clock
+# [s].
 LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"
@@ -27,7 +28,7 @@ REFUSED = "left:shift-x=3"  # fault after which the hand releases the object
 
 @contextlib.contextmanager
 def running(hand: Sequence[str] = ()) -> Iterator[Rig]:
-    """Yield an emulated hand and its daemon on a shared clock that tolerates a busy machine.
+    """Yield an emulated hand and its daemon, which share a clock that tolerates a busy machine.
 
     ``hand`` contains additional settings of the hand.
     """
@@ -35,7 +36,7 @@ def running(hand: Sequence[str] = ()) -> Iterator[Rig]:
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")
         made.config.write_text(text, encoding="utf-8")
         made.hand_words = tuple(word for each in hand for word in ("--set", each))
-        made.start("--set", "servos.fault_after=1.0")  # Times are measured on the hand's clock.
+        made.start("--set", "servos.fault_after=1.0")  # Measure times on the hand's clock.
         yield made
 
 
@@ -55,7 +56,7 @@ def reaches(rig: Rig, wanted: str) -> None:
 
 
 def gripped(rig: Rig) -> None:
-    """Let a hand without sensor faults hold the object at its initial position."""
+    """End all sensor faults, and let the hand hold the object at its initial position."""
 
     def done(command: str, **numbers: float) -> None:
         reply: dict[str, Any] = rig.ask({"command": command, **numbers}, 60.0)
@@ -75,7 +76,7 @@ def gripped(rig: Rig) -> None:
 
 
 def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
-    """Yield the emulated hand's reports for ``seconds`` or until all its servos have torque off."""
+    """Yield the emulated hand's reports for ``seconds``, or until torque is off."""
     begin = rig.report()["t"]
     while True:
         report = rig.report()
@@ -87,7 +88,7 @@ def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
 
 
 def test_arming_while_the_joints_spring_back_on_a_busy_machine_is_no_fault(rig):
-    """After ``disarm``, the daemon does not run while the hand moves for 0.05 s of its own time."""
+    """After ``disarm``, suspend the daemon until the hand's clock has advanced by 0.05 s."""
     gripped(rig)
     assert rig.ask({"command": "disarm"}, 60.0)["ok"]
     rig.daemon.send_signal(signal.SIGSTOP)
@@ -123,9 +124,9 @@ def test_a_sensor_fault_has_a_bounded_effect_and_is_the_only_one_reported(rig, l
 
 
 def test_an_unexpectedly_high_joint_friction_does_not_change_the_force():
-    """The hand has more than twice the joint friction that the daemon is configured with.
+    """The hand's joint friction is more than twice the joint friction in the daemon's settings.
 
-    Other differences are tested in virtual time (`tests.unit.test_robustness`).
+    `tests.unit.test_robustness` tests other differences in virtual time.
     """
     with running(hand=["simulation.joint_friction=0.12"]) as rig:
         gripped(rig)

@@ -1,4 +1,4 @@
-"""Test `softfinger emulate`: process, ports, boards, scenes, faults and invalid input."""
+"""Test the process, ports, boards, scenes and faults of `softfinger emulate`."""
 
 import os
 import signal
@@ -87,7 +87,7 @@ def test_a_folder_in_use_is_refused_and_the_first_emulator_continues(hand, servo
 )
 def test_a_signal_during_start_up_ends_the_emulator_cleanly(tmp_path, number):
     with EmulatorProcess("--dir", tmp_path / "new", "--config", HIL) as process:
-        # The emulator locks the folder first, long before the servos respond.
+        # The emulator locks the folder long before its servos respond.
         until((tmp_path / "new" / ".emulator.lock").exists)
         assert process.end(number) == (0, "", "")
     assert list((tmp_path / "new").iterdir()) == []
@@ -200,12 +200,12 @@ def test_emulated_time_is_synchronised_with_a_late_daemon(monkeypatch, tmp_path,
     apart = []
     for k in range(200):
         daemon.sleep_until(100.0 + 0.002 * k)
-        for _ in range(10):  # The emulator reads its clock while the daemon is late.
+        for _ in range(10):  # Let the emulator read its clock while the daemon is late.
             machine.work(0.1 * late * (k % 3))
             apart.append(clock.now() - daemon.now())
     assert max(apart[20:]) - min(apart[20:]) <= 0.0045
     assert daemon.behind > 100 * late or late < 0.002
-    # Time still advances while a reply is on the wire, and after the daemon has exited.
+    # Time still advances while a reply is being sent, and after the daemon has exited.
     machine.work(0.01)
     stands = clock.now()
     machine.work(0.01)
@@ -345,7 +345,7 @@ def test_injected_faults_change_measurements_but_not_the_hand(tmp_path):
 
 
 def board_mean(folder: Path, finger: int) -> float:
-    """Return the mean count of a board's newest frame."""
+    """Return the mean count over all cells of a board's newest frame."""
     sensor = board(folder, finger)
     sensor.open()
     frame = sensor.latest()

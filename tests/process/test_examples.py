@@ -14,7 +14,7 @@ def test_grasp_and_turn_example(start, profile, addresses, tmp_path):
     daemon = start("--config", str(profile("")))
     stream, commands = addresses
     picture = tmp_path / "picture.png"
-    # An earlier program may have left the hand armed.
+    # Users may run the program after another program that has armed the hand.
     with Hand(stream, commands, timeout=60.0) as hand:
         hand.arm()
     where = ("--stream", stream, "--commands", commands, "--picture", picture)

@@ -1,4 +1,4 @@
-"""Test the bus exchange of one tick: `doctor` timing, checks on connecting and while disarmed."""
+"""Test how `doctor` times the bus exchange, and checks when connecting and while disarmed."""
 
 import contextlib
 import grp
@@ -29,7 +29,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 
 def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
-    """Return the doctor's timing of one tick's bus exchange."""
+    """Return the doctor's finding about the duration of a tick's bus exchange."""
     settings = backend_settings(bus.port, **servos)
     loop = settings.loop.model_copy(update={"rate": rate})
     settings = settings.model_copy(update={"loop": loop})
@@ -81,7 +81,7 @@ def test_assessment_of_exchange_times():
     assert near.text.endswith(
         "a cycle takes up most of a tick of 2 ms (loop.rate = 500), so ticks will be late"
     )
-    # Both times are longer than a tick and shorter than reply_timeout.
+    # Both percentiles are longer than a tick and shorter than reply_timeout.
     both = judged(0.0028, 0.003)
     assert (both.status, both.fix.split(",")[0]) == ("FAIL", "set loop.rate = 260")
     assert (
@@ -105,7 +105,7 @@ def test_assessment_of_exchange_times():
 
 def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bus):
     for i in (0, 1):
-        bus.servo(i).fast_reads = False  # This setting contradicts the firmware version.
+        bus.servo(i).fast_reads = False  # The firmware version promises fast reads.
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
     assert notice.fix == "the daemon uses slower normal sync reads"
@@ -140,7 +140,7 @@ def test_slow_replies_are_reported_at_start_up(bus):
 
 
 def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
-    """Opening the port may restart the board, so the backend must not reopen the port to retry."""
+    """Opening the port may restart the board, so the backend must not open the port again."""
     bus, opened = running(), []
     for i in (0, 1):
         bus.servo(i).silent = True

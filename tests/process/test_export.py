@@ -78,7 +78,7 @@ def test_times_of_all_files_count_from_one_zero(tmp_path, first):
     messages.insert(first != schema.TACTILE, (schema.TACTILE, frame(0.0, 1) | scan))
     for topic, message in messages:
         writer.add(topic, message)
-    # The Unix time was set between the two messages.
+    # The system's Unix time was changed between the two messages.
     late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}
     writer.add(schema.STATE, sample(schema.STATE) | late)
     writer.close()

@@ -20,7 +20,7 @@ LATE = 1026 * 10 / 2e6 + 0.02  # time to transmit 32 × 32 cells, plus the laten
 
 
 class Board(FrameWriter):
-    """A board's port, and a thread that sends the test's data."""
+    """Port of a board, and a thread that sends the board's frames."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Board(FrameWriter):
         self._thread = threading.Thread()
 
     def stream(self, images: Callable[[int], bytes]) -> None:
-        """Send images 0, 1, … as frames until closed."""
+        """Send images 0, 1, … as frames until the board is closed."""
 
         def run() -> None:
             k = 0
@@ -47,7 +47,7 @@ class Board(FrameWriter):
 
 @pytest.fixture
 def own_threads() -> Callable[[], set[threading.Thread]]:
-    """Return the threads started in this test; other threads may belong to a shared rig."""
+    """Return a function that lists the threads started in this test."""
     before = set(threading.enumerate())
     return lambda: set(threading.enumerate()) - before
 
@@ -78,8 +78,8 @@ def test_frames_are_received_through_a_port_with_their_times(own_threads, board)
     first = tactile.latest()
     until(lambda: tactile.latest().seq >= first.seq + 20)
     now = tactile.latest()
-    # Wait for a frame that was read on its own. If several frames are read together, all but
-    # the last one have waited in the buffer.
+    # Wait until a read returns a single frame. If a read returns several frames, all frames except
+    # the last frame have waited in the buffer.
     until(lambda: (n := tactile.latest()).t_arrival - n.t_sample == pytest.approx(LATE))
     assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1

@@ -1,4 +1,4 @@
-"""Test ``softfinger view --foxglove``: messages for clients, and access control."""
+"""Test the messages and the access control of ``softfinger view --foxglove``."""
 
 import base64
 import json
@@ -41,7 +41,7 @@ WAIT = 60.0  # timeout for one message [s]
 
 
 class Client:
-    """Client that subscribes to channels; ``next`` returns a message and its log time [s]."""
+    """Foxglove client that subscribes to channels and receives messages."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self.socket = socket
@@ -60,7 +60,7 @@ class Client:
         self.socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": ended}))
 
     def next(self, topic: str = "") -> tuple[str, float, dict[str, Any]]:
-        """Return topic, log time [s] and content of the next message (of ``topic``, if given)."""
+        """Return topic, log time [s] and content of the next message, optionally of ``topic``."""
         while True:
             message = self.socket.recv(timeout=WAIT)
             assert isinstance(message, bytes)
@@ -72,7 +72,7 @@ class Client:
 
 @contextmanager
 def served(fake: FakeDaemon) -> Iterator[tuple[str, Path]]:
-    """Yield the address and layout of a Foxglove server for the stream."""
+    """Yield the address of a Foxglove server for the stream, and the path of the layout."""
     process = started("view", "--foxglove", "0", "--address", fake.state_address, stderr=None)
     try:
         line = process.stdout.readline()
@@ -117,7 +117,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
 
 
 def used_topics(layout: Any) -> set[str]:
-    """Return all topics used by a layout."""
+    """Return all topics that a layout uses."""
     if isinstance(layout, dict):
         return set().union(*map(used_topics, layout.values()))
     if isinstance(layout, list):
@@ -217,7 +217,7 @@ def connections(address: str) -> int:
 @pytest.mark.extended
 def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
     fake, address = stranger
-    fake.changes = {"fault": "x" * 30_000}  # Large states soon fill a buffer.
+    fake.changes = {"fault": "x" * 30_000}  # Large states fill the buffers quickly.
     with ExitStack() as stack:
         lazy = []
         for _ in range(CLIENT_COUNT_MAX):

@@ -1,4 +1,4 @@
-"""Test that a hung, crashed or killed gateway never stops the loop, and test local stops."""
+"""Test that the loop continues when the gateway hangs, crashes or is killed; test local stops."""
 
 import asyncio
 import json
@@ -47,7 +47,7 @@ def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def ticking(addresses: Addresses, own_folder: Path) -> Iterator[Daemon]:
-    """Yield a daemon that runs in a thread and whose gateway runs in a process."""
+    """Yield a daemon whose loop runs in a thread and whose gateway runs in a separate process."""
     settings = Settings.model_validate(
         {
             "stream": {"address": addresses[0]},
@@ -144,7 +144,7 @@ sys.exit(gateway.main(sys.argv[1:]))
     [
         ("STEP_CPU_TIME_MAX", "while True: pass", -signal.SIGPROF),
         ("STEP_TIME_MAX", "select.select([], [], [])", -signal.SIGALRM),
-        # The gateway stalls like a process that is stopped or gets no processor time.
+        # Suspend the gateway like a process that gets no processor time.
         ("STEP_CPU_TIME_MAX", "select.select([], [], [], 0.5)", 0),
     ],
 )
@@ -187,10 +187,10 @@ def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses)
         publisher = Publisher(gateway.link)
         gateway.link.look()
         os.kill(gateway.process.pid, signal.SIGSTOP)
-        for k in range(50_000):  # This loop would never end if publishing waited for the gateway.
+        for k in range(50_000):  # If publishing waited for the gateway, the loop would never end.
             publisher.event(0.0, 0.0, "info", "test", f"event {k}")
         assert len(gateway.link._channel._unsent) < 1000, "the queue exceeds its limit"
-        with suppress(ProcessLookupError):  # A slow gateway may have been replaced.
+        with suppress(ProcessLookupError):  # The daemon may have replaced a slow gateway.
             os.kill(gateway.process.pid, signal.SIGCONT)
     finally:
         gateway.close()
@@ -200,7 +200,8 @@ def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses)
 
 
 def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, inline, monkeypatch):
-    # Do not replace a stopped gateway, and allow only local delivery, even on a busy machine.
+    # Prevent the daemon from replacing the stopped gateway, and allow a busy machine enough time
+    # for a local stop.
     monkeypatch.setattr(supervisor, "_SUSPENSION_TIME_MAX", threading.TIMEOUT_MAX)
     monkeypatch.setattr(command_client, "LOCAL_STOP_TIMEOUT", 60.0)
     where = ["--address", ",".join(addresses)]

@@ -1,4 +1,4 @@
-"""Test the glove-style framing on bytes, and its polling on a real pty."""
+"""Test the decoder for glove-style framing, and the polling of a board on a real pty."""
 
 import itertools
 
@@ -97,6 +97,6 @@ def test_each_frame_is_requested_and_requested_again_after_a_lost_reply(tmp_path
         first = rig.sensor.latest().seq
         until(lambda: rig.sensor.latest().seq >= first + 5)
         counters = rig.sensor.counters()
-        # The board only replies to requests.
+        # The board sends data only on request.
         assert rig.board.sent <= counters["frames"] + counters["resyncs"] + 3
         assert rig.board.dropped == 0

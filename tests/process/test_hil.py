@@ -1,7 +1,7 @@
 """Test a daemon and an emulated hand as separate processes, connected by serial lines.
 
-The emulated hand's control socket reports the servo bus traffic, and every watchdog trip after the
-daemon dies, stalls or loses its port.
+The emulated hand's control socket reports the traffic on the servo bus. The socket also reports
+each watchdog trip after the daemon dies, stalls or loses its port.
 """
 
 import json
@@ -20,14 +20,14 @@ from tests.harness.daemon_process import Running, ask, softfinger, started
 from tests.harness.descendants import ending
 from tests.harness.emulated import HIL, EmulatorProcess
 
-WATCHDOG = 2.0  # watchdog time [s], well above the delays of a busy machine
+WATCHDOG = 2.0  # watchdog time [s], far above the delays of a busy machine
 REAL = [
     *("--set", "loop.clock=real"),  # With a shared clock, the hand would wait for a stalled daemon.
     *("--set", f"servos.watchdog={WATCHDOG}", "--set", f"servos.fault_after={WATCHDOG}"),
     *("--set", "servos.reply_timeout=0.1", "--set", "servos.open_timeout=60"),
 ]
-# These settings use the hand's clock, which barely advances while the emulator gets no processor
-# time.
+# These timeouts are measured on the hand's clock, which hardly advances while the emulator gets no
+# processor time.
 WAITING = [
     *("--set", "servos.fault_after=1.0", "--set", "safety.frame_age_fault=100"),
     *("--set", "servos.open_timeout=60"),
@@ -35,7 +35,7 @@ WAITING = [
 
 
 class Rig:
-    """The emulated hand and a daemon that can be restarted."""
+    """An emulated hand, and a daemon that can be restarted."""
 
     def __init__(self, folder: Path, addresses: Addresses, *words: str) -> None:
         self.folder = folder / "hand"
@@ -135,7 +135,7 @@ def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
             with hand.stream(120.0) as states:
                 held = [next(states) for _ in range(60)]
             assert {(state.mode, state.fault) for state in held} == {("holding", "")}
-            # A late frame briefly invalidates a contact.
+            # A late frame makes a contact invalid for a short time.
             sound = [state for state in held if state.left.valid and state.right.valid]
             forces = [(state.left.force, state.right.force) for state in sound]
             near = [each == pytest.approx((10.0, 10.0), rel=0.05) for each in forces]
@@ -244,7 +244,8 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
 def test_lost_packets_do_not_keep_torque_on(rig):
     rig.start()
 
-    # The stop's writes are lost, but readings arrive and keep resetting the servos' watchdogs.
+    # The servos do not receive the stop, but readings arrive and keep resetting the servos'
+    # watchdogs.
     rig.at_work()
     send_words(rig.folder, "lose-writes=1")
     told = softfinger("send", "stop", "--address", rig.commands)
@@ -278,7 +279,7 @@ def test_lost_packets_do_not_keep_torque_on(rig):
     )
     send_words(rig.folder, "well")
     until(lambda: not rig.status()["torque"])
-    # The mode depends on the time at which torque off was confirmed.
+    # The mode depends on how soon the servos confirmed that torque is off.
     if rig.status()["mode"] == "fault":
         rig.does("clear")
     rig.works()
@@ -286,9 +287,10 @@ def test_lost_packets_do_not_keep_torque_on(rig):
 
 @pytest.mark.extended
 def test_swapped_ids_are_a_fault_during_the_approach(tmp_path, addresses):
-    """Use the zero offset and direction that `calibrate joints` would find for each servo."""
+    """Use the zero offsets and directions that `calibrate joints` would find for swapped servos."""
     hand = tmp_path / "hand"
-    # The tip force clearly rises at a heavy object. A light object slides away from the tip.
+    # A heavy object causes a clear force at the tip that touches it. A light object would slide
+    # away.
     heavy = ("object_position=[0.006, 0.08]", "object_mass=0.5", "table_friction=0.5")
     words = [word for each in heavy for word in ("--set", f"simulation.{each}")]
     config = tmp_path / "hil.toml"

@@ -1,7 +1,7 @@
-"""Test that kernels compiled from other sources or by other users are never run.
+"""Test that kernels compiled by other users or from other sources are never run.
 
-The tests use a small stand-in package, which has the real decorators and the structure of
-softfinger. They modify the stand-in's files and run its kernels in separate processes.
+The tests use a small package with the structure and the real decorators of softfinger. The tests
+modify the package's files and run the kernels in separate processes.
 """
 
 import os
@@ -64,7 +64,7 @@ print(c.caller(1.0), sum(c.caller.stats.cache_hits.values()))
 
 
 class Package:
-    """A small test package in its own folder, next to its cache folder."""
+    """The small package, in a folder that also contains the kernel cache."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -83,7 +83,7 @@ class Package:
         file.write_text(text, encoding="utf-8")
 
     def run(self, script: str = RUN) -> tuple[list[str], str]:
-        """Return the kernel's result, the number of kernels from the cache, and the warnings."""
+        """Run a script; return the words that the script prints, and its warnings."""
         environment = os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": ""}
         environment.pop("NUMBA_CACHE_DIR", None)
         # Python would load stale bytecode for a file that is rewritten within a second.

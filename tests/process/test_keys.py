@@ -1,4 +1,4 @@
-"""Test key files, and access control of the daemon's sockets with keys."""
+"""Test key files, and the access control that keys provide for the daemon's sockets."""
 
 import errno
 import os
@@ -24,7 +24,7 @@ from tests.harness.gateway import Served
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Create keys of a server and of two clients, local and alice."""
+    """Create keys for a server and for two clients, ``local`` and ``alice``."""
     make_keys(tmp_path / "keys", ["alice"])
     return tmp_path / "keys"
 
@@ -103,7 +103,7 @@ def test_keys_that_others_own_or_may_write_are_refused(folder, which, monkeypatc
         load_server(folder)
     path.chmod(mode)
     load_server(folder)
-    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # Pretend to be a user other than the owner.
+    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # Pretend to be another user.
     if os.getuid() == 0:
         for each in [path, *path.parents]:
             if each.is_relative_to(folder):
@@ -138,7 +138,7 @@ def test_client_keys_are_still_revoked_without_free_file_descriptors(folder, mon
 
 
 class Guarded:
-    """Both sockets of a daemon with keys; commands are served as they arrive."""
+    """The stream and command sockets of a daemon with keys, which executes commands on arrival."""
 
     def __init__(self, addresses: Addresses, folder: Path) -> None:
         self.served = Served(*addresses, keys=str(folder))
@@ -171,7 +171,7 @@ def others() -> Iterator[zmq.Context[Any]]:
 def ask(
     context: zmq.Context[Any], addresses: Addresses, keys: Any
 ) -> tuple[zmq.Socket[Any], zmq.Socket[Any]]:
-    """Return a subscriber and a socket with a pending command in another client's name."""
+    """Return a subscriber, and a socket that has sent a command in another client's name."""
     subscriber, commander = context.socket(zmq.SUB), context.socket(zmq.DEALER)
     for socket, address in zip((subscriber, commander), addresses, strict=True):
         socket.setsockopt(zmq.LINGER, 0)
@@ -221,7 +221,7 @@ def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addr
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.link.fence()  # The loop raises a fence after every stop.
+        guarded.served.link.fence()  # After every stop, the loop sends a fence.
         guarded.step()
         return stopper.poll(0)
 

@@ -28,11 +28,11 @@ from tests.unit.test_schema import sample
 
 
 class Guarded(NamedTuple):
-    """A daemon that accepts only the clients of ``folder``."""
+    """A daemon that accepts only clients whose keys are in ``folder``."""
 
     folder: Path
     addresses: Addresses
-    recording: Path  # recording made by the daemon itself
+    recording: Path  # recording that the daemon makes itself
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
             return (await hand.wait_for(lambda state: not state.torque, 60.0)).mode
 
     assert asyncio.run(session()) == "disarmed"
-    # A user who may end the daemon may also stop the hand without a key.
+    # A user who is permitted to end the daemon may also stop the hand without a key.
     assert ask(commands, "stop")["ok"]
 
 

@@ -1,4 +1,4 @@
-"""Test the demo with a one-second suspension of its process."""
+"""Test the demo while the demo's process is suspended for a second."""
 
 import select
 import signal
@@ -12,7 +12,7 @@ from softfinger.daemon.wire.schema import Event
 from tests.conftest import Addresses
 from tests.harness.daemon_process import Running
 
-STILL = 1.0  # duration of a stall [s], ten times the watchdog time and the maximum frame age
+STILL = 1.0  # duration of a stall [s]; watchdog time and maximum frame age are a tenth
 PATIENCE = 60.0  # timeout for an event on a busy machine [s]
 
 
@@ -56,7 +56,7 @@ def test_a_simulated_hand_survives_a_suspended_machine(start, profile, hand):
 def test_on_real_time_a_stall_is_a_fault_and_the_task_restarts(start, profile, hand):
     running = start("--config", str(profile('task.name = "demo"\nloop.clock = "real"\n')))
     with hand.stream(PATIENCE) as states, hand.events(PATIENCE) as events:
-        # The demo may already have faulted and restarted.
+        # The demo may already have restarted after a fault.
         next(state for state in states if state.mode == "holding")
         stand_still(running)
         fault = told(events, "servos.bus", "watchdog")

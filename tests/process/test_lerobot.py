@@ -1,4 +1,4 @@
-"""Test that the real LeRobot package finds and uses the hand as a robot and environment."""
+"""Test that the real LeRobot package can use the hand as a robot and as an environment."""
 
 import math
 import runpy
@@ -23,7 +23,7 @@ PACKAGE = Path(__file__).parents[2] / "lerobot_robot_softfinger"
 
 @pytest.fixture
 def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Register the installed package as LeRobot's programs do."""
+    """Install the package of the robot, and register the package as LeRobot's programs do."""
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     pytest.importorskip("lerobot")
@@ -53,7 +53,7 @@ def make(tmp_path: Path, addresses: Addresses, plugin: None) -> Any:
 
 
 def act_until(robot: Any, action: dict[str, float], done: Callable[[dict[str, Any]], Any]) -> Any:
-    """Send one action repeatedly, as a policy does, until an observation satisfies a condition."""
+    """Send an action repeatedly, as a policy does, until ``done`` accepts an observation."""
     for _ in range(20_000):
         robot.send_action(action)
         found = robot.get_observation()
@@ -87,7 +87,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     with pytest.raises(Refused, match=r"left: found 515.7° \(9 rad\), expected"):
         robot.send_action({"left.pos": 9.0, "right.pos": 0.0})
     robot._hand.disarm()
-    # The robot does not rearm a hand that another client has disarmed.
+    # If another client has disarmed the hand, the robot does not arm the hand again.
     with pytest.raises(Refused, match="arm first"):
         robot.send_action(goal)
     robot.disconnect()
@@ -166,7 +166,7 @@ def record(kind, robot, first, action, moved, root):
     """Write two observations with LeRobot's own recorder and read them back."""
     try:
         from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
-    except ImportError:  # In LeRobot 0.4, the functions are in this module.
+    except ImportError:  # LeRobot 0.4 defines the functions in this module.
         from lerobot.datasets.utils import build_dataset_frame, hw_to_dataset_features
     features = hw_to_dataset_features(robot.action_features, "action", False)
     features |= hw_to_dataset_features(robot.observation_features, "observation", False)

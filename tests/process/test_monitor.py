@@ -39,7 +39,7 @@ def test_page_shows_the_hand_and_the_state_of_its_stream(fake):
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
         fake.silent.set()
-        # For at most 1.5 s, the page shows the stream as stale.
+        # The page first shows the stream as stale, for at most 1.5 s.
         page.shows("○ lost", "the stream has stopped")
         fake.changes = {}
         fake.silent.clear()
@@ -89,8 +89,8 @@ sys.exit(monitor.run(parser.parse_args()))
 def test_a_signal_ends_it_while_the_terminal_is_blocked(fake):
     with TerminalProcess(command(fake)) as page:
         page.shows("HOLDING")
-        termios.tcflow(page.slave, termios.TCOOFF)  # Suspend the output, as Ctrl-S does.
-        # Wait for several redraws with different noise in the maps.
+        termios.tcflow(page.slave, termios.TCOOFF)  # Suspend the output as Ctrl-S does.
+        # Wait for several redraws, whose maps contain different noise.
         until_later = fake.published + 50
         until(lambda: fake.published >= until_later)
         page.process.terminate()
@@ -124,7 +124,7 @@ def test_keys_command_the_hand(fake):
         page.shows("LEFT contact")
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 10.0°")
-        # The key changes the target, although the object angle is still 4.98°.
+        # The second key press changes the last target, although the object angle is still 4.98°.
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 15.0°")
         page.type(b"\x1bOD")
@@ -132,7 +132,7 @@ def test_keys_command_the_hand(fake):
         assert [r["command"] for r in fake.requests[-3:]] == ["rotate"] * 3
         assert fake.requests[-1]["angle"] == pytest.approx(0.17418, abs=1e-4)
         fake.replies["rotate"] = {"ok": False, "error": "rotate: angle: too much"}
-        # A refused turn does not count, so the next turn starts at the measured object angle.
+        # After a refused turn, the next turn starts at the measured object angle.
         for _ in range(2):
             count = len(fake.requests)
             page.type(b"\x1b[D")
@@ -176,8 +176,7 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         page.type(b"g")
         page.shows("✓ grasp with 4 N: ok")
         assert asked() == [4.0]
-        # During a grip, the keys change the force last commanded by any client, and the hand
-        # follows.
+        # During a grip, the keys change the force that any client commanded last.
         fake.changes = {"goal_force": 9.0}
         page.shows("HOLDING", "+- 9 N")
         told = {"command": "grasp", "client": "", "request": '{"force": 7.0}', "ok": True}
@@ -319,7 +318,7 @@ print("ended", over.is_set(), flush=True)
 
 
 class Beside(TerminalProcess):
-    """A stand-in daemon with the monitor as its child process."""
+    """A stand-in for the daemon, which runs the monitor as its child process."""
 
     def __init__(self, fake: FakeDaemon, folder: Path) -> None:
         file = folder / "pid"

@@ -1,4 +1,4 @@
-"""Test that clients and tools work without Linux-only features, as on macOS and Windows."""
+"""Test that clients and tools work without Linux-only features, which macOS and Windows lack."""
 
 import sys
 from pathlib import Path

@@ -11,8 +11,9 @@ from tests.harness.daemon_process import python
 from tests.harness.golden_recording import machine_class
 from tests.harness.paper_tip import MEASURED, TIP
 
-# The script tests each kind of kernel: SIMD lanes and selected callees in the tables, reorderable
-# sums in the estimator, inlined loops over the cells of a frame, and nested records in the grip.
+# The script tests each kind of kernel. The tables use SIMD lanes and selected callees, and the
+# estimator uses reorderable sums. The loops over the cells of a frame are inlined, and the grip
+# uses nested records.
 SCRIPT = """
 import sys
 import numba
@@ -35,13 +36,13 @@ sys.exit(failed)
 """
 
 
-# Both compilers produce bit-identical results on this processor. On other processors, the compilers
-# may choose different products for fused multiply-add.
+# On this processor, both compilers produce bit-identical results. On other processors, the
+# compilers may fuse other multiplications and additions.
 SAME_BITS = "znver3"
 
 
 def figures() -> str:
-    """Return a table's values, exact to the last bit."""
+    """Return a table's values as text that is exact to the last bit."""
     d = np.linspace(0.0, 8e-3, 200)
     found = ContactTable.build(TIP, MEASURED, 1e-9)(d, 40.0 * d)
     return " ".join(float(each).hex() for each in np.array(found[:6]).ravel())
@@ -49,7 +50,7 @@ def figures() -> str:
 
 @pytest.mark.extended
 def test_plain_numba_passes_tests_of_every_kind_of_kernel_with_the_same_results(request):
-    # Use a separate cache, because the shared cache is in use.
+    # Use a separate cache, because other tests use the shared cache.
     kept = str(request.config.cache.mkdir("plain-numba"))
     environment = os.environ | {"NUMBA_CACHE_DIR": kept}
     done = python("-c", SCRIPT, cwd=Path(__file__).parents[2], env=environment)

@@ -1,4 +1,4 @@
-"""Test ``softfinger plot``: a recording's pages and their contents; incomplete recordings."""
+"""Test the pages that ``softfinger plot`` makes of complete and incomplete recordings."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Test that the backends of an installed package are found, checked, and run by a real daemon."""
+"""Test that a daemon finds, checks and uses the backends of an installed package."""
 
 import os
 import threading
@@ -30,7 +30,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put the example on the test process's import path."""
+    """Add the example to the import path of the test process."""
     monkeypatch.syspath_prepend(installed)
 
 

@@ -1,4 +1,4 @@
-"""Test calibration without hardware: `emulate --send press` and `calibrate` on a rubber tip."""
+"""Test `emulate --send press` and `calibrate` on an emulated hand with rubber tips."""
 
 import math
 import re
@@ -17,7 +17,7 @@ RUBBER = ["tip.physics=solid", "tip.poisson=0.48", "safety.d_max=0.008", *LINEAR
 
 
 class Stage:
-    """Simulated user of the test stand, who applies the requested load and presses Enter."""
+    """Simulated user, who applies each load on the test stand and then presses Enter."""
 
     def __init__(self, folder, presses):
         self._folder, self._presses = folder, list(presses)
@@ -29,7 +29,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def rubber(tmp_path_factory):
-    """Yield a hand with solid rubber tips, its log, and a calibration file with a tare."""
+    """Yield the folder and the log of an emulated hand with solid rubber tips."""
     folder = tmp_path_factory.mktemp("hand")
     log = []
     with emulated(folder, settings=load(HIL, folder, RUBBER), tell=log.append):

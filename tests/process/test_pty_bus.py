@@ -1,4 +1,4 @@
-"""Test the servo bus on a pty: timing, baud rates, links, connecting and disconnecting."""
+"""Test the timing, baud rates, links and connections of the servo bus on a pty."""
 
 import os
 import select
@@ -22,7 +22,7 @@ PONG = 14
 
 
 class Wire:
-    """A paced bus with its own clock, and the client's end of its pseudo-terminal."""
+    """A bus with line timing and its own clock, and the client's end of the pseudo-terminal."""
 
     def __init__(self, bus: ServoBus, baud: int, **options: float) -> None:
         self.t = 1.0
@@ -36,14 +36,14 @@ class Wire:
         self.port.service(self.t)
 
     def received(self) -> bytes:
-        """Return the available bytes; the pseudo-terminal delivers them with a short delay."""
+        """Return the available bytes, which the pseudo-terminal delivers after a short delay."""
         data = b""
         while select.select([self.client], [], [], 0.05)[0]:
             data += self.client.read(4096)
         return data
 
     def when(self, seconds: float) -> bytes:
-        """Advance the time, serving every event that is due."""
+        """Advance the time, and serve every event that is due."""
         end = self.t + seconds
         while (due := self.port.next_event()) <= end:
             self.t = max(due, self.t + 1e-7)
@@ -79,7 +79,7 @@ def test_replies_take_wire_time_and_return_delay_one_after_another(wires):
     first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE_TIME
     assert wire.when(first - 1e-5) == b""
     assert len(wire.when(2e-5)) == PONG
-    second = PONG * byte + 500e-6  # The replies of a group are sent one after another.
+    second = PONG * byte + 500e-6  # The servos of a group reply one after another.
     assert wire.when(second - 4e-5) == b""
     assert len(wire.when(6e-5)) == PONG
 
@@ -110,8 +110,7 @@ def test_a_client_may_reconnect_and_leave_the_terminal_in_cooked_mode(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     wire.client.close()
     for _ in range(3):
-        # A client without pyserial, which sets no terminal mode, must find the terminal in raw
-        # mode.
+        # The terminal must be in raw mode, because a client without pyserial does not set the mode.
         end = os.open(wire.port.path, os.O_RDWR | os.O_NOCTTY)
         assert not termios.tcgetattr(end)[tty.LFLAG] & (termios.ECHO | termios.ICANON)
         os.write(end, PING)

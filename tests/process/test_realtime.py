@@ -1,4 +1,4 @@
-"""Test that real-time measures are applied and reverted if permitted, and otherwise reported."""
+"""Test that real-time measures are applied and reverted, and that refusals are reported."""
 
 import ctypes
 import json
@@ -18,8 +18,8 @@ from softfinger.tools.benchmarks.measuring import Report, attempt
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE, python
 
-# Script that prints the real-time properties of its process before, during and after the use of all
-# real-time measures.
+# This script applies all real-time measures. Before, during and after their use, the script prints
+# the properties of its process.
 HELD = """
 import json, os, sys, threading
 from pathlib import Path
@@ -60,7 +60,7 @@ finally:
     over.set()
 """
 
-# Script that does the same as HELD, but for a user without permissions.
+# This script applies real-time measures without the necessary permissions.
 REFUSED = """
 import json, os, resource
 from softfinger.daemon.loop.realtime import RealTime
@@ -177,7 +177,7 @@ def test_ticks_over_ptys_alternate_with_their_exchanges():
     reports: list[Report] = []
 
     def measured() -> bool:
-        """Return True if the attempt succeeded; on a busy machine, the grip may take too long."""
+        """Return True if the attempt succeeded; a grip may take too long on a busy machine."""
         part = partial(tick.in_the_loop, "paced", 2, 2_000_000, patient)
         reports.append(attempt("paced", part))
         return not reports[-1].failed

@@ -1,4 +1,4 @@
-"""Test that a lost servo port is reopened only on command, and with torque off."""
+"""Test that only a command reopens a lost servo port, and that torque is then off."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -16,7 +16,7 @@ from tests.harness.emulated import emulated
 
 
 class Rig:
-    """A daemon and the emulated servos that it drives, both in the test process."""
+    """A daemon and its emulated servos, which run in the test process."""
 
     def __init__(self, folder: Path, **sections: Any) -> None:
         servos = {
@@ -41,7 +41,7 @@ class Rig:
         until(lambda: self.loop.advance(0.1) or condition())
 
     def does(self, name: str) -> dict[str, Any]:
-        """Issue a command that must succeed, on a tick with readings from the servos."""
+        """Wait for a valid reading, except before ``clear``; issue a command that must succeed."""
         if name != "clear":
             self.until(lambda: self.loop.state.reading.valid)
         return self.loop.command({"command": name})
@@ -81,7 +81,7 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     rig.unplug()
     rig.until(lambda: loop.state.mode == "fault")
     assert "the port is lost" in loop.state.fault
-    assert rig.torque() == [1, 1]  # The daemon could not reach the servos.
+    assert rig.torque() == [1, 1]  # The daemon could not switch torque off.
     # From here on, `clear` reopens the port.
     rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
     rig.refuses("clear", "port not found")
@@ -119,8 +119,8 @@ def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
         "full_count": 255,
         "rate": 50.0,
     }
-    # Frames may be late because the emulator shares this process's interpreter lock. The hand then
-    # waits and does not close until tactile data arrive.
+    # The emulator shares this process's interpreter lock, so frames may be late. The hand does not
+    # close until tactile data arrive.
     rig = Rig(tmp_path, tactile=board, safety={"frame_age_hold": 3.0, "frame_age_fault": 40.0})
     try:
         loop, left = rig.loop, rig.loop.perception.fingers[0].sensor

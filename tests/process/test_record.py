@@ -1,4 +1,4 @@
-"""Test that recordings contain all published messages, even if the recorder is interrupted."""
+"""Test that a recording contains all messages published until the recorder was interrupted."""
 
 import contextlib
 import json
@@ -54,7 +54,7 @@ def is_filled(path: Path) -> bool:
 
 
 def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
-    """Write a recording of ``count`` states with frames in between; return its messages."""
+    """Write a recording of ``count`` states and one frame per ten states; return all messages."""
     sent: list[tuple[bytes, dict[str, Any]]] = []
     for k in range(count):
         times = {"timestamp": 1e9 + k, "mono_ns": k * 10**9}
@@ -73,7 +73,7 @@ def test_read_messages_equal_the_published_ones(tmp_path):
     recording = Recording(tmp_path / "a.mcap")
     read = list(recording.messages())
     assert read == sent
-    # The types are equal, too, so the messages can be published again byte for byte.
+    # The types of all values are equal, so the messages can be published again byte for byte.
     for (_, before), (_, after) in zip(sent, read, strict=True):
         assert {key: type(value) for key, value in before.items()} == {
             key: type(after[key]) for key in before
@@ -245,8 +245,8 @@ def test_messages_lost_while_recording_a_daemon_are_counted(start, profile, addr
     assert not recording.truncated
     seqs = [m["seq"] for _, m in recording.messages([schema.STATE])]
     assert len(seqs) > 10
-    # A gateway without processor time loses messages. The reported number of lost messages must be
-    # exact.
+    # The gateway loses messages if it gets no processor time. The recorder must report the exact
+    # number of lost messages.
     told = re.search(rf"(\d+) of {schema.STATE}", out)
     assert seqs[-1] - seqs[0] + 1 - len(seqs) == (int(told[1]) if told else 0)
     kinds = {message["kind"] for _, message in recording.messages([schema.EVENT])}
@@ -344,7 +344,7 @@ def test_topics_are_selected_by_name(fake, tmp_path):
 
 
 def test_repeated_messages_do_not_extend_the_time_range(tmp_path):
-    """A recorder that starts late receives the daemon's first events and settings again."""
+    """A recorder that starts late receives repetitions of the first events and of the settings."""
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
     old = {"schema": 1, "seq": 1, "again": True, "timestamp": 1.7e9 - 7200.0, "mono_ns": 5}
@@ -384,7 +384,7 @@ def test_a_damaged_chunk_is_reported_and_skipped_and_the_file_can_be_recovered(
     assert "damaged (" in told[0]
     assert 500 < len(read) < len(sent)
     assert read[0] == sent[0]
-    assert read[-1] == sent[-1]  # Chunks after the damaged chunk are readable.
+    assert read[-1] == sent[-1]  # The chunks after the damaged chunk are readable.
     fast = ("--no-wait", "--speed", "1e6", "--address", addresses[0])
     for words in (("export", "--topics", "state"), ("replay", *fast)):
         assert "damaged (" in inline(words[0], path, *words[1:]).stderr, words

@@ -1,4 +1,4 @@
-"""Test registers changed by another program: reports, corrections by `arm`, repairs, backups."""
+"""Test that registers changed by another program are reported, corrected or restored."""
 
 import json
 from typing import Any
@@ -21,8 +21,8 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 LEFT = "servo 1 (left)"
 FIX = "`softfinger doctor --fix`"
-# Values that another program may leave in a servo: register, value, and the status and text of the
-# finding.
+# Registers and values that another program may leave in a servo, with the status and text of the
+# doctor's finding.
 EEPROM = [
     (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, expected at most 50 µs"),
     (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: the servo also executes commands for the servo"),
@@ -132,7 +132,7 @@ def test_arm_overwrites_changed_ram_registers(bus, connect, reboots):
 
 
 def test_factory_settings_of_every_model_pass_the_checks():
-    """Mode and return delay are excluded, because their factory settings never suit the hand."""
+    """Only mode and return delay may fail, because their factory settings never suit the hand."""
     for name, model in MODELS.items():
         mode = "current-based position" if model.senses_current else "position"
         small = {"current_max": min(1.2, model.stall_current)}
@@ -199,7 +199,7 @@ def test_invalid_register_files_are_refused(bus, tmp_path):
     assert right == []
 
 
-# Servos with unexpected states and types.
+# Servos in unexpected states, and servos of unexpected types.
 
 
 def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):

@@ -1,4 +1,4 @@
-"""Test that recordings are published unchanged and recomputed with identical states."""
+"""Test that replaying a recording publishes unchanged messages or recomputes identical states."""
 
 import json
 import re
@@ -72,7 +72,7 @@ def test_other_settings_report_the_first_difference(taken, tmp_path):
     assert "left.goal_current" in result.differences
     assert "left.q" not in result.differences  # The inputs are unchanged.
     different = result.differences["left.goal_current"]
-    assert different.first_tick > 50  # The first difference appears after arming.
+    assert different.first_tick > 50  # The first difference occurs after arming.
     assert different.worst > 1e-3
     assert different.recorded != different.recomputed
 
@@ -128,8 +128,7 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_p
     ticks = re.search(r"(\d+) ticks, ", told.stdout)
     assert ticks is not None
     assert int(ticks[1]) > 100
-    # Different settings give different results, even if the grip was never reached on a slow
-    # machine.
+    # The changed setting changes the goals, even if the hand never gripped on a slow machine.
     other = tmp_path / "other.toml"
     other.write_text(profile("safety.current_move = 0.3\n", "base.toml").read_text())
     told = inline("replay", path, "--recompute", "--config", other)

@@ -1,4 +1,4 @@
-"""Test the daemon as a systemd service: watchdog messages, service unit, udev rules, logs."""
+"""Test the daemon as a systemd service, with watchdog messages, unit, udev rules and logs."""
 
 import configparser
 import grp
@@ -26,7 +26,7 @@ from tests.harness.descendants import ending
 
 
 class Manager:
-    """The service manager's end of NOTIFY_SOCKET."""
+    """Socket on which the service manager would receive notifications."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "notify"
@@ -168,7 +168,7 @@ def test_the_unit_has_the_settings_of_a_control_daemon(tmp_path, inline):
     assert words[0] == sys.executable
     assert words[4:6] == ["run", "--no-task"], "the service must restart disarmed"
     assert words[6:] == ["--log", "json", "--config", str(config)]
-    # The program that the unit starts exists, and its command line prints the help.
+    # The program of the unit exists and prints its help.
     shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=300, check=False)
     assert shown.returncode == 0
     analyze = shutil.which("systemd-analyze")

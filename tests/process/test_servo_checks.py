@@ -1,4 +1,4 @@
-"""Test the checks on connecting, their suggested fixes, and servo health readings."""
+"""Test the checks when connecting, their suggested fixes, and readings of the servos' health."""
 
 import math
 import os
@@ -29,7 +29,7 @@ from tests.process.conftest import Connect
 
 
 def refusal(path: str, **servos: Any) -> list[str]:
-    """Return the lines of the error raised on connecting."""
+    """Return the lines of the error that connecting raises."""
     backend = DynamixelServos(backend_settings(path, **servos), RealClock())
     with pytest.raises(ServoError) as caught:
         backend.connect()
@@ -113,7 +113,7 @@ def test_all_problems_are_listed_with_their_fixes(running, options, faults, regi
     for address, value in registers.items():
         bus.call(lambda at=address, value=value: bus.servo(1).table.set(at, value))
     lines = refusal(bus.port)
-    # The servo itself may already have detected the supply voltage.
+    # The servo may already have reported the supply voltage.
     assert [line for line in lines if "input voltage" not in line] == told
 
 
@@ -183,7 +183,7 @@ def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     gears = "gear friction consumes 25% of the transmitted torque, so a grip may never settle"
     assert [each.text for each in backend.notices] == 2 * [constant, gears]
     backend.close()
-    for name in ("hil", "small"):  # The servos in these profiles can produce the requested forces.
+    for name in ("hil", "small"):  # The servos in these profiles are strong enough.
         settings = load(find(Path(name)), Path("/tmp"))
         assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 
@@ -270,7 +270,7 @@ def test_an_alert_names_the_hardware_error_and_arming_is_refused(bus, servos):
 
 
 class Loaded:
-    """A stationary hand whose left motor draws 2 A."""
+    """A hand whose joints do not move while its left motor draws 2 A."""
 
     q = dq = np.zeros(2)
     current = np.array([2.0, 0.0])
@@ -302,8 +302,8 @@ def test_simulated_servos_heat_up_with_their_current_and_shut_down():
     while not read(servos, reading).alert:
         clock.sleep_until(clock.now() + 0.05)
         assert clock.now() < 400.0
-    # The heat is 55 K times 73 J/K. The power is 22.5 W initially and 32 W once the copper is
-    # hot. The air removes part of this heat.
+    # The servo warms up by 55 K and has a heat capacity of 73 J/K. The power rises from 22.5 W to
+    # 32 W as the copper heats up. The air removes part of the heat.
     assert 55.0 * 73.0 / 32.0 < clock.now() < 1.2 * 55.0 * 73.0 / 22.5
     assert (reading.alert, reading.hardware) == (0b01, [1 << 2, 0])
     assert reading.temperature == [80.0, 25.0]

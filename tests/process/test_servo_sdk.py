@@ -1,4 +1,4 @@
-"""Test the manufacturer's SDK on emulated servos, with its own and softfinger's packet handler."""
+"""Test the SDK on emulated servos, with the SDK's packet handler and with softfinger's."""
 
 from collections.abc import Iterator
 
@@ -32,7 +32,7 @@ def line(bus: RunningBus) -> Iterator[Line]:
 )
 def test_arbitrary_bytes_are_transferred_unchanged(bus, line, data, kind):
     port, handler = line
-    start = 224  # Indirect data that refer to themselves act as plain memory.
+    start = 224  # Indirect data that refer to themselves behave like memory.
     assert handler.writeTxRx(port, 1, start, len(data), list(data)) == (OK, 0)
     assert bus.memory(0)[start : start + len(data)] == data
     assert handler.readTxRx(port, 1, start, len(data)) == (list(data), OK, 0)
@@ -47,7 +47,7 @@ def test_other_sdk_calls_work_with_our_handler(line):
     assert handler.write4ByteTxRx(port, 1, reg.PROFILE_VELOCITY, 77) == (OK, 0)
     assert handler.read4ByteTxRx(port, 1, reg.PROFILE_VELOCITY) == (77, OK, 0)
     assert handler.write1ByteTxOnly(port, 2, reg.LED, 1) == OK
-    # The unread reply to this write must not be mistaken for the reply to the next request.
+    # This write causes a reply, which must not count as the reply to the next request.
     assert handler.read1ByteTxRx(port, 2, reg.LED) == (1, OK, 0)
     bulk = sdk.GroupBulkRead(port, handler)
     bulk.addParam(1, reg.PRESENT_POSITION, 4)

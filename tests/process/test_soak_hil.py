@@ -1,4 +1,4 @@
-"""Run a short real-time soak; test that it checks the bus, the memory and lost messages."""
+"""Test that a short real-time soak checks the bus, the memory and lost messages."""
 
 import copy
 import math
@@ -20,7 +20,7 @@ def test_the_real_time_soak_checks_wire_memory_and_streams(monkeypatch):
     # Allow 30 MB, because all processes are still warming up.
     monkeypatch.setattr(hil, "_FLAT", 30.0)
     account = hil.soak(4.0)
-    # On a busy machine, the emulated hand may be late, and its watchdog then trips late.
+    # On a busy machine, the emulated hand may be late, so the watchdog may trip late.
     assert [each for each in account.wrong if "without a packet" not in each] == []
     assert account.ticks > 0
     assert {"daemon", "hand", "recorder", "subscriber 3"} <= account.memory.keys()

@@ -1,7 +1,4 @@
-"""Test the behaviour of subcommands before their work starts.
-
-The tests cover missing packages, Ctrl-C during an import, and shell completion.
-"""
+"""Test subcommands with missing packages or with Ctrl-C during an import; test shell completion."""
 
 import signal
 import subprocess
@@ -47,7 +44,7 @@ def test_a_required_package_that_is_missing_is_named(tmp_path, missing, words, t
     assert not (tmp_path / "new.mcap").exists()
 
 
-# Program that sends Ctrl-C to itself during the import of a module.
+# This program sends itself Ctrl-C during the import of a module.
 _AT = """
 import builtins, os, signal, sys
 from softfinger.tools import cli
@@ -85,7 +82,7 @@ echo "${COMPREPLY[@]}"
 
 
 def test_tab_completion(inline, tmp_path):
-    """Use the script printed by `softfinger completion bash`."""
+    """Test the script that `softfinger completion bash` prints."""
     pytest.importorskip("shtab")
     script = tmp_path / "script"
     script.write_text(inline("completion", "bash").stdout, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Test that sweeps are bit-identical in one process, a pool, and a cluster that loses a worker."""
+"""Test that one process, a pool, and a cluster that loses a worker give bit-identical results."""
 
 import multiprocessing
 from functools import partial

@@ -1,4 +1,4 @@
-"""Test the emulated tactile board: the bytes on its pty, their timing, and its faults."""
+"""Test the bytes, the timing and the faults of the emulated tactile board on a pty."""
 
 import os
 import select
@@ -85,14 +85,14 @@ def test_the_next_event_is_the_next_frame_delivery():
     source = Source()
     made = board(source, rate=100.0, delay=0.004)
     assert made.next_event() == -np.inf
-    # If rounding places an event just before its frame, the board must not repeat the event
-    # immediately.
+    # Due to rounding, an event may occur just before its frame is due. The board must not repeat
+    # such an event immediately.
     times = (0.0, 0.004, np.nextafter(0.014, 0.0), 0.0561)
     for seq, (t, due) in enumerate(zip(times, (0.004, 0.014, 0.024, 0.064), strict=True)):
         source.make(seq)
         made.service(t)
         assert made.next_event() == pytest.approx(due)
-    made.service(0.0562)  # The board soon checks again for a late frame.
+    made.service(0.0562)  # The frame is late, so the board soon checks for it again.
     assert made.next_event() == pytest.approx(0.0567)
     made.service(0.0638)
     assert made.next_event() == pytest.approx(0.064)
@@ -104,7 +104,7 @@ def test_without_a_reader_only_whole_frames_are_dropped(cells):
     writer = FrameWriter()
     rng = np.random.default_rng(0)
     frame = rng.bytes(cells)
-    # The kernel reports the number of unread bytes only after a delay.
+    # The kernel updates the number of unread bytes with a delay.
     sent: list[bool] = []
     until(lambda: sent.append(writer.send(frame)) or writer.dropped >= 150)
     assert writer.dropped == sent.count(False)
@@ -116,7 +116,7 @@ def test_without_a_reader_only_whole_frames_are_dropped(cells):
         got += client.expect(1) + client.read()
     assert got == frame * sent.count(True)
     assert client.read() == b""
-    assert writer.send(frame)  # Sending continues once there is a reader.
+    assert writer.send(frame)  # The board continues once its output is read.
     os.close(client.fd)
     writer.close()
 

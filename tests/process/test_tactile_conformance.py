@@ -1,4 +1,4 @@
-"""Test the requirements for every tactile backend."""
+"""Test that every tactile backend meets the requirements for backends."""
 
 import threading
 
@@ -146,7 +146,7 @@ def test_a_frozen_board_has_new_numbers_and_times_but_the_same_image(backend, tm
         until(still)
 
 
-# The glove-style board is not tested here, because it gives an invalid frame only after 40
+# The glove-style board is excluded. The glove backend produces an invalid frame only after 40
 # unanswered requests of 0.1 s each.
 @pytest.mark.parametrize("backend", ["flexitac", "cobs"])
 def test_a_board_that_changes_its_grid_gives_an_invalid_frame(backend, tmp_path):

@@ -1,4 +1,4 @@
-"""Test the test kit with separate test files in another pytest process."""
+"""Test the test kit with test files that run in a separate pytest process."""
 
 import os
 from pathlib import Path

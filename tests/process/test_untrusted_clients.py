@@ -1,7 +1,7 @@
-"""Test that clients with an old ZeroMQ protocol can neither send commands nor receive messages.
+"""Test that clients with the old protocol ZMTP/1.0 can neither send commands nor receive messages.
 
-A web page can make a browser POST arbitrary bytes to any port of this machine. The bytes can form
-ZMTP/1.0 frames. ZMTP/1.0 has no handshake that would distinguish a browser from a client.
+A web page can make a browser POST arbitrary bytes to any port of this machine. The posted bytes can
+form ZMTP/1.0 frames. ZMTP/1.0 has no handshake that would distinguish a browser from a client.
 """
 
 import contextlib
@@ -18,18 +18,18 @@ from tests.harness.daemon_process import ask
 
 
 def old_frame(body: bytes, more: bool = False) -> bytes:
-    """Return a ZMTP/1.0 frame: length including flags, flags, body."""
+    """Return a ZMTP/1.0 frame, which consists of its length, flags and body."""
     return bytes([len(body) + 1, more]) + body
 
 
 def old_command(name: str) -> bytes:
-    """Return a command as a ZMTP/1.0 REQ socket sends it, identity first."""
+    """Return an identity and a command as a ZMTP/1.0 REQ socket sends them."""
     payload = msgpack.packb({"command": name})
     return old_frame(b"") + old_frame(b"", more=True) + old_frame(payload)
 
 
 def posted(frames: bytes, address: str) -> bytes:
-    """Return an HTTP request whose header is one message part and whose body is ``frames``."""
+    """Return an HTTP request whose header is a valid ZeroMQ frame and whose body is ``frames``."""
     for padding in range(256):
         head = (
             f"POST /{'x' * padding} HTTP/1.1\r\nHost: {address.removeprefix('tcp://')}\r\n"
@@ -50,7 +50,7 @@ def place(address: str) -> tuple[str, int]:
 
 
 def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
-    """Send ``request``, call ``wait``, and return the reply received meanwhile."""
+    """Send ``request``, call ``wait``, and return the bytes received in reply."""
     with socket.create_connection(place(address), timeout=60.0) as raw:
         raw.sendall(request)
         wait()
@@ -83,7 +83,7 @@ def test_a_web_page_can_neither_send_nor_receive(daemon, wrap):
         )
         assert b"ok" not in answer
         assert hand.state().mode == "disarmed"
-        hand.arm()  # The daemon still serves clients.
+        hand.arm()  # The daemon continues to serve other clients.
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
         hand.stop()
         request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), daemon.addresses[0])

@@ -1,4 +1,4 @@
-"""Test ``softfinger view``: pictures of the stream, access control, and errors."""
+"""Test the pictures, the access control and the errors of ``softfinger view``."""
 
 import argparse
 import base64
@@ -59,7 +59,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Kept:
-    """Pictures that the test process computes and stores."""
+    """Compute pictures in the test process; store the newest picture, scene and rows."""
 
     def __init__(self, *, live: bool = False) -> None:
         self.newest: dict[str, Any] = {}
@@ -70,7 +70,7 @@ class Kept:
 
     def _take(self, scene: str, picture: str, rows: list[Row]) -> None:
         self.rows = [orjson.loads(row.text) for row in rows]
-        # Tests in another thread wait for the picture, so the picture is stored last.
+        # Store the picture last, because tests in another thread wait for it.
         self.scene = orjson.loads(scene)
         self.newest = orjson.loads(picture)
 
@@ -90,7 +90,7 @@ def got(host: str, path: str, **headers: str) -> tuple[int, str]:
 
 
 def location(host: str, path: str) -> str:
-    """Return the target of a redirect."""
+    """Request a path and return the address to which the server redirects."""
     connection = http.client.HTTPConnection(host, timeout=60)
     connection.request("GET", path)
     answer = connection.getresponse()
@@ -166,7 +166,7 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
                     page.send(wish)
-                return fake.published > begun + 500  # The queue of the page holds 5 s of pictures.
+                return fake.published > begun + 500  # The page's queue holds 5 s of pictures.
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)
@@ -189,7 +189,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         with view(fake) as viewed, Watcher(viewed.host) as page:
             pictures = [page.next() for _ in range(5)]
             fake.send(schema.EVENT, msgpack.packb(event(7, "slip", "the object slips", "warning")))
-            # On a busy machine, the publisher may pause, and the picture then shows old data.
+            # If the publisher pauses on a busy machine, the picture shows old data.
             while not (picture := page.next())["events"] or (
                 picture["age"] >= picture["patience"]["state"]
             ):
@@ -230,7 +230,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
-        # Of 31 levels, more than 20 are used, because the peak is 45 kPa of 50 kPa.
+        # There are 31 levels for 50 kPa, and the peak is 45 kPa.
         assert levels.max() > 20
         assert levels[20:24, 20:24].min() > 10
         assert levels[:8].max() < 6  # This area contains only noise.
@@ -308,7 +308,7 @@ def test_panels_for_missing_parts_are_omitted(tmp_path, changes, gone, there):
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[tuple[FakeDaemon, Viewed]]:
-    """Yield a fake daemon and its viewer, for tests that do not change them."""
+    """Yield a fake daemon and a viewer for tests that do not change either."""
     with FakeDaemon() as fake, view(fake) as viewed:
         yield fake, viewed
 
@@ -409,7 +409,7 @@ def test_other_machines_need_a_one_time_code() -> None:
         with pytest.raises(InvalidStatus, match="403"):
             ask(viewed.host, query, {"command": "stop"}, origin="http://evil.example")
         assert got(viewed.host, code)[0] == 403  # Another browser has already used this code.
-        line = viewed.process.stdout.readline()  # This code is for the next browser.
+        line = viewed.process.stdout.readline()  # The next browser may use this code.
         assert location(viewed.host, line.split()[1].removeprefix(f"http://{viewed.host}")) == place
         listening = psutil.Process(viewed.process.pid).net_connections()
         assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.2"]
@@ -470,7 +470,7 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
 
 
 def stored_in(page: str) -> list[Any]:
-    """Return the scenes, pictures and rows that a saved page contains."""
+    """Return all scenes, pictures and rows in a saved page."""
     (packed,) = re.findall('id="stored">(.*?)</script>', page)
     return [orjson.loads(line) for line in gzip.decompress(base64.b64decode(packed)).splitlines()]
 
@@ -559,7 +559,7 @@ def test_states_are_queued_while_a_picture_is_drawn(context, addresses):
             for k in range(1, 5001):
                 publisher.send_multipart([schema.STATE, pack({**state(0.0, k), "seq_step": 1})])
                 if k % 100 == 0:
-                    # Publish at the rate at which libzmq's thread accepts messages.
+                    # Do not publish faster than libzmq's thread accepts messages.
                     select.select([], [], [], 0.005)
             drawn.set()
             until(lambda: kept.pictures.states == 5000)

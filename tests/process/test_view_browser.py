@@ -1,4 +1,4 @@
-"""Test the ``softfinger view`` page in a real browser: its contents and controls."""
+"""Test the contents and controls of the ``softfinger view`` page in a real browser."""
 
 import math
 import os
@@ -30,7 +30,7 @@ pytestmark = [
 LEASE = 10.0  # s
 SHIM = Path(__file__).parents[2] / "docs" / "iframe-worker.js"
 PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
-# Fraction of the canvas pixels with approximately the given colour.
+# Fraction of a canvas's pixels that have approximately the given colour.
 FRACTION = """((selector, colour) => {
   const canvas = document.querySelector(`${selector} canvas`);
   const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
@@ -39,7 +39,8 @@ FRACTION = """((selector, colour) => {
     count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
   return 4 * count / data.length;
 })"""
-# Visible text with a contrast below the WCAG AA minimum of 4.5 (3 for large text).
+# Visible text whose contrast is below the WCAG AA minimum, which is 3 for large text and otherwise
+# 4.5.
 PALE = """(() => {
   const linear = part => part <= 10.31 ? part / 3294.6 : ((part / 255 + 0.055) / 1.055) ** 2.4;
   const parts = colour => colour.match(/[\\d.]+/g).map(Number);
@@ -82,7 +83,7 @@ COVERED = """[...document.querySelectorAll("button, input, select")].filter(each
 
 
 class Page:
-    """The browser's page, with actions for tests."""
+    """The browser's page, and actions for tests of the page."""
 
     def __init__(self, browser: Browser) -> None:
         self.browser = browser
@@ -128,7 +129,7 @@ class Page:
         self.browser.ask("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], **named)
 
     def place(self, selector: str, across: float) -> tuple[float, float]:
-        """Return a point on an element, at the given fraction of its width."""
+        """Return the point at mid-height and at the fraction ``across`` of an element's width."""
         left, width, top, height = self(
             "(({left, width, top, height}) => [left, width, top, height])"
             f"(document.querySelector('{selector}').getBoundingClientRect())"
@@ -139,7 +140,7 @@ class Page:
         return float(self(f"{FRACTION}('{selector}', {list(colour)})"))
 
     def lag(self) -> float:
-        """Return the delay [s] of the page relative to the stream."""
+        """Return the age [s] of the picture on the page."""
         return float(self("Date.now() / 1000 - picture.time"))
 
 
@@ -185,7 +186,7 @@ def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
             mode_is(mode)
 
         press("[name=arm]", "armed")
-        # The page holds the lease.
+        # The page holds the lease for commands.
         assert "page" in command(commands, "release", client="another")["error"]
         press("[name=grasp]", "holding")
         assert hand.state().goal_force == pytest.approx(5.0)
@@ -299,7 +300,7 @@ def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
         page.mouse("mouseMoved", page.place(plot, 0.9), button="left", buttons=1)
         page.mouse("mouseReleased", page.place(plot, 0.9), button="left", clickCount=1)
         until(lambda: page("view.end") is not None)
-        assert 5.0 < page("view.span") < 8.0  # The zoom shows 0.3 of the 20 s, including margins.
+        assert 5.0 < page("view.span") < 8.0  # The zoom shows 0.3 of 20 s and margins.
         assert page.text("#hold") == "Resume"
         # The labels are times of day.
         assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")
@@ -397,7 +398,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
 def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page, fake):
     fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
     with viewing(fake) as viewed:
-        page.open(viewed.address)  # This visit fills the browser's cache for the second visit.
+        page.open(viewed.address)  # The browser caches this page.
         assert "Watching" in page.text("aside")
         page.click("#help")
         explained = page("document.querySelector('#explained').innerText")
@@ -409,7 +410,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         page.open(viewed.commanding)
         page.click("[name=clear]")
         until(lambda: page.text(".reply") == "✓ clear: ok")
-        # Opening the page did not send a stop.
+        # The page did not send a stop when it opened.
         assert [each["command"] for each in fake.requests] == ["clear"]
         until(lambda: page.lag() < 0.5)
 
@@ -422,7 +423,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         rows = page("past.rows.map(row => row[0])")
         # The rows include the states that were published while the browser was suspended.
         assert rows == [*range(rows[0], rows[0] + len(rows))]
-        page.click("[name=stop]")  # The page sends the stop, although its connection was closed.
+        page.click("[name=stop]")  # The page's connection was closed before.
         until(lambda: fake.requests[-1]["command"] == "stop")
 
         page("location.reload()")

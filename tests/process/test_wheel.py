@@ -1,4 +1,4 @@
-"""Test that the wheel is one complete package, independent of environment and current folder."""
+"""Test that the wheel is complete, and that the package works in any environment and folder."""
 
 import contextlib
 import os
@@ -54,7 +54,7 @@ def build(what: str, source: Path, into: Path) -> subprocess.CompletedProcess[st
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the unpacked sdist built from a clone."""
+    """Build the sdist from a clone; return the unpacked folder."""
     folder = tmp_path_factory.mktemp("sdist")
     built = build("sdist", copied(folder / "source"), folder)
     assert built.returncode == 0, built.stderr
@@ -118,7 +118,7 @@ def test_the_wheel_contains_one_package_with_all_its_data(wheel):
 
 @pytest.mark.extended
 def test_a_script_next_to_an_editable_clone_finds_the_package(tmp_path):
-    """The clone's folder has the package's name and precedes the installed package on the path."""
+    """The clone's folder, also named softfinger, is on the path before the installed package."""
     source = copied(tmp_path / "softfinger")
     assert build("editable", source, tmp_path).returncode == 0
     (packed,) = tmp_path.glob("*.whl")
@@ -157,7 +157,7 @@ def test_folders_with_the_names_of_subpackages_do_not_interfere(wheel, tmp_path)
 
 
 def test_pinned_versions_support_the_oldest_supported_python():
-    """Check that no installed package in constraints.txt requires a newer Python patch release."""
+    """Check that no package in constraints.txt requires a newer Python patch release."""
     oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
     assert oldest.startswith(">=")
     looked_at = 0

@@ -1,1 +1,1 @@
-"""Soak programs, one per module; the tests run short versions."""
+"""Soak programs, one per module, which the tests run for a short time."""

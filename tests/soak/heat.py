@@ -1,12 +1,12 @@
-"""Predict the temperatures of servos whose thermal constants are unknown:
+"""Predict the temperatures of servos whose thermal constants are unknown.
 
-``python -m tests.soak.heat --runs 40``.
+``python -m tests.soak.heat --runs 40`` performs 40 runs.
 
-Each run draws a servo model, factors for heating, cooling and heat capacity (0.75 to 1.33), a room
-temperature (15 to 35 °C) and a current (1.15 to 1.8 times the maximum continuous current). At a
-random time, the room becomes 5 or 8 °C warmer or colder. The daemon's filter receives temperatures
-in whole degrees and a current with 3 % noise. The plant is `servo_model.servo_joint`. ``--grips N``
-adds complete hands in virtual time that grip too hard for too long.
+Each run draws a servo model and a room temperature from 15 to 35 °C. The factors for heating,
+cooling and heat capacity are 0.75 to 1.33. The current is 1.15 to 1.8 times the maximum continuous
+current. At a random time, the room becomes 5 or 8 °C warmer or colder. The daemon's filter receives
+temperatures in whole degrees and a current with 3 % noise. The plant is `servo_model.servo_joint`.
+``--grips N`` also simulates N complete hands that grip too hard for too long.
 """
 
 import argparse
@@ -29,15 +29,15 @@ _LONG = 8000.0  # duration that is long enough to reach the steady state [s]
 
 
 class Foreseen(NamedTuple):
-    """Result of the prediction for one hold."""
+    """Result of the prediction in one run."""
 
-    warned: float  # time from the warning until the reading reached the limit [s]
-    told: float  # remaining time that was predicted 60 s before the end [s]
+    warned: float  # time from the warning to the limit [s]
+    told: float  # time until the limit as predicted 60 s before [s]
     lasted: float  # total duration [s]
 
 
 class Bench:
-    """Servo with hidden constants, and the daemon's temperature prediction for it."""
+    """Servo with random thermal constants, and the daemon's temperature prediction for it."""
 
     def __init__(self, seed: int) -> None:
         self.chance = chance = random.Random(seed)
@@ -51,7 +51,7 @@ class Bench:
         self._watch = HeatWatch(settings, self.state)
 
     def lasting_current(self) -> float:
-        """Find the current [A] at which the plant's case temperature settles at the limit."""
+        """Return the current [A] at which the plant's case temperature settles at the limit."""
         low, high = 0.0, 3.0
         while high - low > 3e-3:
             current = 0.5 * (low + high)
@@ -64,7 +64,7 @@ class Bench:
         return low
 
     def step(self, current: float) -> float:
-        """Advance by _DT at a current [A]; return the predicted time until the limit [s]."""
+        """Apply a current [A] for _DT seconds; return the predicted time until the limit [s]."""
         self.t += _DT
         noisy = current * (1.0 + 0.03 * self.chance.gauss(0.0, 1.0))
         self.plant.step(current, _DT)
@@ -93,7 +93,7 @@ def foreseen(seed: int) -> Foreseen:
 
 
 def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
-    """Apply half the maximum continuous current; halfway through, the room becomes 8 °C warmer.
+    """Apply half the maximum continuous current, and make the room 8 °C warmer halfway through.
 
     Returns the minimum predicted time until the limit [s].
     """
@@ -109,14 +109,14 @@ def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
 class Held(NamedTuple):
     """Result of a grip with more force than the servos can sustain."""
 
-    # True if the object was dropped, because of an overheated servo or for another reason.
+    # True if the hand lost its grip for any reason.
     dropped: bool
     force: float  # requested force at the end [N]
     events: list[str]
 
 
 def held(seed: int, seconds: float = 400.0) -> Held:
-    """Grip with 20 to 26 N, on a complete hand whose servos have a fifth of the heat capacity."""
+    """Grip with 20 to 26 N; the servos have about a fifth of the usual heat capacity."""
     chance = random.Random(seed)
     factors = (
         chance.uniform(0.9, 1.33),

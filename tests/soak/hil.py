@@ -1,11 +1,12 @@
 """Run a one-hour real-time hardware-in-the-loop soak: ``python -m tests.soak.hil``.
 
 A daemon process drives an emulated hand. A recorder, three subscribers and a client connect to the
-daemon. The client grasps, turns, moves, releases and streams setpoints at 50 Hz, while faults
-disturb servos, boards and the daemon itself. Every few seconds the emulated hand's record of the
-servo bus is checked. The memory of each process must stay constant, and all lost messages must be
-counted. The ticks at the end must be as punctual as at the beginning. At least three of ten grasps
-must lead to a hold. Faults caused by a busy machine are counted, reported and cleared.
+daemon. The client grasps, turns, moves and releases the object, and streams setpoints at 50 Hz.
+Meanwhile, faults disturb the servos, the boards and the daemon. Every few seconds, the soak checks
+the emulated hand's record of the servo bus. The memory of each process must stay constant, and all
+lost messages must be counted. Ticks must be as punctual at the end as at the beginning. At least
+three of ten grasps must lead to a hold. The soak counts, reports and clears faults that a busy
+machine causes.
 """
 
 from __future__ import annotations
@@ -36,23 +37,22 @@ from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0
 SUBSCRIBERS = 3
-_LOOK = 5.0  # time between two checks of bus and memory [s]
-# Duration of the windows that are compared, at the start and at the end of the run [s]. Each window
-# takes at most a third of the run.
+_LOOK = 5.0  # time between two checks of the bus and of the memory [s]
+# Duration of the first window and of the last window, whose delays are compared [s]. A window takes
+# at most a third of the run.
 _WINDOW = 600.0
 _FLAT = 2.0  # maximum memory growth of a process [MB]
 _FAULT_EVERY = 40.0  # average time between faults [s]
 _FAULT_FOR = 0.3
 _SETPOINT = 0.02  # time between setpoints [s]
 _STREAM = 3.0  # duration of a setpoint stream [s]
-_SPLIT = 300  # time per recorder file [s]; the recorder keeps an index until the file is closed
-# After a stop, these faults leave the object tilted, and the soak test then puts the object
-# upright.
+_SPLIT = 300  # time per recorder file [s]; the index of an open file uses memory
+# These faults leave the object tilted. The soak then puts the object upright.
 _ASKEW = ("hand.angle", "tip.tilt")
-_DROPPED = 20.0  # time without a grip after which the test puts a lost object back [s]
+_DROPPED = 20.0  # time without a grip after which the soak puts the object back [s]
 _HELD = 0.3  # minimum fraction of grasps that settle
 _MANY = 50  # number of grasps above which `_HELD` is checked
-_BEGUN = 1500  # maximum difference between the numbers of states received by any two listeners
+_BEGUN = 1500  # maximum difference between the listeners' numbers of states
 
 
 @dataclass
@@ -62,7 +62,7 @@ class Account:
     seconds: float = 0.0
     ticks: int = 0
     overruns: int = 0
-    modes: Counter[str] = field(default_factory=Counter)  # number of checks per mode
+    modes: Counter[str] = field(default_factory=Counter)  # number of checks in each mode
     done: Counter[str] = field(default_factory=Counter)  # accepted commands
     injected: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
@@ -80,7 +80,7 @@ class Account:
     looked: list[tuple[float, int]] = field(default_factory=list)
 
     def growth(self) -> dict[str, float]:
-        """Return each process's memory growth after the first window [MB]."""
+        """Return the increase of each process's memory after the first window [MB]."""
         looks = [t for t, _ in self.looked]
         warm = int(np.searchsorted(looks, self.window))
         return {
@@ -90,11 +90,11 @@ class Account:
 
     @property
     def window(self) -> float:
-        """Length of the window at the beginning and at the end [s]."""
+        """Duration of the first window and of the last window [s]."""
         return min(_WINDOW, self.seconds / 3.0)
 
     def lateness(self) -> tuple[float, float]:
-        """Return p99.9 of the tick delays in the first and last window [s]."""
+        """Return p99.9 of the tick delays in the first window and in the last window [s]."""
         times, counts = np.array(self.looked).reshape(-1, 2).T
         first = int(np.interp(self.window, times, counts))
         last = int(np.interp(self.seconds - self.window, times, counts))
@@ -126,7 +126,7 @@ class Account:
 
 
 def soak(seconds: float, seed: int = 1) -> Account:
-    """Run the soak; raise RigError if the setup does not work."""
+    """Run the soak; raise RigError if the emulated hand has ended or a process does not start."""
     chance = random.Random(seed)
     account = Account()
     with Rig() as rig, ExitStack() as others:
@@ -210,7 +210,7 @@ def _next(chance: random.Random, mode: str) -> dict[str, object] | None:
 
 
 def _teleoperate(rig: Rig, account: Account, chance: random.Random) -> None:
-    """Stream force and angle setpoints for a while, as a teleoperation device does."""
+    """Stream force and angle setpoints for _STREAM seconds, as a teleoperation device does."""
     force, swing, pace = chance.uniform(4, 10), chance.uniform(0.02, 0.15), chance.uniform(2, 8)
     begin = time.monotonic()
     while (t := time.monotonic() - begin) < _STREAM:
@@ -228,7 +228,7 @@ def _inject(rig: Rig, account: Account, chance: random.Random) -> End:
 
 
 def _listen(rig: Rig, account: Account, seconds: float) -> None:
-    """Receive states for ``seconds`` and record their tick delays."""
+    """Receive states for ``seconds``, and record the delay of each state's tick."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         account.late.extend(state["wake_late_s"] for state in rig.states(left))
@@ -236,7 +236,7 @@ def _listen(rig: Rig, account: Account, seconds: float) -> None:
 
 @contextmanager
 def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
-    """Run the recorder and the subscribers; yield each process's name and ID."""
+    """Run the recorder and the subscribers; yield the names and IDs of all processes."""
     assert rig.daemon is not None
     assert rig.hand is not None
     file = rig.folder / "soak.mcap"
@@ -309,7 +309,7 @@ def _conclude(account: Account) -> None:
 
 
 def subscribe(address: str) -> None:
-    """Print "ready" at the first state; finally, print how many states were received and lost."""
+    """Print "ready" at the first state and, at the end, the counts of received and lost states."""
     received = 0
     with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()

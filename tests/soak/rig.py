@@ -1,4 +1,4 @@
-"""Run an emulated hand and its daemon as processes, and inject faults during a soak."""
+"""Run an emulated hand and its daemon as processes, and inject faults for a soak."""
 
 from __future__ import annotations
 
@@ -29,21 +29,19 @@ from softfinger.tools.processes.emulate import emulator_process
 
 _PATIENCE = 300.0  # timeout for the start of a process, including kernel compilation [s]
 _STATE_RATE = 250.0  # Hz
-# These settings affect only the startup, because a busy machine may delay the first bytes of the
-# emulated hand.
+# On a busy machine, the first bytes of the emulated hand may be late.
 _PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
 _POLL = 0.003  # time between polls of the stream [s]
-_SLACK = 0.05  # tolerated delay of a process [s]
+_SLACK = 0.05  # tolerance for delays of a process [s]
 _RESOLUTION = 0.0016  # one encoder count [rad]
 _CURRENT_UNIT = 0.0027  # A
-_ROOM = 1 << 18  # number of bytes that a daemon with limited memory may still allocate
+_ROOM = 1 << 18  # number of bytes by which the address space may grow
 
 
 class Rig:
-    """Emulated hand and daemon as two processes that can be restarted.
+    """An emulated hand and its daemon, which run in two processes that can be restarted.
 
-    Checks of the data sent to the servos use the emulated hand's record, never the daemon's
-    reports.
+    Checks of the data sent to the servos use the emulated hand's record, not the daemon's reports.
     """
 
     def __init__(self) -> None:
@@ -68,7 +66,7 @@ class Rig:
         self._states: zmq.Socket[bytes] | None = None
 
     def start(self, *words: str) -> None:
-        """Start the missing processes; ``words`` are the daemon's arguments; may raise RigError."""
+        """Start processes that are not running; pass ``words`` to the daemon. Raises RigError."""
         if self.hand is None or self.hand.poll() is not None:
             self.hand = self._running.enter_context(
                 emulator_process("--dir", self.ports, "--config", self.config, *self.hand_words)
@@ -93,7 +91,7 @@ class Rig:
                 raise RigError(f"the daemon did not start: {self.log()[-1:]}")
 
     def end_daemon(self, number: int = signal.SIGTERM) -> int | None:
-        """Signal the daemon and wait for it; return None if it had to be killed."""
+        """Signal the daemon; return its exit status, or None if it had to be killed."""
         daemon, self.daemon = self.daemon, None
         if daemon is None:
             return 0
@@ -138,7 +136,7 @@ class Rig:
             raise RigError(str(error)) from None
 
     def report(self, more: str = "") -> dict[str, Any]:
-        """Return the servo bus record; ``forget`` in ``more`` starts a new record."""
+        """Return the record of the servo bus; if ``more`` is ``forget``, start a new record."""
         report: dict[str, Any] = json.loads(self.send(f"report {more}"))
         return report
 
@@ -155,7 +153,7 @@ class Rig:
         return status if status["ok"] else None
 
     def states(self, wait: float = _POLL) -> list[dict[str, Any]]:
-        """Return the states received since the last call; wait at most ``wait`` s for one."""
+        """Return the states received since the last call; wait up to ``wait`` [s] for the first."""
         found: list[dict[str, Any]] = []
         assert self._states is not None
         while self._states.poll(0 if found else int(wait * 1000)):
@@ -163,13 +161,13 @@ class Rig:
         return found
 
 
-# Function that starts a fault and returns a function that ends the fault.
+# An Inject function starts a fault and returns the End function of the fault.
 End = Callable[[], object]
 Inject = Callable[[Rig, random.Random], End]
 
 
 def _sent(begin: str, end: str = "well", *, places: tuple[Any, ...] = ("",)) -> Inject:
-    """Return a fault that sends words to the emulated hand; ``{}`` becomes one of ``places``."""
+    """Return a fault that sends words to the emulated hand; one of ``places`` replaces ``{}``."""
 
     def inject(rig: Rig, chance: random.Random) -> End:
         place = chance.choice(places)
@@ -196,7 +194,7 @@ def _stood_still(rig: Rig, chance: random.Random) -> End:
 
 
 def _without_memory(rig: Rig, chance: random.Random) -> End:
-    """Limit the daemon's address space to slightly above its current size, and send requests."""
+    """Allow the daemon only _ROOM more bytes of address space, and send it requests."""
     assert rig.daemon is not None
     process = rig.daemon.pid
     _, hard = resource.prlimit(process, resource.RLIMIT_AS)
@@ -232,8 +230,8 @@ CASES: dict[str, Inject] = {
 def judge_wire(rig: Rig) -> str:
     """Return an error found in the emulated hand's record of the servo bus, or "".
 
-    Goals must be within their limits. While torque is on, packets must keep arriving, and torque
-    must not be switched on far from the goal.
+    Goals must be within their limits. Torque must not be switched on far from the goal. While
+    torque is on, packets must keep arriving.
     """
     settings = rig.settings
     wrong = ""

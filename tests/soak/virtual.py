@@ -1,12 +1,13 @@
-"""Run a virtual-time soak: random sequences of commands, loads and faults, one per seed.
+"""Run random sequences of commands, loads and faults in virtual time, one sequence per seed.
 
-``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most sequences grip the object;
-the grips are then loaded, turned, disturbed by faulty measurements and stopped. The complete daemon
-runs, except for its sockets. Requirements are checked against the plant and the data sent to the
-servos, never against the daemon's own reports. The soak counts how often each requirement is
-checked, and fails if a requirement is never checked. The test suite runs only a few sequences.
+``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. In most sequences, the hand
+grips the object. The soak then loads, turns and stops the grip, and disturbs it with faulty
+measurements. The daemon is complete except for its sockets. Requirements are checked with the
+plant's values and the data sent to the servos, not with the daemon's own reports. The soak counts
+how often each requirement is checked, and fails if a requirement is never checked. The test suite
+runs only a few sequences.
 
-``--ticks 14400000`` runs one hand for eight hours of virtual time and records and reads its stream.
+``--ticks 14400000`` runs one hand for eight hours of virtual time and records the stream.
 Violations are counted and do not end the run. The run fails if memory grows or a state is
 inconsistent.
 """
@@ -43,32 +44,32 @@ from softfinger.tools.recordings.record import RecordingWriter
 
 SEQUENCES, TICKS = 1000, 5000
 LONG = 1_000_000  # number of ticks above which a sequence counts as long
-HELD = 0.3  # fraction of the sequences that must reach a settled grip
+HELD = 0.3  # minimum fraction of the sequences in which a grip settles
 _GRIPPING = ("grasping", "holding", "rotating")
 _COMMAND_EVERY = 150  # average number of ticks between commands
 _DISTURBED_EVERY = 800  # average number of ticks between loads or faults
 _DISTURBED_FOR = 500
-_WILD = 0.1  # fraction of commands that are drawn regardless of the mode
+_WILD = 0.1  # fraction of commands that are drawn from all commands in any mode
 _LOOKS = 96  # number of memory checks in a long sequence
-_WARM = 2  # number of memory checks excluded as warm-up: ten minutes of eight hours
+_WARM = 2  # number of memory checks in the warm-up, which takes ten minutes of eight hours
 _FLAT = 2.0  # maximum memory growth after the warm-up [MB]
 _STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # message rates in a long sequence [Hz]
 _SPLIT = 16e6  # file size limit for the recording of the long sequence [bytes]
-# "deaf": the servo receives no data but still sends readings. "jumped": the angle is off by 0.2
-# rad. "numb": angle, velocity and current stay constant.
+# A "deaf" servo receives no data but still sends readings. A servo that has "jumped" reports an
+# angle that is wrong by 0.2 rad. A "numb" servo always reports the same angle, velocity and
+# current.
 SERVO_FAULTS = (
     *("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed"),
     *("jumped", "numb"),
 )
-# Faults in which the joint angle contradicts the frames.
+# faults with which the joint angle contradicts the frames
 _ENCODER = ("fast", "strayed", "jumped", "numb")
-# faults in which the servo does not receive the torque-off command
+# faults with which a servo does not receive the torque-off command
 _UNHEARD = ("silent", "gone", "deaf")
 _WATCHDOG = 100  # number of ticks until the servo watchdogs stop the motors (0.2 s)
-_LOST = 20  # number of consecutive lost goals after which the loss is reported
+_LOST = 20  # number of consecutive lost goals that triggers a report
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
-# Faults of a sensor or of a current measurement, each with its range of values and the channel that
-# may be named.
+# For each measurement fault, the range of its values and the channel that the daemon may name.
 LIES = {
     "gain": ((0.5, 1.6), "sensor"),
     "shift-x": ((-4.0, 4.0), "sensor"),
@@ -79,12 +80,12 @@ LIES = {
     "current": ((0.4, 2.5), "current"),
 }
 LOADS = ("push", "twist")
-_TOO_LONG = 0.05  # maximum time for which a tip force may exceed its bound [s]
-_TOO_MUCH = 1.3  # maximum ratio of tip force to requested force without a load or fault
-_UNSURE = 1.2  # maximum ratio of a tip force to the increased grip force under load
-_REMEMBERED = 5.0  # maximum time for which a grip stays raised after a load or fault [s]
+_TOO_LONG = 0.05  # maximum time above a bound on the tip force [s]
+_TOO_MUCH = 1.3  # maximum ratio of a tip force to the requested force without a load
+_UNSURE = 1.2  # maximum ratio of a tip force to the raised grip force under a load
+_REMEMBERED = 5.0  # maximum time for which the grip force stays raised after a load or fault [s]
 _RETARGETED = 0.5  # maximum time for which the previously requested force may persist [s]
-_UNCOVERED = 1.0  # time after which a tip near the object's edge is ignored [s]
+_UNCOVERED = 1.0  # time for which a footprint outside the object excuses false reports [s]
 
 # Requirements. The test counts the checks of each requirement.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
@@ -108,9 +109,9 @@ ASSERTIONS = (
 
 
 class Judge:
-    """Check requirements and count how often each was checked.
+    """Check requirements, and count the checks of each requirement.
 
-    If ``broken`` is given, violations are counted there and do not raise an exception.
+    If ``broken`` is given, a violation is counted there and does not raise an exception.
     """
 
     def __init__(self, judged: Counter[str], broken: Counter[str] | None = None) -> None:
@@ -118,7 +119,7 @@ class Judge:
         self._broken = broken
 
     def __call__(self, name: str, holds: bool, *found: object) -> None:
-        """Count ``name``; if the requirement is violated, raise AssertionError with ``found``."""
+        """Count a check of the requirement ``name``; raise AssertionError on a violation."""
         self._judged[name] += 1
         if not holds and self._broken is not None:
             self._broken[name] += 1
@@ -127,7 +128,7 @@ class Judge:
 
 
 class Listener(Link):
-    """Replacement for the gateway that receives and records all published messages."""
+    """Receive and record all published messages, in place of the gateway."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -172,7 +173,7 @@ class FaultyServos:
         self.last_good = -math.inf
         self.torque = False
         self.armed = False  # True if the hand has been armed since the last event that disarmed it
-        self._last = 0.0  # last angle reported by a numb joint [rad]
+        self._last = 0.0  # last reported angle, which a numb joint repeats [rad]
         self._unheard = 0
 
     def connect(self) -> None:
@@ -313,14 +314,14 @@ class Account:
     """Results of the sequences."""
 
     sequences: int = 0
-    held: int = 0  # number of sequences that reached a settled grip
+    held: int = 0  # number of sequences in which a grip settled
     ticks: int = 0
     seconds: float = 0.0  # run time
     judged: Counter[str] = field(default_factory=Counter)
     modes: Counter[str] = field(default_factory=Counter)  # number of ticks in each mode
     faults: Counter[str] = field(default_factory=Counter)  # number of latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
-    # Channels that were reported as faulty, with the actual fault.
+    # Channels that the daemon reported as faulty, each with the actual fault.
     named: Counter[str] = field(default_factory=Counter)
     commands: Counter[str] = field(default_factory=Counter)  # accepted commands
     refused: int = 0
@@ -365,7 +366,7 @@ class Account:
 
 
 class Soak:
-    """Random actions on a daemon with the virtual clock, and checks of all requirements."""
+    """Apply random actions to a daemon in virtual time, and check all requirements."""
 
     def __init__(
         self, seed: int = 1, account: Account | None = None, listener: Listener | None = None
@@ -401,7 +402,7 @@ class Soak:
         self.hand.plant.parameters.torque_constant *= chance.uniform(0.9, 1.1)
         self.count = 0  # ticks so far
         self.held = False
-        self.off_by = math.inf  # tick until which torque must be off
+        self.off_by = math.inf  # tick from which torque must be off
         self._off_name = OFF
         self._failed = ""
         self._deadline = clock.now()
@@ -409,12 +410,12 @@ class Soak:
         self._next_disturbance = self._after(_DISTURBED_EVERY)
         self._well_at = math.inf  # tick at which a disturbance ends
         self._lie = ""  # kind of the current measurement fault
-        self._false: set[str] = set()  # channels that have been faulty and may be named
+        self._false: set[str] = set()  # faulty channels, which the daemon may name
         self._loaded = 0.0  # N along the faces
-        # Last time [s] with a load, with a wrong measurement, and with a tip near the object's
-        # edge.
+        # Times [s] of the last load, the last wrong measurement, and the last footprint off the
+        # object.
         self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
-        # Pairs of time [s] and force [N], empty outside grips.
+        # Requested forces [N] of the current grip, each with its time [s].
         self._asked: list[tuple[float, float]] = []
         # Start of the current interval above the bound [s].
         self._above = {MOST: math.inf, CALM: math.inf}
@@ -484,7 +485,7 @@ class Soak:
             self._carried_out(request, str(mode))
 
     def _carried_out(self, request: dict[str, Any], mode: str) -> None:
-        """Record the effects of an accepted command."""
+        """Update the expected torque and force after an accepted command."""
         name = request["command"]
         if name == "arm":
             self.servos.armed, self.off_by = True, math.inf
@@ -493,14 +494,14 @@ class Soak:
         if name == "grasp" or (name == "hold" and ("force" in request or mode not in _GRIPPING)):
             force = request.get("force", self.settings.control.force_default)
             t = self.daemon.clock.now()
-            if not self._asked:  # A motion may already apply a higher force.
+            if not self._asked:  # A motion may already exert a higher force.
                 self._asked.append((t, max(self.hand.force.tolist())))
             self._asked.append((t, force))
         elif name in ("arm", "move", "release", "stop", "disarm"):
             self._asked.clear()
 
     def _must_end(self, name: str) -> None:
-        """Require that the motors are off from now on and that no goals are sent."""
+        """Require that motors turn off, and that no goals are sent until the hand is armed."""
         if not self.servos.armed:
             return
         self.servos.armed = False
@@ -550,7 +551,7 @@ class Soak:
         self.account.injected[kind] += 1
 
     def _load(self, kind: str) -> None:
-        """Apply a load up to the grip's limit, and sometimes above it."""
+        """Apply a load that is usually below the grip's limit."""
         chance, friction = self._random, self.settings.simulation.tip_friction
         force = self._asked[-1][1] if self._asked else 5.0
         share = chance.uniform(-0.7, 0.7) if chance.random() < 0.8 else chance.uniform(-1.6, 1.6)
@@ -569,7 +570,7 @@ class Soak:
         self.hand.load()
 
     def _put_object_back(self) -> None:
-        """Put the object back if loads have moved it and the fingers leave room for it."""
+        """Put the object back if it has moved and the fingers leave room for it."""
         hand, (x, y) = self.hand, self.settings.simulation.object_position
         pose = hand.object_pose.copy()
         if hand.force.any() or (math.dist(pose[:2], (x, y)) < 0.003 and abs(pose[2]) < 0.03):
@@ -634,14 +635,14 @@ class Soak:
             self.must(FRAME, age <= most + 1e-9, f"{mode} on one {age:.3f} s old")
 
     def _judge_forces(self, t: float) -> None:
-        """Check that each force in the plant exceeds its bound only briefly."""
+        """Check that no tip force in the plant exceeds its bound for long."""
         control, most = self.settings.control, self.settings.safety.force_max
         if self._loaded:
             self._loaded_t = t
         if self._lie or any(sensor.fault for sensor in self.sensors):
             self._lied_t = t
         force = max(self.hand.force.tolist())
-        # The measured force has the same relative error as the torque constant.
+        # The measured force has the relative error of the torque constant.
         self._must_end_soon(MOST, MOST, force, (1.0 + control.torque_error) * most, t)
         while len(self._asked) > 1 and self._asked[1][0] < t - _RETARGETED:
             del self._asked[0]
@@ -655,7 +656,7 @@ class Soak:
         bound = _TOO_MUCH * asked
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
-        bound += 2.0 * friction  # Allow for friction compensation and static friction.
+        bound += 2.0 * friction  # for friction compensation and static friction
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)
@@ -678,7 +679,7 @@ class Soak:
             self.must(LOADED if self._loaded else HONEST[mode], True)
 
     def _doubts(self, held: bool) -> Iterator[str]:
-        """Yield the channels that the estimator currently treats as faulty."""
+        """Yield the measurement channels that the estimator currently treats as faulty."""
         perception = self.daemon.loop.perception
         found = perception.filter.grasp
         for sensor in perception.fingers:
@@ -693,7 +694,7 @@ class Soak:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:
-        """Check that only faulty channels are reported as faulty, unless the object has slipped."""
+        """Check that a reported channel is faulty, unless a footprint has just left the object."""
         t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1
@@ -704,7 +705,7 @@ class Soak:
             )
 
     def _covered(self) -> bool:
-        """Return True if the plant's object covers the footprints of both tips."""
+        """Return True if the footprints of both tips are on the object's faces in the plant."""
         hand, simulation = self.hand, self.settings.simulation
         x, y, angle = hand.object_pose.tolist()
         sine, cosine, radius = math.sin(angle), math.cos(angle), self.settings.tip.radius
@@ -725,7 +726,7 @@ def resident() -> float:
 
 
 def sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run the sequence with ``seed`` and add its violations to ``account``."""
+    """Run the sequence of a seed, and add its violations to ``account``."""
     soak = Soak(seed, account)
     try:
         soak.run(ticks)
@@ -738,7 +739,7 @@ def sequence(seed: int, ticks: int, account: Account) -> None:
 
 
 def long_sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run one hand for a long time with a listener and memory checks."""
+    """Run one hand for a long time; record all messages and check the memory."""
     with tempfile.TemporaryDirectory() as folder:
         listener = Listener(Path(folder))
         soak = Soak(seed, account, listener)

@@ -1,4 +1,4 @@
-"""Test short benchmark runs: their errors, bounds and verdicts."""
+"""Test the errors, bounds and verdicts of short benchmark runs."""
 
 import json
 import math
@@ -152,7 +152,7 @@ ASKEW = {"object_angle": math.radians(5.0)}
     ],
 )
 def test_residual_angle_error_of_a_control_law(way, low, high):
-    # The controller tolerates a delay if the product of delay and integral bandwidth is below π/2.
+    # The control loop is stable if the product of its delay and integral bandwidth is below π/2.
     assert low <= control.left(way, ASKEW) <= high
 
 
@@ -187,7 +187,7 @@ def test_a_held_load_slides_and_a_lost_load_is_reported():
     assert 0.0 < held.answer < 0.022
     assert 0.0 < held.slid < 0.02
     assert not held.lost
-    # A joint that still sticks moves a quarter as far as the other joint.
+    # One joint still sticks and moves only a quarter as far as the other joint.
     sticking = reflex.overloaded({"simulation": {"object_mass": 0.5}}, 6.0, 15.0, 1)
     assert (sticking.answer < 0.022, sticking.slid < 0.012, sticking.lost) == (True, True, False)
     weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}
@@ -210,7 +210,7 @@ def test_an_ideal_hand_meets_its_aim():
     (table,) = measure(trials=2, only="6 N: no fault")
     (row,) = table.rows
     assert (row["met"], row["trials"], table.failed) == (2, 2, False)
-    # The torque constants are off by up to 10 %.
+    # The errors of the torque constants are up to 10 %.
     assert row["lowest"] == pytest.approx(1.0, abs=0.08)
     assert row["peak"] < 1.15
     assert (row["reported"], row["missed"], row["events"]) == ("", "", "")

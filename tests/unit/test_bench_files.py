@@ -1,4 +1,4 @@
-"""Test that frame files from test benches are read correctly or rejected with a clear reason."""
+"""Test that frame files of test benches are read correctly or rejected with a clear reason."""
 
 import itertools
 import re
@@ -44,7 +44,7 @@ def press(tared) -> np.ndarray:
 
 
 def export(frames: np.ndarray, unit: str = "kPa", scale: float = 1e-3, **form: Any) -> bytes:
-    """Write an export; ``form`` sets header lines, separator, decimal sign, encoding, etc."""
+    """Return an export; ``form`` sets header lines, separator, decimal sign, encoding, etc."""
     point, digits = form.get("point", "."), form.get("digits", 3)
     header = [
         *("DATA_TYPE MOVIE", "SENSOR_TYPE 5051", "ROWS 44", "COLS 44", "NOISE_THRESHOLD 3"),
@@ -96,7 +96,7 @@ def test_cells_above_the_saturation_pressure_of_the_header_are_excluded(
     path = tmp_path / "a.asf"
     path.write_bytes(export(frames, unit, 1.0 / pascal, digits=digits, header=[line]))
     settings, within = SETTINGS, 3e-5
-    if digits == 0:  # Rounding to whole kPa adds noise of a third of a kPa.
+    if digits == 0:  # Rounding to whole kPa adds noise of 0.3 kPa.
         tactile = SETTINGS.tactile.model_copy(update={"noise": 600.0})
         settings, within = SETTINGS.model_copy(update={"tactile": tactile}), 6e-5
     check(path, settings, within)
@@ -149,7 +149,7 @@ def test_raw_readings_saturate_at_255(press, tmp_path):
     check(path, SETTINGS.model_copy(update={"tactile": tactile}))
 
 
-# Zero offsets and dead cells
+# Zero offsets and dead cells.
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16, np.int32])

@@ -1,4 +1,4 @@
-"""Test the elastomer blur: the model against dense convolution, the estimator against its bound."""
+"""Test the model of the elastomer's blur against a convolution; test estimates with blur."""
 
 import math
 
@@ -70,8 +70,8 @@ def test_cells_beyond_the_reach_of_the_tip_are_unused_for_any_blur(reading):
     frame = grid.pressure(TIP, LINEAR, 0.012, 0.25, 0.25)
     estimator = ContactEstimator(TIP, LINEAR, grid, noise)
     usual = estimator(frame)
-    # This cell is more than three standard deviations outside the rim, but inside the bounding box
-    # of the footprint.
+    # This cell is in the bounding box of the footprint. Its distance to the rim exceeds three
+    # standard deviations of the blur.
     frame[39, 39] = reading
     found = estimator(frame)
     assert usual.valid

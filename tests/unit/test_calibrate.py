@@ -1,4 +1,4 @@
-"""Test `softfinger calibrate` step by step on a simulated sensor; use the file in the daemon."""
+"""Test each step of `softfinger calibrate` on a simulated sensor, and the file in the daemon."""
 
 import json
 import math
@@ -72,7 +72,7 @@ class MadeUp:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """Run a complete calibration from recordings; return the folder with its two files."""
+    """Run all calibration steps with recordings; return the folder of the files, and the sensor."""
     folder = tmp_path_factory.mktemp("calibration")
     (folder / "profile.toml").write_text(PROFILE)
     sensor = MadeUp()
@@ -165,7 +165,7 @@ def test_the_daemon_applies_the_file(bench, tmp_path):
         assert contact.tilt_y == pytest.approx(0.0, abs=0.01)
         assert contact.force == pytest.approx(math.pi * E * 0.003**2 / math.cos(0.15), rel=0.04)
         for perception in daemon.loop.perception.fingers:
-            perception.tare()  # The converter applies the new zero offset in counts.
+            perception.tare()  # The converter subtracts the new zero offset, in counts.
         daemon.loop.advance(0.3)
         assert daemon.loop.state.contacts[0].d == 0.0
 

@@ -1,4 +1,4 @@
-"""Test calibration files in the hand: each finger uses its own tip and zero offsets."""
+"""Test that each finger uses the tip and the zero offsets in its own calibration file."""
 
 import math
 from pathlib import Path
@@ -125,14 +125,14 @@ def test_the_material_of_each_tip_reaches_estimate_table_and_prediction(settings
             assert scale == pytest.approx(1.0, abs=0.1)
             assert contact.force == pytest.approx(scale * expected.force, rel=1e-9)
             assert contact.energy == pytest.approx(scale * expected.energy, rel=1e-9)
-        # The simulated tips use the material of the settings.
+        # The simulated tips use the material in the settings.
         d, theta = daemon.hand.d, daemon.hand.theta
         by_truth = math.pi * TRUE * d**2 / np.cos(theta)
         assert np.abs(daemon.hand.force / by_truth - 1.0).max() < 1e-3
 
 
 PASCAL_PER_COUNT = 150.0
-FULL = 255  # full count; corresponds to 38 kPa, below the peak pressure of 46 kPa
+FULL = 255  # full count, which is 38 kPa; the peak pressure is 46 kPa
 
 
 def counting(**tactile: object) -> Settings:
@@ -152,7 +152,7 @@ def counting(**tactile: object) -> Settings:
 
 
 def calibrated(path: Path, zero: NDArray[np.float64]) -> Calibration:
-    """Write a calibration file with only a tare to ``path``."""
+    """Write a calibration file that contains only a tare."""
     step = TareStep(date="today", zero=zero.tolist(), noise=1.0, frames=16)
     made = Calibration(sensor=sensor_of(counting(), 0), date="today", tare=step)
     save_calibration(path, made)
@@ -160,7 +160,7 @@ def calibrated(path: Path, zero: NDArray[np.float64]) -> Calibration:
 
 
 class Bench:
-    """One finger's perception, and a board whose cells read ``base`` counts without contact."""
+    """Perception of one finger, for frames whose cells read ``base`` counts without contact."""
 
     def __init__(self, given: Settings) -> None:
         self.sensor = GivenFrames()

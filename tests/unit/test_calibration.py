@@ -1,4 +1,4 @@
-"""Test the calibration mathematics: each step recovers a simulated sensor's properties."""
+"""Test that the mathematics of each calibration step recovers a simulated sensor's properties."""
 
 import math
 import sys
@@ -29,7 +29,7 @@ RNG = np.random.default_rng(11)
 
 @pytest.fixture(autouse=True)
 def own_noise(monkeypatch):
-    """Reset the random source, so tests do not depend on each other."""
+    """Reset the random source, so that a test does not depend on earlier tests."""
     monkeypatch.setattr(sys.modules[__name__], "RNG", np.random.default_rng(11))
 
 
@@ -60,13 +60,13 @@ def test_a_tare_measures_noise_correlation_and_common_drift():
     plain = tare(50.0 + white)
     assert plain.correlation.size == 0
     assert plain.drift == 0.0
-    # The noise of each cell combines two sources, each of which is shared with one neighbour.
+    # The noise of each cell is the sum of two sources, and a neighbour shares each source.
     shared = 50.0 + (white[:, :, 1:] + white[:, :, :-1]) / math.sqrt(2.0)
     shared[:, 3, 3] += 100.0 * rng.standard_normal(100)  # This cell is faulty.
     found = tare(shared + 0.7 * rng.standard_normal((100, 1, 1)))
     assert found.correlation.shape == (1, 2)
     np.testing.assert_allclose(found.correlation, [[1.0, 0.5]], atol=0.02)
-    # With 100 frames, the relative scatter of the estimate is 0.07.
+    # With 100 frames, the estimate has a relative scatter of 0.07.
     assert found.drift == pytest.approx(0.7, rel=0.3)
 
 
@@ -85,13 +85,13 @@ def test_equilibration_equalises_cells_and_finds_dead_ones():
 
 @pytest.mark.parametrize("kind", ["power", "cubic"])
 def test_the_curve_is_recovered_from_known_weights(kind):
-    # The response curve gives the pressure as a function of the reading x. Each reading is
-    # interpolated from the pressure of the model.
+    # The response curve gives the pressure as a function of the reading x. The test inverts the
+    # curve by interpolation.
     x = np.linspace(0, 1000, 4001)
     true = 0.9 * x**1.4 if kind == "power" else 60 * x + 0.08 * x**2 + 5e-5 * x**3
     depths = (0.001, 0.0015, 0.002, 0.003, 0.004)
     readings = [np.interp(GRID.pressure(TIP, LINEAR, d), true, x) for d in depths]
-    # The highest stiffness would exceed the range of the table.
+    # The pressures exceed the range of the table, so use the exact inverse.
     if kind == "power":
         readings = [(GRID.pressure(TIP, LINEAR, d) / 0.9) ** (1 / 1.4) for d in depths]
     found = fit_curve(kind, readings, [force(d) for d in depths], AREA, 4000.0)
@@ -114,7 +114,7 @@ def test_centre_and_rotation_are_recovered_from_tilted_loads(rotation):
     assert found.centre == pytest.approx(true.centre, abs=2e-5)
     assert found.rotation == pytest.approx(rotation, abs=5e-3)
     assert found.residual < 3e-5
-    assert 2e-5 < found.std < 2e-4  # The fit assumes a tilt error of half a degree.
+    assert 2e-5 < found.std < 2e-4  # The fit assumes that tilts have an error of 0.5°.
 
 
 def test_upright_loads_determine_the_centre_but_not_the_rotation():

@@ -1,4 +1,4 @@
-"""Test the COBS framing: documented bytes, decoder against a simple reference, timestamps."""
+"""Test the bytes and timestamps of the COBS framing, and its decoder against a reference."""
 
 import re
 import struct
@@ -107,7 +107,7 @@ def test_every_single_bit_flip_is_detected():
         wrong = bytearray(good)
         wrong[bit // 8] ^= 1 << bit % 8
         decoder = CobsDecoder(4, 5)
-        # If the flipped bit creates or removes a delimiter, the frame is incomplete.
+        # The flipped bit may also create or remove a delimiter.
         assert decoder.feed(bytes(wrong) + b"\0", 0.0) is None
 
 
@@ -126,8 +126,8 @@ def test_the_sensor_clock_uses_the_minimum_delay_and_follows_drift_and_restarts(
 
 def test_the_longest_frame_consists_of_zeros():
     rng = np.random.default_rng(3)
-    # Half of the cells are zero, as in a frame without contact. The worst case contains only zero
-    # bytes.
+    # Half of the cells are zero, as in a frame without contact. A frame of zero bytes is the
+    # longest.
     frames = [
         encode(np.maximum(rng.normal(0, 380, (44, 44)), 0).astype(np.uint16), k, 0.01 * k)
         for k in range(30)

@@ -1,4 +1,4 @@
-"""Test the command line without a daemon: first steps, profile list, and numbers with units."""
+"""Test the command line without a daemon, including errors, profiles and numbers with units."""
 
 import json
 import math
@@ -42,7 +42,7 @@ def test_the_closest_subcommand_is_suggested(inline):
         assert f"unknown word {word!r}; nearest: {near}" in wrong.stderr
     assert max(map(len, inline("limits").stdout.splitlines())) <= 120
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
-    # The message names only the missing command, not missing options.
+    # The message names the missing command and no options.
     assert inline("send").stderr.endswith("required: COMMAND\n")
 
 

@@ -1,4 +1,4 @@
-"""Test the command table, the source of the generated page, against a running hand."""
+"""Test the command table, from which a page is generated, against a running hand."""
 
 import math
 from collections.abc import Callable
@@ -61,7 +61,7 @@ def faulted(daemon: Daemon) -> Daemon:
     return daemon
 
 
-# Settings, hand state, and numbers for each command and reason.
+# For each command and reason: settings, a function that prepares the hand, and arguments.
 REFUSED: dict[tuple[str, Reason], tuple[Any, Callable[[Daemon], Daemon], dict[str, float]]] = {
     ("arm", Reason.SCENE): ({"servos": {"backend": "none"}}, lambda it: it, {}),
     ("arm", Reason.STATE): ({}, hot, {}),

@@ -1,4 +1,4 @@
-"""Test the command server and client on real sockets: order and form of requests."""
+"""Test the command server and client with requests of any order and form on real sockets."""
 
 import os
 import select
@@ -42,7 +42,7 @@ def server(addresses: tuple[str, str]) -> Iterator[Served]:
 
 
 class Asking:
-    """A client with one request, to be served by a gateway and a loop."""
+    """A client that sends one request at a time to a gateway and a loop."""
 
     def __init__(
         self, context: zmq.Context[Any], served: Served, address: str, request: str | bytes
@@ -100,13 +100,14 @@ def test_malformed_multipart_messages_and_disconnecting_clients_have_no_effect(
 ):
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
-    socket.send_multipart([b"", b"a", b"b", b"c"])  # Clients never send messages in this form.
+    socket.send_multipart([b"", b"a", b"b", b"c"])  # No client sends such a message.
     socket.send(msgpack.packb({"command": "arm"}))
     socket.close(linger=1000)
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
 
 
-# The second request waits either in the queue or on the link.
+# With a limit of 1, the second request waits in the queue. With a limit of 16, the second request
+# waits on the link.
 @pytest.mark.parametrize("under_way", [1, 16])
 def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
     context, addresses, monkeypatch, under_way
@@ -128,7 +129,7 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
 
 
 def test_a_request_passes_few_functions(context, addresses):
-    """Count the functions between the socket and the handler; the loop adds only two more."""
+    """Count the daemon's functions that run between the socket and the handler."""
     passed: set[str] = set()
     heard = []
 
@@ -200,7 +201,7 @@ def test_a_proxy_may_be_used(context, addresses):
         ([*[b"hop"] * (bounds.PART_COUNT_MAX - 3), b"", ARM], bounds.PART_COUNT_MAX - 2, True),
         ([*[b"hop"] * (bounds.PART_COUNT_MAX - 2), b"", ARM], 0, False),
         ([b"x" * 700, b"x" * 400, b"", ARM], 0, False),
-        ([b"", ARM, ARM], 1, False),  # A REQ socket sends two frames here.
+        ([b"", ARM, ARM], 1, False),  # A REQ socket would send two frames.
         ([b"id", ARM], 0, False),
         ([ARM, b""], 0, False),
         ([b"part"] * 500, 0, False),
@@ -225,7 +226,7 @@ def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered
 
 
 class Aged:
-    """Handler that stores the ages of commands and refuses commands older than 0.2 s as late."""
+    """Command handler that records the commands' ages and refuses commands older than 0.2 s."""
 
     def __init__(self) -> None:
         self.ages: list[float] = []
@@ -255,8 +256,8 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
         if stalled == "loop":
             on_the_link(served)
         elif stalled == "gateway":
-            # libzmq has received the request or is about to receive it, so its waiting time is
-            # unknown.
+            # libzmq has received the request, so the gateway cannot determine how long it has
+            # waited.
             until(served.has_request)
         pass_time(clock, 0.5)
         # After the stall, libzmq's own thread may run later than the gateway's check.
@@ -302,7 +303,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         elif meanwhile:
             other = Asking(context, served, addresses[1], meanwhile)
             until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
-        # Wait until new requests can be distinguished from requests before the stop.
+        # Wait until the gateway can distinguish new requests from requests before the stop.
         until(lambda: served._is_open())
         count = len(aged.ages)
         asking.send(keyed())
@@ -325,7 +326,7 @@ def test_every_disarm_is_executed_even_with_the_same_key(context, addresses):
 
 
 def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses):
-    """After a gap, libzmq's thread may still deliver requests sent before a stop."""
+    """After a gap, libzmq's thread may still deliver requests that were sent before a stop."""
     clock, aged = VirtualClock(), Aged()
     with Served(commands=addresses[1], clock=clock) as served:
         served.link.fence()
@@ -441,7 +442,7 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(con
 
 
 class Flood:
-    """Clients that send requests without waiting for replies.
+    """Clients that send many requests without waiting for replies.
 
     Initially, the requests are not served.
     """
@@ -455,7 +456,7 @@ class Flood:
                 socket.send(msgpack.packb({"command": "move"}))
 
     def collect(self, replies: list[dict[str, Any]]) -> int:
-        """Collect replies; return the number collected so far."""
+        """Append the available replies to ``replies``, and return the number of replies so far."""
         for socket in self.sockets:
             while socket.poll(0):
                 replies.append(msgpack.unpackb(socket.recv()))
@@ -463,7 +464,7 @@ class Flood:
 
 
 def test_a_stop_goes_before_all_waiting_requests(context, addresses):
-    clock = VirtualClock()  # Waiting requests do not age while clients connect.
+    clock = VirtualClock()  # Time does not advance while clients connect.
     with Served(commands=addresses[1], clock=clock) as served:
         flood = Flood(context, addresses[1], clients=4, each=40)
         order: list[str] = []
@@ -515,11 +516,11 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
             "too many commands: expected at most 20 per second"
         }
         assert all(reply["ok"] for reply in kind)
-        # The client may send again after a second.
+        # The rate limit allows another request after a second.
         clock.sleep_until(clock.now() + 1.0)
         flood.sockets[0].send(msgpack.packb({"command": "move"}))
         last: list[dict[str, Any]] = []
-        # Wait for this reply, which follows the last replies to the flood.
+        # The reply to the last request follows all replies to the flood.
         answer = {"ok": True, "heard": "move"}
         until(lambda: [served.serve(echo), flood.collect(last), answer in last][2])
 

@@ -1,4 +1,4 @@
-"""Test `calibrate law --compression`: laws from testing machines, against independent formulas."""
+"""Test that `calibrate law --compression` finds the laws of simulated compression tests."""
 
 import json
 import math
@@ -34,14 +34,14 @@ WORDS = ["--config", "hil", "--no-plot"]
 
 
 def springs(d: float, theta: float = 0.0) -> float:
-    """Return the normal force of a sticking platen: the paper's F divided by cos θ."""
+    """Return the normal force on a sticking platen, which is the paper's F divided by cos θ."""
     return math.pi * E * d**2 / math.cos(theta) ** 2
 
 
 def pressed(force, rng, noise, theta=0.0, deep=6e-3, above=0.6e-3, toe=0.0):
-    """Return d and F of a machine that loads and unloads, with zero offsets, hysteresis and noise.
+    """Return d and F during loading and unloading, with zero offsets, hysteresis and noise.
 
-    The tip does not carry any load up to the depth ``toe``.
+    Up to the depth ``toe``, the tip carries no load.
     """
     up = np.linspace(-above, deep, 140)
     depth = np.concatenate([up, up[::-2]])
@@ -66,7 +66,7 @@ def test_modulus_and_zeros_agree_with_their_standard_deviations(above):
                        (zero - LOAD) / zero_std])  # fmt: skip
         assert fit.chi2 == pytest.approx(1.0, abs=0.3)
     assert fit.std < 0.006
-    # The mean of 40 squared standard normal values is 1.0 ± 0.22.
+    # The mean of the squares of 40 standard normal values is 1.0 ± 0.22.
     assert np.mean(np.square(scores), axis=0) == pytest.approx(1.0, abs=0.7)
 
 
@@ -81,7 +81,7 @@ def test_correlated_noise_increases_the_standard_deviation():
         return float(np.mean(np.square(errors)))
 
     smooth = found(np.full(8, 8**-0.5))
-    assert 0.3 < smooth < 3.0  # Without the correlation, the mean would be about 8.
+    assert 0.3 < smooth < 3.0  # If the fit ignored correlation, the mean would be about 8.
 
 
 def test_the_toe_region_is_excluded(monkeypatch):
@@ -118,7 +118,7 @@ def test_a_strain_dependent_modulus_is_found_from_the_force():
 
 
 def rubber(base: str) -> Force:
-    """Return the force on solid rubber, interpolated between independent finite element results."""
+    """Return the force on solid rubber, interpolated between finite element results."""
     with np.load(ROOT / "tests" / "golden" / "solid_frames.npz") as file:
         used = (file["base"] == base) & (file["theta"] == 0.0)
         d, push = file["d"][used], file["push"][used]
@@ -296,7 +296,7 @@ def test_a_depth_dependent_modulus_is_stored_as_points(tmp_path, capsys):
     assert main(["calibrate", "law", str(out), *WORDS, "--compression", str(file)]) == 0
     step = load_calibration(out).modulus
     law = step.material()
-    # Compute F from the stored law by integration over the strain.
+    # Compute F by integrating the stored law over the strain.
     deep = 5e-3
     found = 2.0 * math.pi * (A - deep) ** 2
     found *= quad(lambda e: float(law.stress(e)) / (1.0 - e) ** 3, 0.0, deep / A)[0]

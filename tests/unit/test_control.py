@@ -1,4 +1,4 @@
-"""Test the controller: its parts, and its performance measured on the simulated plant."""
+"""Test the parts of the controller, and the controller's performance on the simulated plant."""
 
 import math
 from pathlib import Path
@@ -19,8 +19,7 @@ PAPER: dict[str, dict[str, Any]] = {
     "simulation": {"tactile_delay": 0.040},
 }
 ANGLE = math.radians(10.0)
-# Uncertainty of the grip force after the torque measurements of one grip, as a fraction of the
-# force.
+# Relative uncertainty of the grip force after the torque measurements of one grip.
 KNOWN = 0.06
 
 
@@ -30,14 +29,14 @@ def watched(sections: dict[str, dict[str, Any]], **simulation: float) -> Simulat
 
 
 def grasped(hand: SimulatedDaemon, force: float = 10.0, seconds: float = 2.0) -> Any:
-    """Grasp the object; return the values recorded from the moment both tips are in contact."""
+    """Grasp the object; return the values recorded after both tips have made contact."""
     hand.grasp(force)
     seen = hand.watch(seconds)
     return seen.since(int(np.flatnonzero((seen.force > 0.3).all(axis=1))[0]))
 
 
 def settled(hand: SimulatedDaemon, angle: float) -> float:
-    """Turn to ``angle`` and return the time until the object stays within 0.2° of it [s]."""
+    """Turn to ``angle``; return the time [s] until the object stays within 0.2° of the angle."""
     hand.command("rotate", angle=angle)
     seen = hand.watch(2.0)
     assert hand.mode == "holding"
@@ -75,8 +74,8 @@ def test_grasps_and_turns_also_with_mass_and_modulus_off_by_30_percent(
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
 def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip_force(sections):
-    # Successive pushes of 1 N differ by up to 2 N, and such a sudden change raises the grip force.
-    # A sideways push resembles a twist.
+    # Successive pushes of 1 N differ by up to 2 N. A sudden change of 2 N raises the grip force. A
+    # sideways push resembles a twist.
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
         grasped(hand)
@@ -193,7 +192,8 @@ def test_a_known_load_raises_the_grip_within_its_bound():
         control = {"object_load": 12.0, "grip_raise_max": raised}
         with watched({"control": control}) as hand:
             seen = grasped(hand, force=8.0)
-            # For μ = 0.6, the load of 12 N is 80 % of the friction limit of both tips.
+            # With μ = 0.6, the load of 12 N is 80 % of the load that friction at both tips can
+            # carry.
             assert hand.mode == "holding"
             assert seen.force[-200:].mean() == pytest.approx(expected, rel=KNOWN)
             assert any(
@@ -233,7 +233,7 @@ def test_prediction_during_motion_is_within_its_own_uncertainty(sections):
         share = np.sqrt(np.mean(np.square(off), axis=0))
         assert (share < 1.5).all(), share
         assert (share > 0.2).all(), share
-        # The frames lag behind the plant, but the predicted tilts do not.
+        # The tilts in the frames lag behind the plant, but the predicted tilts do not.
         old, new = np.abs(frames)[:150].mean(axis=0)
         assert new < 0.25 * old
         assert hand.state.object.width == pytest.approx(0.040, abs=1e-4)
@@ -309,7 +309,7 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
             "setpoint smoothing delays the angle by 0.06 s"
         )
         assert np.abs(np.array(forces) - 1.0).max() < 0.04 + KNOWN
-        for k in range(int(rate)):  # The setpoint varies only slightly.
+        for k in range(int(rate)):  # The setpoint changes slightly.
             hand.command("hold", force=10.0 + 0.05 * (k % 2), angle=1e-3 * (k % 2))
             hand.run(1.0 / rate)
         assert not [event for event in hand.events if event[0] != "info"]

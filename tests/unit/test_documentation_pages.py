@@ -1,4 +1,4 @@
-"""Test that the site's pages build, links are valid, and quoted messages match the program."""
+"""Test that the site's pages build, that links are valid, and that quoted messages are exact."""
 
 import ast
 import html
@@ -22,7 +22,7 @@ LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)]*))?\)")
 
 @pytest.fixture(scope="module")
 def site() -> tuple[ModuleType, dict[str, str]]:
-    """Return the module docs/pages.py and the site's pages as MkDocs receives them."""
+    """Return the module docs/pages.py, and the text of each page as MkDocs receives it."""
     spec = importlib.util.spec_from_file_location("pages", ROOT / "docs" / "pages.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -35,7 +35,7 @@ def site() -> tuple[ModuleType, dict[str, str]]:
 
 
 def written(text: str) -> str:
-    """Return the text without code, because brackets in code are not links."""
+    """Return the text without its code, in which brackets are not links."""
     return re.sub(r"(?ms)^ *```.*?^ *```$|`[^`\n]*`", "", text)
 
 
@@ -152,7 +152,7 @@ ROW = re.compile(r"(?m)^\| ([^|]*) \|.*\|.*\|$")
 
 
 def texts() -> set[str]:
-    """Return all texts in the sources, with … in place of values."""
+    """Return all strings in the sources, with … in place of formatted values."""
     found = set()
     for path in [
         *ROOT.glob("daemon/**/*.py"),

@@ -1,4 +1,4 @@
-"""Test the registers of an emulated servo: access, units, motion, watchdog, errors, resets."""
+"""Test an emulated servo's registers, motion, watchdog, errors and resets."""
 
 import math
 import struct
@@ -45,7 +45,7 @@ def client(**options: Any) -> BusClient:
         (reg.GOAL_CURRENT, 1194, 2, framing.DATA_RANGE),
         (reg.MIN_POSITION_LIMIT, 4095, 4, framing.OK),
         (reg.LED, 1, 1, framing.OK),
-        (660, 7, 1, framing.OK),  # This address is in the second block of indirect data.
+        (660, 7, 1, framing.OK),  # in the second block of indirect data
         (661, 0, 2, framing.ACCESS),  # past the end of the table
     ],
 )
@@ -130,11 +130,11 @@ def test_protocol_1_if_configured() -> None:
     assert c.bus.feed(bytes.fromhex("FFFF010201FA"), c.t) == b""  # The checksum is wrong.
 
 
-# Registers that affect the motion to a goal.
+# Registers that affect how the servo moves to its goal.
 
 
 def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
-    """Return the distance [counts] moved in ``time`` [s] towards a goal of 300 counts."""
+    """Return the distance [counts] that a servo moves in ``time`` [s] towards a goal at 300."""
     c = client(for_daemon=True)
     for address, value, size in writes:
         assert c.write(address, value, size) == 0
@@ -167,7 +167,7 @@ def test_without_position_gain_or_pwm_the_joint_does_not_move() -> None:
 def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     profile = (reg.PROFILE_VELOCITY, 200, 4)
     limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
-    # The limit is 20 · 0.229 rpm for 0.1 s in counts, minus the lag of the joint.
+    # The joint lags behind the profile, so it moves less than at the limit of 20 · 0.229 rpm.
     assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
     c = client()
     for address, value, size in (

@@ -1,4 +1,4 @@
-"""Test that the covariance matches the actual errors, even those that are invisible in frames."""
+"""Test that the covariance matches all actual errors, even errors that frames do not show."""
 
 import itertools
 import math
@@ -57,7 +57,7 @@ def test_correlated_noise_increases_the_covariance(physics, d, theta):
         return float(np.mean(squares)), len(squares) / len(frames)
 
     score, valid = nees(KNOWN)
-    assert 0.8 < score < 1.3  # 400 frames with three or four values each give a scatter of ± 0.04.
+    assert 0.8 < score < 1.3  # With 400 frames, the scatter is 0.04.
     assert valid > 0.9
     assert tip != TIP or nees(None)[0] > 5.0
 
@@ -69,7 +69,7 @@ def test_systematic_errors_are_reported_separately_and_default_to_zero():
     shifted = ContactEstimator(TIP, LINEAR, GRID, NOISE, known=Uncertainty(centre=5e-4))(frame)
     assert (shifted.d, shifted.tilt_x, shifted.gain) == (plain.d, plain.tilt_x, plain.gain)
     np.testing.assert_allclose(shifted.covariance - shifted.systematic, plain.covariance, rtol=1e-3)
-    # The model interprets an offset of the tip as a rotation about the tip's centre.
+    # An offset of the tip has the same effect as a rotation about the tip's centre.
     assert math.sqrt(shifted.systematic[2, 2]) == pytest.approx(5e-4 / 0.019, rel=0.05)
 
 
@@ -108,7 +108,7 @@ def pressed(tip, d, x, y, grid=FLAT):
 
 
 def unloading(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
-    """Return pressures at ``d`` with errors of up to 10 % of each cell's pressure at 1.3 d."""
+    """Return the pressures at ``d``, with errors of up to 10 % of the pressures at 1.3 d."""
     loaded = np.maximum(pressed(tip, 1.3 * d, x, y), 1e-9)
     strain = np.clip(pressed(tip, d, x, y) / loaded, 0.0, 1.0)
     return pressed(tip, d, x, y) + sign * 0.4 * loaded * strain * (1.0 - strain)
@@ -125,11 +125,11 @@ def power(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarr
 
 
 def misplaced(by):
-    """Return a pressure function for cells with an unknown offset, pitch error or rotation."""
+    """Return a function that computes pressures on a misplaced, rotated or scaled grid."""
     return lambda tip, d, x, y, sign: pressed(tip, d, x, y, replace(FLAT, **by(sign)))
 
 
-# Sensor defects that the model does not include, each with the uncertainty that covers it.
+# Sensor defects that the model does not include, each with the uncertainty that accounts for it.
 IMPERFECTIONS = {
     "unloading": (Uncertainty(gain=0.1, smooth=0.04), unloading),
     "crosstalk": (Uncertainty(gain=0.02, smooth=0.01), crosstalk),
@@ -155,12 +155,12 @@ IMPERFECTIONS = {
 }
 
 
-# Defects that are harmless, or that invalidate the frame.
+# Defects that are harmless or make the frame invalid.
 HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")
 
 
 def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
-    """Return the maximum mean NEES of (d, tilts) at 0.5 to 7 mm, excluding flagged frames."""
+    """Return the mean NEES of (d, tilts) at the worst depth, without flagged frames."""
     estimator = ContactEstimator(tip, LINEAR, grid, noise, known=known)
     rng, worst = np.random.default_rng(3), 0.0
     for d in (0.5e-3, 1e-3, 2e-3, 4e-3, 6e-3):
@@ -175,7 +175,7 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
                     if e.contact and e.valid and not e.misfit:
                         error = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
                         squares.append(error @ np.linalg.solve(e.covariance[:3, :3], error) / 3.0)
-        if len(squares) > 16:  # At other depths, most frames are flagged as invalid.
+        if len(squares) > 16:  # At the other depths, most frames are flagged.
             worst = max(worst, float(np.mean(squares)))
     return worst
 
@@ -185,12 +185,11 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
 def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]
     tip = Fingertip(0.020, physics)
-    # With 32 frames of three values per depth, the scatter is ± 0.14. For a solid tip, the
-    # covariance includes the error in the tip data. The simulated frames come from the same data,
-    # so the lower limit is smaller.
+    # With 32 frames of three values at each depth, the scatter is ± 0.14. For a solid tip, the
+    # covariance includes the error of the tip data. The simulated frames use the same data, so the
+    # lower limit is smaller.
     least, most = (0.6, 1.5) if physics == "springs" else (0.2, 1.5)
-    # With spring tips, an offset of 0.5 mm causes an error in d that exceeds the estimated
-    # uncertainty of d.
+    # With spring tips, the error of d due to an offset of 0.5 mm exceeds the estimated uncertainty.
     most = 3.0 if (name, physics) == ("centre", "springs") else most
     assert least < worst_nees(known, tip, imperfect) < most
     request.getfixturevalue("exact_solid_data")
@@ -198,7 +197,7 @@ def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
         assert worst_nees(Uncertainty(), tip, imperfect) > 5.0
 
 
-# The last hand has all defects that a profile can declare, each with its own magnitude.
+# The last hand has all defects that a profile can contain.
 SECTIONS = {
     "sim": {},
     "velostat": load(Path("velostat")).model_dump(exclude_unset=True),
@@ -219,7 +218,7 @@ SECTIONS = {
 
 
 def smooth_error(pressure, width, kind, rng):
-    """Return a smooth error, e.g. due to cell gains, another response curve or crosstalk."""
+    """Return a smooth pressure error, such as the error due to another response curve."""
     if kind == 0:
         x, y = np.indices(pressure.shape) - 0.5 * (len(pressure) - 1)
         waves, phases = rng.normal(0.0, 1.0 / width, (64, 2)), rng.uniform(0.0, 2.0 * math.pi, 64)
@@ -283,15 +282,15 @@ def test_errors_match_the_covariance_with_all_declared_imperfections(profile, ph
             slopes = c.force_theta * np.array([e.tilt_x, e.tilt_y]) / total
             slopes = np.array([c.force_d, *slopes])
             variance = slopes @ covariance @ slopes
-            # With spring tips, the modulus error adds to the force error. The frames of a solid tip
-            # determine the force without the modulus.
+            # With spring tips, the force error includes the modulus error. With solid tips, the
+            # estimated force does not depend on the modulus.
             variance += (known.modulus * c.force) ** 2 if physics == "springs" else 0.0
             true_force = modulus_factor * float(table(d, tilt).force)
             forces.append(abs(c.force - true_force) < 1.96 * math.sqrt(variance))
             inside.append(np.abs(error) < 1.96 * np.sqrt(covariance.diagonal()))
     assert len(squares) > 0.6 * frames
-    # The errors that all frames of a hand share are drawn 60 times. With other seeds, the mean is
-    # 0.63 to 1.1.
+    # All frames of a hand share some errors, which are drawn 60 times. With other seeds, the mean
+    # is 0.63 to 1.1.
     assert (0.55 if physics == "springs" else 0.35) < np.mean(squares) < 1.3
     assert (np.mean(inside, axis=0) > 0.9).all()
     assert np.mean(forces) > 0.9

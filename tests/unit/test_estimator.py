@@ -1,4 +1,4 @@
-"""Test that the contact estimator reaches the Cramér-Rao bound with a consistent covariance."""
+"""Test that the contact estimator reaches the Cramér-Rao bound and reports a correct covariance."""
 
 import math
 import re
@@ -28,8 +28,7 @@ from tests.harness.paper_tip import (
 @pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
 @pytest.mark.parametrize("free_gain", [True, False])
 def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain):
-    # The azimuths and the tip positions relative to the cells are random. The bias is compared with
-    # a noise of 0.2 % of the modulus.
+    # The azimuth and the position of the tip are random. The noise level is 0.2 % of the modulus.
     rng = np.random.default_rng(7)
     noise = 0.002 * material.reference_modulus
     for _ in range(30):
@@ -42,7 +41,7 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
         assert e.valid
         n = 4 if free_gain else 3
         sigma = np.sqrt(np.diag(e.covariance))[:n]
-        # With other tip positions, the maximum ratio is 0.34.
+        # With other random values, the maximum ratio is 0.34.
         assert np.all(np.abs(errors(e, truth)[:n]) < 0.4 * sigma)
         assert abs(e.d - d) < 2e-3 * d
 
@@ -52,8 +51,7 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
     ("d", "degrees", "share"), [(0.008, 25.0, 0.35), (0.008, 30.0, 1.0), (0.008, 33.5, 5.0)]
 )
 def test_the_bias_is_small_where_the_footprint_nearly_reaches_the_rim(d, degrees, share, free_gain):
-    # The outermost cells average the function 1/√(a² − x² − y²), which has a singularity at the
-    # rim.
+    # Each outermost cell measures the mean of 1/√(a² − x² − y²), which is singular at the rim.
     rng = np.random.default_rng(1)
     noise = 0.002 * E
     for _ in range(12):
@@ -88,7 +86,7 @@ def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percen
     truth = (d, *tilts(math.radians(degrees), azimuth), 1.0)
     bound = fisher(grid, material, truth, noise, free_gain)
     clean = grid.pressure(TIP, material, *truth[:3])
-    if blur:  # Avoid the estimator's own forward model.
+    if blur:  # Use a forward model that is independent of the estimator.
         clean = dense(grid, material, truth[:3])
     estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
     rng = np.random.default_rng(3)
@@ -103,16 +101,17 @@ def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percen
         miss[k] = errors(e, truth)[:n]
         nees[k] = miss[k] @ np.linalg.solve(e.covariance[:n, :n], miss[k])
     ratio = np.sqrt((miss**2).mean(axis=0) / np.diag(bound))
-    # With 800 frames, the ratio scatters by 2.5 %. The limit of 1.12 allows 4.5 times this scatter.
+    # With 800 frames, the ratio has a standard deviation of 2.5 %. The limit of 1.12 allows 4.5
+    # standard deviations.
     assert np.all(ratio < 1.12), ratio
     assert np.all(ratio > 0.85), ratio
-    # The tolerance is four standard deviations of the mean, plus a bias of a quarter of one frame's
-    # standard deviation.
+    # The tolerance is four standard deviations of the mean, plus a quarter of a frame's standard
+    # deviation for the bias.
     assert np.all(
         np.abs(miss.mean(axis=0)) < (4.0 / math.sqrt(frames) + 0.25) * np.sqrt(np.diag(bound))
     )
-    # The tolerance is four standard deviations of χ² with 800 n degrees of freedom, plus a model
-    # error of 5 %.
+    # The tolerance is a model error of 5 % plus four standard deviations of χ² with 800 n degrees
+    # of freedom.
     assert abs(nees.mean() / n - 1.0) < 4.0 * math.sqrt(2.0 / (frames * n)) + 0.05
     # The reported covariance equals the Cramér-Rao bound.
     np.testing.assert_allclose(
@@ -189,7 +188,7 @@ def test_update_reuses_one_result_and_skips_a_repeated_frame():
     newer = estimator.update(GRID.pressure(TIP, LINEAR, 0.005), seq=5)
     assert newer is first
     assert newer.d == pytest.approx(0.005, rel=1e-4)
-    # A direct call of the estimator neither reads nor changes the state of `update`.
+    # Calling the estimator directly neither uses nor changes the state of `update`.
     covariance = newer.covariance.copy()
     alone = estimator(GRID.pressure(TIP, LINEAR, 0.002))
     assert alone.d == pytest.approx(0.002, rel=1e-4)
@@ -215,7 +214,7 @@ def test_the_frame_path_allocates_almost_nothing():
     finally:
         tracemalloc.stop()
     assert now - before < 1024
-    assert peak - before < 8192  # A frame has 15 kB.
+    assert peak - before < 8192  # A frame takes 15 kB.
 
 
 def test_all_frame_types_and_layouts_give_the_same_estimate():
@@ -233,11 +232,10 @@ def test_all_frame_types_and_layouts_give_the_same_estimate():
         np.asfortranarray(counts.astype(np.uint16)),
         wide[:, ::2],
     ):
-        # Each frame type has its own machine code, which may add the numbers in different SIMD
-        # lanes.
+        # The machine code for each frame type may add numbers in a different order.
         assert estimator(frame, scale).d == pytest.approx(reference.d, abs=1e-3 * reference.d_std)
-    # Frames of floats may contain negative values and have no quantum, so the estimator treats them
-    # slightly differently.
+    # Frames of floats may contain negative values and have no quantum, so the estimates differ
+    # slightly.
     for kind in (np.float32, np.float64):
         e = estimator(counts.astype(kind), scale)
         assert e.d == pytest.approx(reference.d, rel=1e-4)
@@ -312,7 +310,8 @@ def test_a_footprint_cut_off_by_the_sensor_edge_is_estimated():
 
 @pytest.mark.parametrize("degrees", [36.0, 40.0, 50.0])
 def test_the_tilt_is_estimated_at_and_beyond_the_limit(degrees):
-    # At d = 8 mm, the tilt limit is 36.87°. The estimator must also report larger tilts correctly.
+    # At d = 8 mm, the limit of the tilt is 36.87°. The estimator must also report larger tilts
+    # correctly.
     estimator = ContactEstimator(TIP, MEASURED, GRID, 300.0, free_gain=False)
     e = estimator(GRID.pressure(TIP, MEASURED, 0.008, math.radians(degrees)))
     assert e.valid

@@ -26,7 +26,7 @@ def test_saturated_cells_are_excluded():
     assert abs(aware.d - 0.006) < 4.0 * aware.d_std
     assert aware.d_std > plain.d_std
     assert aware.cells < plain.cells
-    # The full scale of an 8-bit board is known from the type of its frames.
+    # The frames' type determines the full scale of an 8-bit board.
     counts = np.minimum(np.round(clean / 300.0), 255).astype(np.uint8)
     assert counts.max() == 255
     board = ContactEstimator(TIP, LINEAR, GRID, 100.0)(counts, 300.0)
@@ -87,7 +87,7 @@ def test_one_nan_cell_makes_a_frame_invalid(estimator, bad):
         assert not e.valid
         assert not e.contact
         assert (e.d, e.tilt_x) == (0.0, 0.0)
-    # The next frame is unaffected.
+    # An invalid frame has no effect on the next frame.
     assert estimator.update(GRID.pressure(TIP, MEASURED, 0.003, 0.1)).valid
 
 

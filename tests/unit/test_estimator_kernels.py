@@ -1,4 +1,4 @@
-"""Test the estimator's kernels against plain NumPy, with clipped counts and misfits."""
+"""Test the estimator's kernels against plain NumPy, also with clipped counts and misfits."""
 
 import math
 
@@ -121,7 +121,7 @@ def test_noise_is_estimated_from_cells_without_contact(ratio):
     readings = noise * np.random.default_rng(1).standard_normal(2_000_000)
     readings[readings < floor] = 0.0
     assert free_noise(float(np.mean(readings**2)), floor) == pytest.approx(noise, rel=0.03)
-    # If all readings are at the floor, the noise is much lower than the floor.
+    # If all readings are zero, the noise is far below the floor.
     assert free_noise(0.0, floor) == pytest.approx(floor / 3.2, rel=0.02)
 
 
@@ -160,7 +160,7 @@ def test_a_board_without_noise_is_not_corrected_for_clipping():
 
 
 def test_noise_clipped_at_zero_raises_the_contact_threshold():
-    # One strong cell, and neighbours with a sum of 5.1 standard deviations
+    # One strong cell, whose neighbours have a sum of 5.1 standard deviations.
     frame = np.zeros((44, 44))
     weights = np.outer((1, 2, 2, 2, 1), (1, 2, 2, 2, 1)).astype(float)
     weights[2, 2] = 0.0
@@ -196,7 +196,7 @@ def test_a_misfit_is_flagged_and_valid_frames_are_not():
     rng = np.random.default_rng(5)
     noise = 0.002 * E
     x = (np.arange(44) - 21.5) * PITCH
-    # Hertz pressure with the same force. The footprint has r² ≤ a d instead of r² ≤ 2 a d − d².
+    # Hertz pressure with the same force; its footprint is r² ≤ a d instead of r² ≤ 2 a d − d².
     r2 = (x[None, :] - 3e-4) ** 2 + (x[:, None] + 2e-4) ** 2
     hertz = np.sqrt(np.maximum(1.0 - r2 / (0.020 * 0.003), 0.0))
     good = grid.pressure(TIP, LINEAR, 0.003)
@@ -208,7 +208,8 @@ def test_a_misfit_is_flagged_and_valid_frames_are_not():
             e = estimator.update(frame)
             assert e.contact
             assert e.misfit is expected
-            # Unlike unequal cell gains, this smooth pressure causes an error of 38 % in d.
+            # The Hertz pressure causes an error of 38 % in d, but unequal cell gains cause less
+            # than 5 %.
             assert e.valid is not expected
     unequal = good * rng.normal(1.0, 0.1, grid.shape)
     e = estimator(unequal)

@@ -10,7 +10,7 @@ from softfinger.daemon.wire.event_kinds import KINDS
 
 ROOT = Path(softfinger.__file__).parents[1]
 LEVELS = ("info", "warning", "error")
-WARNS = {"_warn": "warning"}  # level of each function whose first argument is the kind
+WARNS = {"_warn": "warning"}  # level of events from functions whose first argument is the kind
 
 
 def written(expression: ast.expr) -> str:
@@ -18,7 +18,7 @@ def written(expression: ast.expr) -> str:
 
 
 def emitted(source: str) -> Iterator[tuple[str, str]]:
-    """Yield the level and kind of each event written as (level, kind, text) in the source."""
+    """Yield the level and kind of each event that the source writes as (level, kind, text)."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and (level := WARNS.get(getattr(node.func, "attr", ""))):
             yield level, written(node.args[0])
@@ -44,7 +44,7 @@ def test_every_kind_of_event_is_documented_with_its_levels():
             for level, kind in emitted(file.read_text(encoding="utf-8")):
                 if kind.islower():  # The kind is a literal, not a constant of `safety.limits`.
                     levels.setdefault(kind, set()).add(level)
-    levels["torque.off"].add("info")  # safety.torque_state uses a constant for this kind.
+    levels["torque.off"].add("info")  # safety.torque_state uses a constant for the kind.
     assert {kind: set(each.levels.split(", ")) for kind, each in KINDS.items()} == levels
 
 

@@ -1,4 +1,4 @@
-"""Test the paper's experiments in simulation: paths, estimation errors, the slow turn."""
+"""Test the paths and the estimation errors of the paper's experiments in simulation."""
 
 import math
 
@@ -26,7 +26,7 @@ def test_compression_reaches_8_mm_at_every_angle(compression):
         assert run["d"].max() == pytest.approx(8.0, abs=0.1)
         touching = run["d"] > 0.0
         np.testing.assert_allclose(run["theta"][touching], tilt, atol=1e-9)
-        # The true values from the plant equal the closed form at the frame times.
+        # At the times of the frames, the plant's true values equal the closed form.
         expected = np.pi * 0.304 * run["d"] ** 2 / np.cos(np.radians(tilt))
         np.testing.assert_allclose(run["F"], expected, rtol=1e-9, atol=1e-12)
 
@@ -65,7 +65,7 @@ def sheets() -> tuple[Sheet, ...]:
 
 
 def test_forces_are_energy_derivatives():
-    """Finite differences of the energy along rolling motions must match the joint torques."""
+    """Compare the joint torques with finite differences of the energy along rolling motions."""
     here = slow_turn.turned(np.radians([2.0, 4.0]), slow_turn.gripped())[-1]
     step = 1e-6
     for k in range(5):

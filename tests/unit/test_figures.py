@@ -1,4 +1,4 @@
-"""Test figure values against published and derived values, and the figures' files and plots."""
+"""Test the values of figures against published and derived values; test the files and plots."""
 
 import argparse
 import csv
@@ -67,8 +67,8 @@ def test_checkpoints_of_force_and_energy_versus_displacement(folder, d, theta, f
 
 
 def test_double_integrals_equal_the_one_dimensional_form() -> None:
-    # The reference evaluates eqs. 3 and 10 differently: analytical integration over y, and Gauss
-    # quadrature in t for the integral over x. The tilt is close to the limit of 36.87°.
+    # The reference integrates eqs. 3 and 10 over y analytically, and over x by Gauss quadrature in
+    # t. The tilt is close to the limit of 36.87°.
     a, d, theta, modulus = 0.02, 0.008, np.radians(34.0), 0.304e6
     points, weights = np.polynomial.legendre.leggauss(200)
     t = points * np.pi / 2
@@ -87,9 +87,9 @@ def test_double_integrals_equal_the_one_dimensional_form() -> None:
 def by_quadrature(
     d: float, theta: float, shear: float = 0.0, law: Material = LINEAR
 ) -> tuple[float, float]:
-    """Return F [N] and U [J] by SciPy quadrature; a shear moves each spring's end along the face.
+    """Integrate F [N] and U [J] with SciPy; a shear moves the end of each spring along the face.
 
-    The sheared springs have a constant modulus, with equal lateral and axial stiffness.
+    Sheared springs have a constant modulus, and are equally stiff in all directions.
     """
     a, s, c = 0.020, np.sin(theta), np.cos(theta)
     h, rho = a - d, np.sqrt(d * (2.0 * a - d))
@@ -161,8 +161,8 @@ def test_with_shear_the_minimum_is_before_upright(folder: Path) -> None:
     assert felt["least U [deg]"] == pytest.approx(
         minima["least U [deg]"][minima["share [%]"] == 5.0], abs=0.01
     )
-    # In the plant, the equilibrium includes the springs at the rim, which are sheared from the
-    # first contact onwards.
+    # The plant's equilibrium includes the springs at the rim, which are sheared from their first
+    # contact.
     balance = felt["least N cos theta + T sin theta [deg]"]
     assert (balance < minima["least F on the base [deg]"][minima["share [%]"] == 5.0]).all()
     model, plant = read(folder / "fig10_shear.csv"), read(folder / "fig10_shear_plant.csv")
@@ -198,11 +198,10 @@ def test_compression_with_the_sensor_model(folder: Path) -> None:
         law = columns[f"F of Table I's law at {tilt} deg [N]"]
         expected = np.pi * 0.304 * d**2 / np.cos(np.radians(tilt))
         np.testing.assert_allclose(model, expected, rtol=1e-12)
-        # The quadrature over the cells is less accurate. The paper gives the readings to three
-        # digits.
+        # The sum over the cells is less accurate, but the paper gives only three digits.
         np.testing.assert_allclose(sensed, model, rtol=1e-4)
-        # The bounds are the forces for the minimum and the maximum modulus, up to but not including
-        # full compression.
+        # Below full compression, the force is between the forces for the minimum and the maximum
+        # modulus.
         assert np.all(law[1:] > 0.135 / 0.304 * model[1:])
         assert np.all(law[1:] < 0.255 / 0.304 * model[1:])
 
@@ -218,11 +217,11 @@ def test_path_of_rotation_and_rolling(folder: Path) -> None:
         law = rolling[f"F/F(0) of Table I's law at d = {d} mm [1]"]
         for curve in (ratio, law):
             assert theta[np.argmin(curve)] == 0.0
-        # A modulus that increases with strain deepens the energy minimum.
+        # If the modulus increases with strain, the energy minimum is deeper.
         assert np.all(law[theta != 0.0] > ratio[theta != 0.0])
         # Springs that point towards the tip's centre produce no energy minimum.
         assert np.ptp(rolling[f"F of radial springs at d = {d} mm [N]"]) == 0.0
-        # The rotation ends in the state in which the rolling begins.
+        # The rolling begins in the final state of the rotation.
         last = rotation[f"F, d up to {d} mm [N]"][-1]
         assert last == pytest.approx(rolling[f"F at d = {d} mm [N]"][0], rel=1e-12)
         assert rotation[f"d up to {d} mm [mm]"][0] == 0.0
@@ -232,7 +231,7 @@ def test_path_of_rotation_and_rolling(folder: Path) -> None:
 @pytest.mark.parametrize("of", [experiment_pages.printed_terms, experiment_pages.integrated_terms])
 def test_checkpoints_of_the_appendix(of: Callable[..., experiment_pages.Terms]) -> None:
     a, d = 20.0, np.array(4.0)  # mm
-    # These are eqs. 16, 18 and 19.
+    # Values of eqs. 16, 18 and 19.
     expected = (31.939525311496, 1.7671458676443, 0.098174770424681)
     np.testing.assert_allclose(of(a, d), expected, rtol=1e-13)
     assert experiment_pages.limits(a, d)[1] == pytest.approx(0.92729521800161, rel=1e-14)  # eq. 17

@@ -14,17 +14,17 @@ CELLS = ROWS * COLS
 STRIDE = CELLS + 2
 
 payloads = st.binary(min_size=CELLS, max_size=CELLS)
-# Images that often contain the marker, which may also include the first or last byte of a frame.
+# Images that often contain the marker, or bytes that form a marker with an adjacent byte.
 nasty = st.lists(
     st.sampled_from([b"\xaa", b"\x55", b"\xaa\x55", b"\x00", b"\x01"]), min_size=CELLS
 ).map(lambda parts: b"".join(parts)[:CELLS])
 
 
 def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
-    """Decode the data byte by byte and return the frames.
+    """Feed the data byte by byte; return the decoded frames.
 
-    If the decoder synchronises late, it may complete several frames at once but returns only the
-    newest frame.
+    A decoder that synchronises late may complete several frames at once. Such a decoder returns
+    only the newest frame.
     """
     found = []
     for piece in pieces:
@@ -47,7 +47,7 @@ def numbered(count: int, cells: int = CELLS, first: int = 0) -> list[bytes]:
 
 
 def balance(decoder: FlexiTacDecoder, fed: int) -> None:
-    """Check that every byte is part of a frame, counted as skipped, or still buffered."""
+    """Check that every byte is in a frame, is counted as skipped, or is still buffered."""
     counters = decoder.counters()
     held = len(decoder._buffer)
     assert counters["frames"] * decoder.frame_bytes + counters["skipped_bytes"] + held == fed
@@ -80,8 +80,8 @@ def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
         decoded = decoder.feed(frame(images[k]), 0.01 * k)
         assert decoded.data[0, 0] == k
         assert decoded.t == 0.01 * k
-    # The two pieces of the first frame arrive within the frame time. Between the two pieces of the
-    # second frame, there is a gap.
+    # The two pieces of the first frame arrive within the frame time. The two pieces of the second
+    # frame arrive with a gap between them.
     assert decoder.feed(frame(images[5])[:7], 0.05) is None
     assert decoder.feed(frame(images[5])[7:], 0.052) is not None
     assert decoder.feed(frame(images[6])[:7], 0.06) is None
@@ -93,7 +93,7 @@ def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
     decoded = decoder.feed(frame(images[7]), 0.09)
     assert decoded.data[0, 0] == 7
     assert decoder.counters()["frames"] == 9
-    # Without gaps on the line, the next bytes confirm the frame.
+    # Without a gap after the frame, the next marker confirms the frame.
     assert decoder.feed(frame(images[8]), 0.0903) is None
     assert decoder.feed(MARKER, 0.0904) is not None
 
@@ -147,9 +147,8 @@ def test_frames_do_not_depend_on_how_the_stream_is_split(images, start, cuts):
     start=st.integers(0, STRIDE),
 )
 def test_no_wrong_frame_for_any_images(images, start):
-    """From any starting point in images full of AA 55, only sent frames are decoded, in order."""
-    # Append two frames without AA 55 in the image, so that a constant image cannot remain
-    # ambiguous.
+    """Start anywhere in images that often contain AA 55; the decoder returns only sent frames."""
+    # Append two frames that do not contain AA 55, because a constant image would remain ambiguous.
     images = [*images, *numbered(2)]
     stream = b"".join(frame(image) for image in images)[start:]
     found = decode(FlexiTacDecoder(ROWS, COLS), [stream, MARKER])
@@ -184,11 +183,11 @@ def test_a_quiet_line_does_not_confirm_a_frame_that_could_be_incomplete():
     decode(decoder, [frame(image) for image in numbered(3)])
     assert decoder.settle() is not None
     torn = frame(bytes(CELLS))[:-1]
-    # The last byte is missing, and the first half of the next marker follows.
+    # The frame lacks its last byte and is followed by the first byte of the next marker.
     decoder.feed(torn + MARKER[:1], 0.0)
     assert decoder.pending
     assert decoder.settle() is None
-    # If the next marker is lost, the decoder rejects the frame because of the bytes that follow.
+    # If the next marker is lost, the bytes after the frame cause the decoder to reject the frame.
     decoder = FlexiTacDecoder(ROWS, COLS)
     decode(decoder, [frame(image) for image in numbered(3)])
     spliced = frame(bytes(CELLS))[:-4] + bytes([9]) * (CELLS - 3)

@@ -1,4 +1,4 @@
-"""Test Protocol 2.0 framing: published packets byte for byte, and parser properties."""
+"""Test that Protocol 2.0 framing produces published packets; test properties of the parser."""
 
 import pytest
 from dynamixel_sdk import PacketHandler as sdk_handler
@@ -12,7 +12,7 @@ from softfinger.daemon.simulation.servo_model.framing import (
     frame,
 )
 
-# Most pieces belong to the header, because only its first bytes require byte stuffing.
+# Most pieces occur in the header, because only the header's first bytes require byte stuffing.
 PIECES = [b"\xff\xff\xfd", b"\xff", b"\xfd", b"\x00", b"\x55", b"\x12"]
 payloads = st.lists(st.sampled_from(PIECES), max_size=40).map(b"".join)
 

@@ -1,4 +1,4 @@
-"""Test `calibrate friction` and `calibrate latency` on hands that differ from their profile."""
+"""Test `calibrate friction` and `calibrate latency` on hands for which the profile is wrong."""
 
 import math
 from pathlib import Path
@@ -25,7 +25,7 @@ TICK = 2e-3  # s
 
 
 def sweeps(*strokes: tuple[float, float]) -> tuple[Due, float]:
-    """Return the commands for sweeps (angle [rad], velocity [rad/s]) and the end time [s]."""
+    """Return the commands for strokes (angle [rad], velocity [rad/s]), and the end time [s]."""
     due: Due = {100: {"command": "arm"}}
     tick = 150
     for wide, speed in strokes:
@@ -57,7 +57,7 @@ def test_friction_is_measured_by_a_sweep(tmp_path, capsys, friction, more, expec
     assert calibrate("friction", tmp_path) == 0
     told = capsys.readouterr().out
     found = load(tmp_path / "my.toml").control.joint_friction
-    # The additional static friction falls by a factor of e per 0.12 rad/s. At the velocities of
+    # The additional static friction decreases by a factor of e per 0.12 rad/s. At the velocities of
     # this test, a tenth of this friction remains.
     assert found == pytest.approx(expected, abs=2 * COUNT)
     assert f"control.joint_friction = {found:g}" in told
@@ -165,8 +165,8 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
     record_hand(tmp_path / "run.mcap", FORCES, 4.4, profile=path, hand=plant)
     assert calibrate("latency", tmp_path) == 0
     told = capsys.readouterr().out
-    # A cell response time of 60 ms hides part of the latency. For all other cells, the latency is
-    # accurate to within a few ms.
+    # Cells with a response time of 60 ms hide part of the latency. With all other cells, the error
+    # of the latency is a few ms.
     tolerance = 6e-3 if profile == "velostat" else 3e-3
     assert load(tmp_path / "my.toml").tactile.latency == pytest.approx(latency, abs=tolerance)
     assert float(told.split(" ± ")[1].split(" ms")[0]) < 1e3 * tolerance

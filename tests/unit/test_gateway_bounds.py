@@ -1,4 +1,4 @@
-"""Test the gateway's limits on each client, which protect the other clients."""
+"""Test the limits that protect the gateway's clients from each other."""
 
 from collections.abc import Iterator
 
@@ -59,7 +59,7 @@ def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        # This frame exceeds the size of four requests.
+        # This frame is longer than four requests.
         (zmq.DEALER, b"x" * (bounds.PART_SIZE_RATIO * 200 + 1)),
         # This subscription is longer than any topic.
         (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),
@@ -97,10 +97,10 @@ def test_unknown_topics_are_not_stored(served, context, addresses):
 def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
     served, context, addresses, clock
 ):
-    """A repeated message goes to all subscribers, so 50 repeated events would flood them."""
+    """All subscribers receive each repetition, so frequent repetitions would flood them."""
     served.publisher.event(0.0, 0.0, "info", "test", "told again")
-    # Send the event before the first subscription, so that the event cannot reach an unregistered
-    # reader later.
+    # Send the event before the first subscription, so that the reader receives it only as a
+    # repetition.
     served.settle()
     reader = connect(context, zmq.SUB, addresses[0])
     reader.subscribe(EVENT)
@@ -122,7 +122,7 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
 
 
 def test_unread_replies_are_dropped(served, context, addresses):
-    """Unread replies cannot block the gateway or fill its memory, because the queue is limited."""
+    """Unread replies cannot block the gateway or fill its memory, as their queue is limited."""
     client = context.socket(zmq.DEALER)
     client.setsockopt(zmq.RCVHWM, 1)
     client.setsockopt(zmq.RCVBUF, 4096)

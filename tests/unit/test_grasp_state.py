@@ -1,4 +1,4 @@
-"""Test planar geometry against NumPy, and the held object's motion against `Grasp`."""
+"""Test planar geometry against NumPy, and the motion of the held object against `Grasp`."""
 
 import math
 
@@ -65,7 +65,7 @@ def test_moment_arms_are_the_equilibrium_torques_per_force(grasp, delta):
 
 
 def faces(q, d, angle: float, taper: float):
-    """Return the faces' n and t, the tips' centres and Jacobians, and a − d − v·t for rolling."""
+    """Return the faces' n and t, the tips' centres and Jacobians, and the rolling terms."""
     n, t = [], []
     for side in (-0.5, 0.5):
         at = angle + side * taper
@@ -86,8 +86,8 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
     arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
     for dq in ((1.0, 0.0), (0.0, 1.0), (0.3, -0.8)):
-        # The unknowns are (Gx, Gy, φ). The equations keep d_t of both tips constant and change d of
-        # both tips by the same amount.
+        # The unknowns are (Gx, Gy, φ). In the equations, d_t of each tip is constant, and d of both
+        # tips changes by the same amount.
         left = np.array(
             [
                 [*t[0], -w[0]],
@@ -133,7 +133,7 @@ def test_holding_forces_balance_a_tapered_object(grasp, taper):
     moments = [p[0] * f[1] - p[1] * f[0] for p, f in zip(touched, forces, strict=True)]
     turning = felt[0][1] + felt[1][1]
     assert sum(moments) == pytest.approx(turning, abs=5e-4 * normal * a)
-    # Compute joint torques by virtual work on each face.
+    # The virtual work at each face gives the joint torque.
     force = 0.5 * (looked_up[0][0] + looked_up[1][0])
     torque1 = pressed[0] * n[0] @ v[0] + shear[0] * rolls[0] + felt[0][1]
     torque2 = -pressed[1] * n[1] @ v[1] - shear[1] * rolls[1] - felt[1][1]
@@ -163,7 +163,7 @@ def test_total_tilt_is_the_angle_between_normal_and_axis():
     assert math.cos(total_tilt(0.2, -0.1)) == pytest.approx(math.sqrt(1.0 - x * x - y * y))
 
 
-# Load along the faces, computed from joint torques
+# Load along the faces, computed from joint torques.
 
 
 def found_load(
@@ -192,7 +192,7 @@ def test_load_from_torques_equals_the_load_on_the_tips(table, load, delta):
     rolled = 0.5 * (shear[0] + shear[1])
     found, slope = found_load(table, state, rolled)
     assert found == pytest.approx(0.5 * load, rel=0.02, abs=0.01)
-    # The slope relates a torque error to the load error.
+    # The slope is the ratio of a torque error to the load error.
     more = 1e-5  # N·m
     again, _ = found_load(table, state, rolled, more)
     assert again - found == pytest.approx(more / slope, rel=0.02)
@@ -214,7 +214,7 @@ def test_torques_that_no_load_explains_give_a_finite_load(table):
             at = (table.data, table.data, (1e-6, 1e-3), (q, -0.1), 0.3, motion)
             left1, left2, lever, bow = load_torques(*at, (0.3, 0.3), (torque, 0.5))
             if lever == 0.0:
-                continue  # In this pose, the torques do not depend on a load.
+                continue  # The load has no effect on the torques in this pose.
             load, slope = load_of(0.5 * (left1 + left2), lever, bow)
             assert math.isfinite(load)
             assert slope > 0.0
@@ -272,7 +272,7 @@ def rotation(angle: float) -> np.ndarray:
 
 
 def contacts_by_rotation(hand: ReferenceHand, q, pose, width) -> np.ndarray:
-    """The reference uses rotated vectors for the fingers and a rotation matrix for the object."""
+    """Compute the contacts with rotated finger vectors and the object's rotation matrix."""
     local = np.array([hand.finger_offset, hand.finger_length])
     left = np.array([-hand.half_separation, 0]) + rotation(-q[0]) @ local
     right = np.array([hand.half_separation, 0]) + rotation(q[1]) @ (local * [-1, 1])
@@ -333,8 +333,7 @@ def test_symmetric_grasp_values(d, degrees, normal, moment):
     np.testing.assert_allclose(forces.tangential, 0, atol=1e-12)
     lever = 0.080 * np.cos(state.q)
     np.testing.assert_allclose(forces.normal * lever * 1e3, moment, rtol=1e-8)
-    # Each joint also carries the moment of the tilted tip, which is 0.1 to 0.4 % of the torque
-    # here.
+    # The moment of the tilted tip contributes 0.1 to 0.4 % of each joint torque.
     turning = forces.turning * [1, -1]
     np.testing.assert_allclose(forces.torque, forces.normal * lever + turning, rtol=1e-12)
     np.testing.assert_allclose(grasp.gradient(state)[2:], 0, atol=1e-12)

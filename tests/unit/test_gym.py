@@ -1,4 +1,4 @@
-"""Test the Gymnasium environments: API checker, reproducible seeds, observations, rewards."""
+"""Test the API, seeds, observations and rewards of the Gymnasium environments."""
 
 import os
 import shutil
@@ -36,7 +36,7 @@ def test_the_picture_shows_the_hand_and_its_pressure_maps():
     env.reset(seed=1)
 
     def found(image: np.ndarray, part: str) -> np.ndarray:
-        """Return the mean row and column of a part's colour in the scene."""
+        """Return the mean row and column of the pixels with a part's colour."""
         close = np.abs(image[:, :400].astype(int) - COLOURS[part]).max(axis=2) < 8
         assert close.any(), part
         return np.argwhere(close).mean(axis=0)
@@ -142,7 +142,7 @@ def test_shaping_adds_the_increase_of_the_potential():
         env.reset(seed=1)
         start = env._potential
         sums.append(sum(env.step(np.ones(2, np.float32))[1] for _ in range(20)))
-    assert shaped._potential > start + 2.0  # Closing increases the potential even before contact.
+    assert shaped._potential > start + 2.0  # The potential increases before contact.
     assert sums[1] - sums[0] == pytest.approx(shaped._potential - start)
     plain.close()
     shaped.close()

@@ -1,4 +1,4 @@
-"""Test the simulated hand: equilibrium, servos, scenes and time."""
+"""Test the equilibrium, servos, scenes and time of the simulated hand."""
 
 import math
 
@@ -50,8 +50,8 @@ def test_quasi_static_steering_gain(degrees, gain):
     start = grasp.symmetric(0.004)
     place(hand, start.q, start.pose)
     hand.shear[:] = start.shear
-    # The joints are stiff and turn slowly, so that only the joints and the energy of the tips
-    # matter.
+    # The joints are stiff and turn slowly, so only the joints and the tips' energy affect the
+    # motion.
     parameters = hand.plant.parameters
     parameters.position_gain = 1e5
     parameters.rate_gain = parameters.current_limit = parameters.stall_current = 1e3
@@ -67,10 +67,10 @@ def test_quasi_static_steering_gain(degrees, gain):
 
 
 def test_load_dependent_friction_equals_the_gear_efficiency():
-    # If the friction is a fraction μ of the motor torque and of the contact torque, the gears
-    # transmit the fraction (1 − μ)/(1 + μ). If the contact drives the gears, the fraction is the
-    # inverse. ``share`` is the friction as a fraction of the torque. ``rest`` is a constant
-    # friction torque [N·m], half of which acts only at standstill.
+    # Load-dependent friction is ``share`` times the motor torque and the contact torque. The gears
+    # therefore transmit (1 − share)/(1 + share) of the torque. If the contact drives the gears,
+    # this ratio is inverted. ``rest`` is a constant friction torque [N·m], half of which acts only
+    # at standstill.
     share, rest = 0.25, 0.02
     simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
     simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}
@@ -99,7 +99,7 @@ def test_gravity_accelerates_a_free_object_and_a_grasp_holds_it():
     start = grasp.symmetric(0.004)
     place(held, start.q, start.pose)
     settled(held, (0.9, 0.9), 0.7, 1.0)
-    # The y components of the tip forces equal the weight to within 1 %, and the tips do not slip.
+    # The y components of the tip forces carry the weight, and the tips do not slip.
     along = held.tangential * np.cos(held.object_pose[2]) * [-1, 1]
     assert abs(along.sum()) == pytest.approx(0.3 * 9.80665, rel=0.01)
     place_before = held.object_pose[1]
@@ -123,7 +123,7 @@ def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
         run(hand, 0.005)
         ratio = np.abs(hand.tangential) / hand.normal
         assert (ratio <= friction * (1 + 1e-9)).all()
-    # Both tips slip at the Coulomb limit, and only inertia balances the rest of the push.
+    # Both tips slip at the Coulomb limit, so the rest of the push accelerates the object.
     np.testing.assert_allclose(ratio, friction, rtol=1e-6)
     assert push == pytest.approx(2 * friction * hand.normal.mean(), rel=0.15)
 
@@ -140,8 +140,8 @@ def test_a_dropped_object_comes_to_rest_on_the_palm():
             energy = later
             if hand.t > 0.15:
                 highest = max(highest, np.abs(hand.object_velocity[1]))
-        # The object lies flat on a face, and two corner springs of 1e5 N/m carry the weight. A tip
-        # that touches the object may still creep.
+        # The object lies flat, so two corner springs of 1e5 N/m carry its weight. A tip that
+        # touches the object may still creep.
         half = 0.5 * (0.060 if abs(math.sin(hand.object_pose[2])) < 0.5 else 0.040)
         sunk = 0.1 * 9.80665 / 2e5
         assert hand.object_pose[1] == pytest.approx(0.01 + half - sunk, abs=5e-7)
@@ -162,7 +162,7 @@ def test_a_collision_conserves_momentum_and_energy():
     assert hand.force[0] == 0.0
     assert hand.object_velocity[0] > 0.3
     assert 0.05 * (hand.object_velocity[0] + 0.5) == pytest.approx(impulse, rel=1e-3)
-    # The finger receives the impulse L N dt while the object's face stays upright.
+    # The face stays upright, so the joint receives the angular impulse L N dt.
     assert hand.plant.parameters.joint_inertia * hand.dq[0] == pytest.approx(
         -0.080 * impulse, rel=3e-3
     )
@@ -217,8 +217,8 @@ def test_end_stops_and_no_load_speed_limit_the_joints():
         run(hand, 0.002)
         fastest = max(fastest, np.abs(hand.dq).max())
     assert fastest < hand.plant.parameters.no_load_speed
-    # After a clearance of 0.05 rad, the joint stop yields to 5.4 N·m with a stiffness of 500
-    # N·m/rad.
+    # The joint stop is 0.05 rad outside the limit. A torque of 5.4 N·m deforms the stop, whose
+    # stiffness is 500 N·m/rad.
     assert 1.05 < hand.q[0] < 1.07
     assert -0.57 < hand.q[1] < -0.55
 
@@ -240,7 +240,7 @@ def test_scripted_compression_indents_each_tip_by_eight_millimetres():
     np.testing.assert_allclose(deepest, 0.008, atol=2e-5)
     np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
     assert both == 0
-    # The force follows F = πE d²/cos θ at all times.
+    # The force is F = πE d²/cos θ at all times.
     run(hand, 1.7)
     d = hand.d[0]
     assert d > 0.004
@@ -288,8 +288,8 @@ def test_samples_are_interpolated_at_the_frame_times():
     for number in range(hand.sample_count - 5, hand.sample_count):
         sample, exact = hand.sample(number), finer.sample(number)
         assert sample.t == number / 130.0
-        # Per tick, the finger moves by 1e-4 rad and 4e-6 m. Without interpolation, a sample would
-        # have an error of this size.
+        # In each tick, the finger moves by 1e-4 rad and 4e-6 m. Without interpolation, a sample
+        # would have errors of this size.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):

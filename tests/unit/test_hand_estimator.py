@@ -1,4 +1,4 @@
-"""Test the hand's estimator against NumPy, at start-up, and with slow cells."""
+"""Test the estimator of the hand against NumPy, during start-up and with slow cells."""
 
 import math
 from dataclasses import replace
@@ -77,8 +77,8 @@ def test_channel_consistency_is_one_for_modelled_noise_and_four_for_doubled_nois
             hand.covariance[:], hand.slopes[:] = covariance, slopes
             corrected(hand.array, factor * std * rng.normal(), 1e-4, math.inf)
             found.append(hand.grasp.nis[0])
-        # The mean of 4000 squares has a standard error of 0.022. The first 500 values are
-        # transient.
+        # The first 500 values are a transient. The mean of 4000 squares has a standard error of
+        # 0.022.
         assert np.mean(found[500:]) == pytest.approx(factor**2, rel=0.15)
         assert not hand.grasp.nis[1:].any()
 
@@ -114,11 +114,11 @@ def test_systematic_errors_do_not_average_out():
             first = replace(contacts[0])
     contact = contacts[0]
     assert first.d_std == pytest.approx(math.hypot(5e-5, 2e-5), rel=1e-3)
-    # The standard deviation must not fall below 2e-5 m, because the zero offset can drift.
+    # The zero offset may drift, so the standard deviation is at least 2e-5 m.
     assert 2e-5 < contact.d_std < 1.2 * first.d_std
     assert 4e-3 < contact.theta_std < first.theta_std
-    # The force error has three parts: an error in d times ∂F/∂d = 2F/d, an error in θ times F tan
-    # θ, and a modulus error of 20 %.
+    # The force error results from the errors of d, θ and the modulus. The derivatives are ∂F/∂d =
+    # 2F/d and ∂F/∂θ = F tan θ, and the modulus error is 20 %.
     by_d, by_theta = 2.0 * contact.force / contact.d * contact.d_std, contact.force * 0.1 * 4e-3
     by_modulus = 0.2 * contact.force
     assert contact.force_std == pytest.approx(math.hypot(by_d, by_theta, by_modulus), rel=0.02)
@@ -154,7 +154,7 @@ def test_a_contact_at_start_up_is_reported_from_the_first_frame_on(estimator, re
     contacts, pose = [Contact(), Contact()], ObjectPose()
     if read_first:
         estimator.predict(Reading(t=5.0, q=[0.15, 0.15], valid=True))
-    # Both frames were sampled before the first reading.
+    # The sensor sampled both frames before the first reading of the joints.
     for k in range(2):
         estimator.update(0, frame(4.98 + 0.01 * k), ESTIMATE, contacts[0])
         estimator.write_contacts(5.0, contacts, pose)
@@ -177,7 +177,7 @@ def test_a_contact_at_start_up_is_reported_from_the_first_frame_on(estimator, re
 @pytest.mark.parametrize("depths", [(3e-3, 3e-3), (3e-3, 1e-3)])
 @pytest.mark.parametrize("gripping", [False, True])
 def test_tips_are_independent_until_a_grip_begins(estimator, depths, gripping):
-    """Plates press against both tips of a hand whose joints are stationary."""
+    """Press plates against both tips while the joints do not move."""
     contacts, pose = [Contact(), Contact()], ObjectPose()
     for k in range(100):
         t = 5.0 + 0.01 * k
@@ -187,7 +187,7 @@ def test_tips_are_independent_until_a_grip_begins(estimator, depths, gripping):
             estimator.update(finger, frame(t), replace(ESTIMATE, d=d), contacts[finger])
         estimator.write_contacts(t, contacts, pose)
     found = [contact.d for contact in contacts]
-    if gripping:  # The width of a gripped object is constant, so the frames must be wrong.
+    if gripping:  # A gripped object cannot change its width, so the frames are wrong.
         assert sum(found) < 0.8 * sum(depths)
     else:
         assert found == pytest.approx(depths, rel=0.01)

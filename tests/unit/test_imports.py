@@ -1,4 +1,4 @@
-"""Test import directions and cycles, class names, and the base class of exceptions."""
+"""Test import directions, import cycles, class names, and the base class of exceptions."""
 
 import ast
 import re
@@ -81,7 +81,7 @@ def rooms(top: str) -> dict[str, set[str]]:
 
 
 def table_of_rooms() -> list[str]:
-    """Return the rows of the architecture page's room table, from top to bottom."""
+    """Return the rows of the table of rooms on the architecture page."""
     _, _, after = PAGE.read_text(encoding="utf-8").partition("| room |")
     return [line for line in after.partition("\n\n")[0].splitlines() if line.startswith("| `")]
 

@@ -1,4 +1,4 @@
-"""Test presliding joint friction against a reference: sticking, break-away and reversal."""
+"""Test presliding joint friction when joints stick, break away or reverse."""
 
 import math
 from collections.abc import Iterable
@@ -26,7 +26,7 @@ def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
 
 
 def load(hand: SimulatedHand, torques: Iterable[float], each: float) -> np.ndarray:
-    """Apply each motor torque [N·m] for ``each`` [s]; return the angle after each torque."""
+    """Apply motor torques [N·m] for ``each`` [s], one by one; return the angle after each."""
     found = []
     for torque in torques:
         hand.drive(0, CURRENT, True, 0.0, torque / CONSTANT)
@@ -51,7 +51,7 @@ def test_a_constant_load_below_static_friction_causes_no_creep(share):
 
 
 def test_an_oscillating_load_below_static_friction_causes_no_drift():
-    # With the LuGre model, the joint would creep in each period (Dupont et al., 2002).
+    # In the LuGre model, the joint would creep in each period (Dupont et al., 2002).
     hand = joint()
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
     phases = np.arange(0.0, 60.0, 0.02) * 2.0 * math.pi
@@ -61,8 +61,8 @@ def test_an_oscillating_load_below_static_friction_causes_no_drift():
 
 
 def test_very_stiff_bristles_also_stick():
-    # Presliding [rad] and inertia [kg·m²]. The period of the oscillation is 0.3 ms, and the time
-    # step is 0.25 ms.
+    # With this presliding [rad] and inertia [kg·m²], the oscillation has a period of 0.3 ms. The
+    # time step is 0.25 ms.
     presliding, inertia = 1e-6, 1e-4
     hand = joint(2.5e-4, joint_presliding=presliding, joint_inertia=inertia)
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
@@ -91,7 +91,7 @@ def test_break_away_is_at_the_static_friction_torque():
 def test_friction_reverses_over_twice_the_presliding_distance():
     hand = joint(joint_damping=0.0)
     p = hand.plant.parameters
-    # Gains [A/rad, A·s/rad] with which the joint follows its goal.
+    # Gains [A/rad, A·s/rad] of the control of the joint angle.
     p.position_gain, p.rate_gain = 200.0, 2.0
     speed, each = 0.01, 0.001  # speed [rad/s] and time step [s]
     way = np.concatenate((np.arange(0.0, 0.02, speed * each), np.arange(0.02, 0.0, -speed * each)))
@@ -106,8 +106,7 @@ def test_friction_reverses_over_twice_the_presliding_distance():
     closing, opening = torque[turn - 200 : turn].mean(), torque[-200:].mean()
     assert closing == pytest.approx(FRICTION, rel=0.01)
     assert closing - opening == pytest.approx(2.0 * FRICTION, rel=0.01)
-    # The transition is a straight line. A presliding distance that is wrong by a factor of two
-    # would change the slope.
+    # The transition is a straight line, whose slope depends on the presliding distance.
     within = slice(turn + 20, turn + 80)
     slope, _ = np.polyfit(angle[within], torque[within], 1)
     assert slope == pytest.approx(FRICTION / PRESLIDING, rel=0.02)
@@ -154,7 +153,7 @@ def test_a_friction_level_that_changes_at_standstill_adds_no_torque():
 
 
 def reference(torque: float, rate: float, stribeck: float, seconds: float) -> np.ndarray:
-    """Solve the same equations; return angle, velocity and deflection.
+    """Solve the plant's equations with SciPy; return angle, velocity and deflection.
 
     The initial velocity is ``rate`` [rad/s].
     """
@@ -183,7 +182,7 @@ SCALE = (PRESLIDING, 0.1, PRESLIDING)
 
 
 def errors(torque: float, rate: float, stribeck: float, counts: Iterable[int]) -> list[float]:
-    """Return the maximum error relative to SCALE for each number of steps."""
+    """Return, for each number of steps, the maximum error relative to SCALE."""
     exact, found = reference(torque, rate, stribeck, SECONDS), []
     for count in counts:
         hand = joint(SECONDS / count, joint_stribeck=stribeck)

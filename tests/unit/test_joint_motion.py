@@ -1,4 +1,4 @@
-"""Test consistency checks of joint angle, velocity and current: detections and false alarms."""
+"""Test detections and false alarms of the consistency checks on joint readings."""
 
 import math
 import random
@@ -18,7 +18,7 @@ RATE = 0.229 * 2.0 * math.pi / 60.0  # one velocity count [rad/s]
 
 
 class Joint:
-    """A moving joint as reported by its servo: in whole counts and a few milliseconds late."""
+    """A moving joint, whose servo reports whole counts a few milliseconds late."""
 
     def __init__(self, seed: int = 1) -> None:
         self.reading = Reading(valid=True, t=0.0)
@@ -27,16 +27,16 @@ class Joint:
         self.random = random.Random(seed)
 
     def tick(self, dq: float, lag: float = 0.02, held: float = 0.0) -> int:
-        """Move at ``dq`` rad/s for a tick; the reported velocity follows within ``lag`` s.
+        """Move at ``dq`` [rad/s] for a tick; the reported velocity follows within ``lag`` [s].
 
-        The reply is received ``held`` s late.
+        The loop receives the reply ``held`` [s] late.
         """
         self.t += TICK
         self.q += dq * TICK
         self.dq += (dq - self.dq) * min(TICK / lag, 1.0)
         reading = self.reading
         if self.random.random() < 0.01:
-            held += 0.015  # The process was suspended here.
+            held += 0.015  # The process was suspended.
         reading.t = max(reading.t, self.t + self.random.uniform(0.0003, 0.004) + held)
         reading.q[0] = COUNT * round(self.q / COUNT)
         reading.dq[0] = RATE * round(self.dq / RATE)
@@ -79,7 +79,7 @@ def test_a_velocity_without_motion_is_detected():
 
 @pytest.mark.parametrize("seconds", [0.03, 0.06, 0.2])
 def test_a_stall_while_a_joint_moves_is_not_a_jump(seconds):
-    """The stall may occur before the request is sent, or between the reply and its receipt."""
+    """Stall the loop before it sends a request, or before it receives the reply."""
     for at_answer in (False, True):
         joint = Joint()
         for _ in range(100):
@@ -105,7 +105,7 @@ def test_a_jump_during_lost_readings_is_detected():
 
 
 def spoil(daemon: Daemon, how: Callable[[Reading], None]) -> None:
-    """From now on, corrupt each reading after it is taken."""
+    """Corrupt each later reading with ``how``."""
     servos = daemon.loop.torque.servos
     really = servos.read
 
@@ -121,7 +121,7 @@ def jumped(reading: Reading) -> None:
 
 
 class Stuck:
-    """Encoder and current sensor that are stuck."""
+    """Simulate an encoder and a current sensor that are stuck."""
 
     def __init__(self) -> None:
         self.q: float | None = None
@@ -146,7 +146,7 @@ def test_a_joint_fault_ends_a_grip(make, how, name, within):
 
 @pytest.mark.parametrize(("ticks_with_torque", "fault"), [(0, ""), (3, "joint.jump")])
 def test_only_readings_with_torque_on_are_compared(make, ticks_with_torque, fault):
-    """While torque is off, the clock of an emulated hand does not wait for the daemon."""
+    """While torque is off, an emulated hand does not wait for the daemon, so readings may jump."""
     daemon = make()
     daemon.loop.advance(0.1)
     if ticks_with_torque:
@@ -163,7 +163,7 @@ def test_only_readings_with_torque_on_are_compared(make, ticks_with_torque, faul
     "mode", ["current-based position", pytest.param("current", marks=pytest.mark.extended)]
 )
 def test_grips_turns_stops_and_pushes_cause_no_false_alarm(make, mode):
-    """The joints move freely, press on and turn an object, and are pushed away from their goals."""
+    """Move joints freely, grip and turn an object, and push joints away from their goals."""
     daemon = make(servos={"mode": mode})
     hand: Any = daemon.hand
     command(daemon, "arm")

@@ -1,4 +1,4 @@
-"""Test kernel decorators, their records, and the sources that a compiled kernel depends on."""
+"""Test kernel decorators, records, and the list of sources on which a compiled kernel depends."""
 
 import importlib
 import pkgutil
@@ -49,7 +49,7 @@ def test_plain_numba_is_used_if_its_internals_are_unknown(why, monkeypatch):
 
 
 def kernels() -> Iterator[Any]:
-    """Return every kernel of the program as a Python function."""
+    """Yield the Python function of every kernel in the program."""
     for package in (kinematics, daemon):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             module = importlib.import_module(found.name)

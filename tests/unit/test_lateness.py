@@ -1,4 +1,4 @@
-"""Test machine delays: their effect on clocks, simulated and real hands, and messages."""
+"""Test how delays of the machine affect clocks, simulated hands, real hands and messages."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -45,7 +45,7 @@ def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
 
 
 def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
-    """Return the state after ``count`` ticks, without values that depend on the machine."""
+    """Run ``count`` ticks; return the state without the values that depend on the machine."""
     loop = daemon.loop
 
     def end_in_time(_: float) -> None:
@@ -148,7 +148,7 @@ def test_long_work_is_also_named_except_for_commands(on_late_machine):
 
     def slowly() -> None:
         really()
-        machine.work(0.3)  # This delay simulates a slow bus.
+        machine.work(0.3)  # The bus is slow.
 
     servos.torque_on = slowly
     advance_to(daemon, "fault", 2.0)  # The demo task arms the hand.
@@ -173,7 +173,7 @@ METAL = Settings.model_validate({"servos": {"backend": "dynamixel"}})
 
 
 def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
-    """Return the events if each of a real hand's ticks exceeds its period by ``late`` [s]."""
+    """Return the events for a real hand if every tick exceeds its period by ``late`` [s]."""
     timing = Timing(tick_s=0.002 + late)
     lateness = Lateness(METAL, timing, waits=False)
     ticks = round(seconds / 0.002)
@@ -183,7 +183,7 @@ def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
 
 def test_a_delay_is_reported_again_after_doubling_intervals():
     told = [event for event in looked(0.06, 17.0 * REPORT_INTERVAL) if event[1] == "late"]
-    assert len(told) == 6  # The reports come after 0, 1, 2, 4, 8 and 16 times REPORT_INTERVAL.
+    assert len(told) == 6  # after 0, 1, 2, 4, 8 and 16 times REPORT_INTERVAL
 
 
 def test_virtual_time_advances_only_by_waiting_and_never_decreases():
@@ -204,7 +204,7 @@ def test_the_time_of_a_hand_is_constant_between_sleeps_and_ends_them_on_time():
     assert clock.sleep_until(100.002) == pytest.approx(0.0015)
     assert clock.now() == 100.002
     assert clock.host() == pytest.approx(100.0035)
-    clock.sleep_until(100.004)  # The rest of the period compensates for the delay.
+    clock.sleep_until(100.004)  # The delay shortens this wait.
     assert (clock.now(), clock.host()) == (100.004, 100.004)
     assert clock.behind == 0.0
 

@@ -121,7 +121,7 @@ def test_missing_frames_during_a_turn_stop_the_object(make, rate):
 
 
 def blinded(daemon: Daemon, counts: int) -> None:
-    """Set all cells of both sensors to ``counts`` from now on."""
+    """Set all cells in all later frames of both sensors to ``counts``."""
     for finger in (0, 1):
         change_frames(
             daemon, finger, lambda frame: replace(frame, data=np.full_like(frame.data, counts))
@@ -178,7 +178,7 @@ def test_the_state_contains_the_goals_of_the_grip(make):
     daemon.loop.advance(0.01)
     message = state_message(daemon.loop.state, parts(daemon.settings))
     assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
-    # The force exceeds the requested force, because the load would otherwise make the tips slip.
+    # Under this load, the tips would slip at the requested force, so the force increases.
     for k in range(1, 101):
         daemon.hand.apply_load(0.0, 0.12 * k, 0.0)
         daemon.loop.advance(0.02)
@@ -243,7 +243,7 @@ def test_a_tare_reports_the_change_of_the_zero(make):
         f"the left sensor's zero offsets changed: median +30.0 counts ({30 * pascal:+.0f} Pa), "
         "largest change +80.0 counts"
     )
-    # The reference of the warning is the last zero offset, not the first zero offset.
+    # The warning gives the change from the last zero offset, not from the first zero offset.
     assert tared(-10, -60).endswith("largest change -150.0 counts")
 
 
@@ -297,7 +297,7 @@ def test_a_frozen_sensor_is_a_fault_until_it_recovers(make):
     assert daemon.loop.state.fault_name == "tactile.frozen"
     assert "the left sensor has sent the same frame" in daemon.loop.state.fault
     assert "clear: tactile: the left sensor has sent the same frame" in refusal(daemon, "clear")
-    del left.sensor.latest  # Restore the method of the class.
+    del left.sensor.latest  # Remove the replaced method.
     daemon.loop.advance(0.2)
     command(daemon, "clear")
     command(daemon, "arm")

@@ -1,4 +1,4 @@
-"""Test stress-strain laws: Table I, measured points, rejected laws, and tables for the kernels."""
+"""Test stress-strain laws from Table I and from measured points, and their tables for kernels."""
 
 import math
 from fractions import Fraction
@@ -16,7 +16,7 @@ STRAIN = np.linspace(0.0, 1.0, 201)
 
 
 def laws() -> list[Material]:
-    """Return one law of each kind, the last with a high degree."""
+    """Return several laws of different kinds; the last law has a high degree."""
     x = np.linspace(0.0, 0.8, 30)
     return [
         Material.constant(0.304e6),
@@ -57,12 +57,12 @@ def test_a_law_is_smooth_increasing_and_consistent(index):
     stress, energy = material.stress(STRAIN), material.energy_density(STRAIN)
     assert stress[0] == energy[0] == 0.0
     assert np.all(np.diff(stress) > 0)
-    # The energy density is the integral of the stress, by Gauss quadrature on each step.
+    # The energy density is the integral of the stress, here computed by Gauss quadrature.
     points, weights = np.polynomial.legendre.leggauss(8)
     inner = STRAIN[:-1, None] + 0.5 * (points + 1) * np.diff(STRAIN)[:, None]
     parts = 0.5 * np.diff(STRAIN) * (material.stress(inner) * weights).sum(axis=1)
     np.testing.assert_allclose(energy[1:], np.cumsum(parts), rtol=1e-12)
-    # Evaluate the exact polynomial in plain arithmetic.
+    # Evaluate the exact polynomial term by term.
     powers = [float(c) for c in material.coefficients]
     for strain in (1e-9, 0.124999, 0.125, 0.3, 0.75, 1.0 - 1e-12):
         exact = math.fsum(c * strain**j for j, c in enumerate(powers, 1))
@@ -145,7 +145,7 @@ def test_the_force_error_equals_the_effect_of_the_misfit_on_the_force():
     x = np.linspace(0.025, 1.0, 40)
     curve = 1e5 * x**0.7
     law = Material.from_points(x, curve)
-    # For an upright tip, F = 2π h² ∫ σ/(1 − ε)³ dε, with the measured curve and with the law.
+    # Compare F = 2π h² ∫ σ/(1 − ε)³ dε of an upright tip for the measured curve and for the law.
     for share in (0.05, 0.1, 0.3):
         strain = share * (np.arange(2000) + 0.5) / 2000
         weight = (1.0 - strain) ** -3

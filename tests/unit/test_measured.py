@@ -1,4 +1,4 @@
-"""Test a tip that no model fits: interpolation of measurements, the table and the estimator."""
+"""Test the interpolation, the table and the estimator for a tip that no model fits."""
 
 import json
 import math
@@ -36,13 +36,13 @@ TRUE = replace(GRID, centre=(0.7e-3, -0.4e-3), rotation=0.2)  # true position of
 NOISE = 600.0
 D = 1e-3 * np.array([0.7, 1.5, 3, 5, 6, 2, 4, 5, 3, 6, 4])
 THETA = np.radians([0, 0, 0, 0, 0, 10, -10, 10, 20, -25, 25])
-WEIRD = 1e6  # stiffness [N/m²] of a force that no model predicts: F = WEIRD d^1.8 A^0.2 cos θ
+WEIRD = 1e6  # stiffness [N/m²] of the force WEIRD d^1.8 A^0.2 cos θ, which no model predicts
 
 
 def weird(d: float, theta: float) -> np.ndarray:
-    """Return the pressure of a tip that no model fits: a blunt peak.
+    """Return the pressure of a tip that no model fits, which has a blunt peak.
 
-    If the tip tilts, the peak moves half as far as the peak of a spring tip.
+    When the tip tilts, the peak moves half as far as the peak of a spring tip.
     """
     x, y = np.meshgrid(*(pitch * (np.arange(32) - 15.5) for pitch in TRUE.pitches))
     x, y = x - TRUE.centre[0], y - TRUE.centre[1]
@@ -96,7 +96,7 @@ def test_declared_cell_uncertainties_are_part_of_the_errors(law, name, d):
         assert found.valid
         off = np.array([found.d - d, found.tilt_x - theta, found.tilt_y])
         off_by.append(np.abs(off) / np.sqrt(found.covariance.diagonal()[:3]))
-    # With other noise in the fitted curves, the maximum is 1.1 to 1.65, at the smallest depths.
+    # With other seeds, the maximum is 1.1 to 1.65 and occurs at the smallest depths.
     assert 0.5 < np.max(off_by) < 2.0
 
 

@@ -1,4 +1,4 @@
-"""Test measurement faults: syntax, and effect on the sensors while the hand itself is unchanged."""
+"""Test that measurement faults are parsed, and that they affect only the sensors."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ SHAPE = (5, 7)
 
 
 class Press:
-    """A left tip whose indentation increases steadily, and its sensor."""
+    """Sensor of a left tip whose indentation increases steadily."""
 
     def __init__(self, **simulation) -> None:
         self.settings = Settings.model_validate(
@@ -37,7 +37,7 @@ class Press:
         self.faults = self.hand.measurement_faults[0]
 
     def frames(self, count: int) -> list[np.ndarray]:
-        """Return the counts of the next frames, which must have new numbers and times."""
+        """Return the counts of the next frames; check that each frame has a new number and time."""
         found = []
         for _ in range(count):
             before = self.sensor.latest()
@@ -50,7 +50,7 @@ class Press:
         return found
 
     def pressed(self, count: int) -> list[np.ndarray]:
-        """Return the given number of frames, after 1.4 s of compression."""
+        """Return the given number of frames that follow after 1.4 s of compression."""
         self.clock.sleep_until(1.4)
         self.sensor.latest()
         return self.frames(count)
@@ -122,7 +122,7 @@ def test_frames_are_repeated_with_new_numbers():
     assert len({each.tobytes() for each in kept}) == 20
     press.faults.begin("replay", 0.06, press.clock.now())
     again = press.frames(18)
-    # The sensor delays frames by one, so the first frame was sampled before the fault.
+    # The sensor delivers each frame one period late, so the first frame is from before the fault.
     last = [*kept, again[0]][-6:]
     assert [each.tobytes() for each in again[1:]] == [
         last[k % 6].tobytes() for k in range(len(again) - 1)

@@ -1,4 +1,4 @@
-"""Test the monitor page as text: sizes, malformed streams, states, keys, maps."""
+"""Test the text of the monitor page for different sizes, streams, states and keys."""
 
 import json
 import math
@@ -112,7 +112,7 @@ def test_stream_status_follows_the_age_of_data():
     assert [feed.status(now) for now in (0.4, 0.6, 1.9, 2.1)] == ["live", "stale", "stale", "lost"]
     assert "◐ stale" in shown(feed, 0.6)
     slow = StreamState()
-    for k in range(100):  # At one state per second, a pause of 2 s is not a loss.
+    for k in range(100):  # With one state per second, a pause of 2 s is normal.
         give(slow, b"hand/state", fake_daemon.state(k, k) | {"mono_ns": k * 10**9}, float(k))
     assert [slow.status(99 + age) for age in (2.0, 4.0, 11.0)] == ["live", "stale", "lost"]
 
@@ -178,7 +178,7 @@ TEXTS = ["first", "second", "third"]
 
 def test_repeated_events_are_shown_once_and_in_order():
     feed = StreamState()
-    # This event arrives after the subscription and before the repeated events.
+    # The third event arrives as a new event before the events are repeated.
     give(feed, b"hand/event", told(3, 103.0, "third"))
     for seq in (1, 2, 3):
         give(
@@ -300,7 +300,7 @@ def test_resampling_equals_the_area_average():
     blocks = grid.reshape(22, 2, 11, 4).mean(axis=(1, 3))
     assert resample(grid, 22, 11) == pytest.approx(blocks, abs=1e-12)
     assert resample(grid, 88, 132) == pytest.approx(np.kron(grid, np.ones((2, 3))), abs=1e-12)
-    # If the sizes do not divide evenly, the reference uses a common refinement.
+    # If one size does not divide the other, the reference uses a finer grid that both sizes divide.
     fine = np.kron(grid, np.ones((17, 9)))
     twin = fine.reshape(17, 44, 9, 44).mean(axis=(1, 3))
     assert resample(grid, 17, 9) == pytest.approx(twin, abs=1e-12)

@@ -1,4 +1,4 @@
-"""Test soft tips in MuJoCo against the contact table, and a grip against softfinger's plant."""
+"""Compare tips in MuJoCo with the contact table, and a grip in MuJoCo with softfinger's plant."""
 
 import math
 import re
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.extended
 PAGE = Path(__file__).parents[2] / "docs" / "mujoco.md"
 SETTINGS = checked({"loop": {"clock": "virtual"}})
 RADIUS, FRICTION = SETTINGS.tip.radius, SETTINGS.simulation.tip_friction
-# The tip points along x towards a wall, whose face is tilted about z.
+# The tip points along x, and the wall's face is tilted about z.
 SCENE = """<mujoco><option timestep="0.002" gravity="0 0 0" integrator="{integrator}"/>
 <default><geom contype="0" conaffinity="0"/><joint type="slide" damping="5"/></default><worldbody>
 <body><joint axis="1 0 0"/>{joints}
@@ -34,7 +34,7 @@ FREE = '<joint axis="0 1 0"/><joint axis="0 0 1"/>'
 def scene(
     tilt: float = 0.0, joints: str = "", integrator: str = "implicitfast", radius: float = RADIUS
 ) -> tuple[Any, Any]:
-    """Return a model and data with the tip just touching a face tilted by ``tilt`` [rad]."""
+    """Return a model and data; the tip just touches a face that is tilted by ``tilt`` [rad]."""
     away = RADIUS + 0.05
     place = {"x": away * math.cos(tilt), "y": away * math.sin(tilt), "degrees": math.degrees(tilt)}
     text = SCENE.format(joints=joints, integrator=integrator, radius=radius, **place)
@@ -69,11 +69,11 @@ def test_friction_is_a_cone_including_the_lateral_direction(used):
         d, slid = data.qpos[0], math.hypot(*data.qpos[1:])
         normal = tips.touches[0].contact.normal
     assert normal == pytest.approx(press, rel=1e-3)
-    if used < 1.0:  # T = 2F d_t/d, as for the springs of the face.
+    if used < 1.0:  # T = 2F d_t/d, as in the spring model.
         bears = 2.0 * float(tips.table(d, 0.0).force) / d
         assert slid == pytest.approx(push / bears, rel=1e-3)
         assert data.qpos[2] / data.qpos[1] == pytest.approx(4.0 / 3.0, rel=1e-3)
-    else:  # The excess of the push moves the face against a damping of 5 N·s/m.
+    else:  # The rest of the push moves the face, which has a damping of 5 N·s/m.
         speed = (push - FRICTION * press) / 5.0
         assert math.hypot(*data.qvel[1:]) == pytest.approx(speed, rel=0.01)
 

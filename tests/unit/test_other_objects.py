@@ -1,4 +1,4 @@
-"""Test the daemon with objects other than blocks: wedges, discs, a sheet, no object."""
+"""Test the daemon with wedges, discs and a sheet instead of blocks, and without an object."""
 
 import math
 from typing import Any
@@ -15,7 +15,7 @@ SLOW: dict[str, Any] = {"rate": 25.0}
 
 
 class Rig(SimulatedDaemon):
-    """A hand that is observed while it holds an object."""
+    """Simulated hand with actions and measurements for tests."""
 
     def grasp(self, force: float, seconds: float = 2.5) -> None:
         super().grasp(force)
@@ -30,7 +30,7 @@ class Rig(SimulatedDaemon):
 
 
 def width_at_the_contacts(plant: Any) -> float:
-    """Return the distance between the plant's two contacts along the object's normal n."""
+    """Return the distance between both contacts in the plant along the object's normal n."""
     found = []
     n = np.array([math.cos(plant.object_pose[2]), math.sin(plant.object_pose[2])])
     for finger, side in ((0, 1.0), (1, -1.0)):
@@ -114,7 +114,7 @@ def test_a_declared_sheet_is_not_mistaken_for_a_missing_object():
 
 
 def test_a_small_disc_is_not_mistaken_for_another_tip():
-    """The disc causes a misfit that could change d by more than half."""
+    """A disc causes a misfit, whose effect on d could exceed half of d."""
     with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
         rig.grasp(8.0)
         assert rig.state.mode == "holding"
@@ -131,7 +131,7 @@ def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts():
         assert rig.state.fault == ""
         tips = HAND.tips(rig.plant.q)
         line = math.atan2(*(tips[1] - tips[0])[::-1])
-        # The estimator underestimates the tilt of a curved contact slightly.
+        # If the contact is curved, the estimated tilt is slightly too small.
         assert rig.state.object.angle == pytest.approx(0.95 * line, abs=0.01)
-        # The disc has rolled further between the tips.
+        # The disc has also rolled on the tips.
         assert rig.plant.object_pose[2] > 2.0 * line

@@ -1,4 +1,4 @@
-"""Test that another user's files at this user's paths are neither followed nor overwritten."""
+"""Test that softfinger does not use or overwrite files that another user has put at its paths."""
 
 import os
 from collections.abc import Callable
@@ -24,7 +24,7 @@ STRANGER = 54321
 
 @pytest.fixture
 def strangers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
-    """Change a file's owner; without permission, pretend that this process is another user."""
+    """Return a function that makes a file belong to another user, or appear to do so."""
 
     def give(path: Path) -> None:
         if os.geteuid() == 0:

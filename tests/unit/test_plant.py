@@ -1,4 +1,4 @@
-"""Test the plant's kernel: monotonic energy decay, robustness, and shear relaxation."""
+"""Test the plant's forces, energy decay, robustness and shear relaxation."""
 
 import math
 
@@ -26,7 +26,7 @@ def evaluate_one(plants, tables, finger, turn):
 
 
 def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContact:
-    """Evaluate one tip at rest; return a copy of its contact."""
+    """Set the given position and shear without motion; return a copy of a tip's contact."""
     state = hand.plant.state
     state.velocity[:] = 0.0
     state.position[:] = q, q, *pose
@@ -116,9 +116,8 @@ def test_bristles_carry_shear_at_any_tilt_with_the_normal_force_of_the_springs(t
 
 @pytest.mark.parametrize("trial", range(24))
 def test_energy_never_increases_without_input(trial):
-    # Scenes, masses, moduli and friction are random. The fingers start at random angles and speeds,
-    # in some trials with a contact beyond the rim. One trial in three uses a time step that is ten
-    # times too long.
+    # Scenes, masses, moduli, friction and the initial motion are random. In some trials, a contact
+    # is beyond the rim. One trial in three uses a time step that is ten times too long.
     generator = np.random.default_rng(trial)
     hand = random_hand(generator, trial % 3 == 0)
     held = hand.plant.parameters.object_held
@@ -137,7 +136,7 @@ def test_energy_never_increases_without_input(trial):
         later = hand.energy()
         assert later <= energy + 1e-12 * scale
         energy = later
-    # Sticking joints keep the tips indented, so part of the energy remains stored.
+    # Joints that stick keep the tips indented, so part of the energy remains.
     assert energy < start - min(1e-3 * scale, 0.25 * (start - at_rest))
 
 
@@ -146,8 +145,8 @@ def test_energy_never_increases_without_input(trial):
 
 @pytest.mark.extended
 def test_the_state_stays_finite_for_random_commands_and_extreme_parameters():
-    # Two in three trials use the plant's own time step. The other trials use a step that is ten
-    # times too long.
+    # Two in three trials use the normal time step. The other trials use a step that is ten times
+    # too long.
     assert [wrong for wrong in map(abuse, range(6)) if wrong] == []
 
 
@@ -157,7 +156,7 @@ MU = 0.3
 
 
 def pressed(**simulation: float) -> SimulatedHand:
-    """Return a hand whose left tip presses upright on an object; both are held in place."""
+    """Return a hand whose left tip presses upright on an object; joints and object are fixed."""
     hand = make(PAPER, STEP, tip_friction=MU, **simulation)
     hand.plant.parameters.joints_held = hand.plant.parameters.object_held = True
     place(hand, (0.0, -0.3), (-0.010 - DEPTH, 0.08, 0.0))
@@ -165,7 +164,7 @@ def pressed(**simulation: float) -> SimulatedHand:
 
 
 def sheared(hand: SimulatedHand, way: list[float]) -> list[float]:
-    """Return T/(μN) at the end of each leg when the face moves back and forth from 0 [m]."""
+    """Move the face to each position [m] in ``way``, starting at 0; return T/(μN) at each."""
     found, at = [], 0.0
     for target in way:
         for value in np.linspace(at, target, 400)[1:]:
@@ -188,9 +187,9 @@ def test_creep_relaxes_a_stuck_shear_exponentially():
 
 
 def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
-    # The expected force is the integral of the friction of the springs. The first loading follows 1
-    # − (1 − u/μd)². After each reversal, the change is twice this function at half the distance.
-    # After a closed path, the force returns to its initial value.
+    # The expected T/(μN) results from the friction of all springs. During the first loading, the
+    # ratio is 1 − (1 − u/μd)². After a reversal, the ratio changes by twice this function of half
+    # the distance. A closed path restores the initial force.
     def virgin(u: float) -> float:
         return 1.0 - (1.0 - min(u / (MU * DEPTH), 1.0)) ** 2
 
@@ -199,7 +198,7 @@ def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
     assert out == pytest.approx(virgin(part), abs=0.01)
     assert turned == pytest.approx(out - 2.0 * virgin(0.5 * (part - back)), abs=0.01)
     assert again == pytest.approx(out, abs=1e-3)
-    # Decreasing oscillations remove all shear, as in demagnetisation.
+    # Oscillations of decreasing amplitude remove the shear.
     fading = [part * (-1.0) ** k * (1.0 - k / 30.0) for k in range(31)]
     (*_, left) = sheared(pressed(tip_micro_slip=True), fading)
     assert abs(left) < 0.05 * out

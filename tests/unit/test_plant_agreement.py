@@ -1,9 +1,9 @@
 """Test the plant and its order of convergence against SciPy's adaptive solver.
 
-The smooth equations of motion are implemented independently in plain NumPy. They assume a constant
-modulus, sticking tips, and damping only in the tips and the palm. Contacts are geometric functions
-of the coordinates (q1, q2, x, y, φ), differentiated by complex steps; forces come from the closed
-form of the tips' energy.
+The smooth equations of motion are implemented independently in plain NumPy. The equations assume a
+constant modulus, sticking tips, and damping only in the tips and the palm. The contacts are
+functions of the coordinates (q1, q2, x, y, φ), whose derivatives are computed by complex steps. The
+forces are derived from the closed form of the tips' energy.
 """
 
 import math
@@ -22,7 +22,7 @@ PALM_STIFFNESS, PALM_LOSS = 1e5, 1e-3
 
 
 def tips(x):
-    """Return the centres of both tips; the formulas also accept complex coordinates."""
+    """Return the centres of both tips for real or complex coordinates."""
     length, half = HAND.finger_length, HAND.half_separation
     return (
         np.array([-half + length * np.sin(x[0]), length * np.cos(x[0])]),
@@ -41,7 +41,7 @@ def length_of(vector):
 
 @dataclass
 class Contact:
-    """One tip's contact: vector to the nearest point, κ, and the two bodies in contact."""
+    """Contact of one tip with the object or the other tip, as functions of the coordinates x."""
 
     finger: int
     way: Callable  # maps x to the vector from the tip's centre to the point
@@ -64,7 +64,7 @@ class Contact:
         return np.array(columns).T
 
     def slide(self, x):
-        """Return the Jacobian row for the touched body's velocity along t, relative to the tip."""
+        """Return the Jacobian row of the touched body's velocity along t relative to the tip."""
         m = self.normal(x)
         t = np.array([-m[1], m[0]])
         point = tips(x)[self.finger] + self.way(x)
@@ -79,7 +79,7 @@ class Contact:
 
 
 def material(x, finger, point):
-    """Return the velocity (2, 5) of a finger's material at ``point``, about its pivot."""
+    """Return the derivatives (2, 5) of the position of a finger's material at ``point``."""
     pivot = np.array([-HAND.half_separation, 0.0]) * (1 - 2 * finger)
     lever = point - pivot
     out = np.zeros((2, 5))
@@ -88,7 +88,7 @@ def material(x, finger, point):
 
 
 def on_face(finger, point, angle):
-    """Return a plane face through ``point`` of the object, with inward normal at ``angle``."""
+    """Return the contact with a plane face through ``point``; the inward normal is at ``angle``."""
 
     def normal(x):
         return np.array([np.cos(x[4] + angle), np.sin(x[4] + angle)])
@@ -102,9 +102,9 @@ def on_face(finger, point, angle):
 
 
 def wedge(width, taper=0.0, height=0.060):
-    """Return a wedge's contacts; the width is measured at half height, not at the mass centre."""
+    """Return the contacts with a wedge; ``width`` is the width at half height."""
     lean = 0.5 * taper
-    slope = height * math.tan(lean)  # half the difference in length between the two parallel faces
+    slope = height * math.tan(lean)  # half the difference between the parallel sides
     middle = height * slope / (6.0 * width)
     return [
         on_face(0, np.array([-0.5 * width, middle]), -lean),
@@ -141,17 +141,17 @@ def each_other():
 
 @dataclass
 class Equations:
-    """Equations of motion for five coordinates, with a shear for each contact and palm point."""
+    """Equations of motion for five coordinates, and one shear for each contact and palm point."""
 
     contacts: list
     inertias: np.ndarray
     currents: np.ndarray
     loss: float
     weight: np.ndarray
-    # Corners in the frame of an object that rests on a palm at y = ``palm``.
+    # Corners of an object that rests on a palm at y = ``palm``, in the object's frame.
     corners: np.ndarray | None = None
     palm: float = 0.0
-    coupling: float = 1.0  # coupling of the shear with d and θ; 0 for bristles
+    coupling: float = 1.0  # 1 if the shear depends on d and θ, 0 for bristles
 
     def __call__(self, _t, y):
         x, v = y[:5], y[5:10]
@@ -196,7 +196,7 @@ CORNERS = np.array([[-0.020, -0.030], [0.020, -0.030]])
 
 @dataclass
 class Scene:
-    """A smooth motion: contacts neither form nor break; tips and palm stick."""
+    """Start and settings of a motion during which all contacts persist and stick."""
 
     contacts: list
     simulation: dict = field(default_factory=dict)
@@ -239,7 +239,7 @@ def start(scene: Scene, loss: float, count: int):
 
 
 def compared(hand, scene: Scene) -> np.ndarray:
-    """Return the plant state in the coordinate order of the reference."""
+    """Return the state of the plant in the order of the reference's coordinates."""
     state = hand.plant.state
     shears = state.extra_shear[-2:] if scene.contacts[0].mutual else state.shear
     palm = state.extra_shear[: 0 if scene.corners is None else 2]
@@ -278,7 +278,7 @@ def test_second_order_agreement_with_an_adaptive_solver(name, loss):
         hand = start(scene, loss, count)
         hand.advance(hand.t + SECONDS)
         errors.append(np.abs((compared(hand, scene) - exact) / scale).max())
-        # The motion is smooth, so the errors depend only on the integration method.
+        # The motion is smooth, so errors are due to the integration method.
         assert hand.plant.limited_step_count == 0
         assert hand.d.min() > 0.001
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)

@@ -1,4 +1,4 @@
-"""Test the simulated object's shapes, contact between the tips, and the palm."""
+"""Test the shapes of the simulated object, contact between the tips, and the palm."""
 
 import math
 
@@ -47,7 +47,7 @@ def test_radius_of_gyration_and_mean_radius_of_the_shapes():
 
 def test_a_wedge_has_its_origin_at_the_centre_of_mass():
     wedge = shape(object_shape="wedge", object_taper=0.6)
-    # The faces converge away from the palm by 0.6 rad and are 40 mm apart at half the height.
+    # The angle between the faces is 0.6 rad, and their distance at half the height is 40 mm.
     normals = wedge.edges()[:, 2:4]
     assert math.acos(-normals[1] @ normals[3]) == pytest.approx(0.6)
     np.testing.assert_allclose(normals[1], [math.cos(0.3), math.sin(0.3)])
@@ -67,7 +67,7 @@ def test_a_wedge_has_its_origin_at_the_centre_of_mass():
 
 
 def nearest_by_brute_force(corners, point):
-    """Return the nearest of many points on the outline."""
+    """Return the vector from ``point`` to the nearest of many points on the outline."""
     share = np.linspace(0, 1, 20_001)[:, None]
     ends = np.roll(corners, -1, axis=0)
     outline = np.concatenate(
@@ -105,7 +105,7 @@ def test_a_disc_is_touched_in_the_direction_of_its_centre():
 
 
 def springs_on_a_cylinder(d, theta, curved):
-    """Return force and energy of springs under a cylinder, divided by the values for a plane."""
+    """Return the force and energy of springs under a cylinder, relative to those under a plane."""
     away = RADIUS - d + curved
     centre = away * np.array([math.sin(theta), math.cos(theta)])
     x = np.linspace(-RADIUS, min(RADIUS, centre[0] + curved), 50_001)
@@ -136,7 +136,7 @@ def test_curvature_softens_the_contact_like_the_springs(curved, upright, tilted)
         assert springs_on_a_cylinder(d, math.radians(30), curved) == pytest.approx(
             (share,) * 2, rel=tilted
         )
-    # The share is exact to leading order in d.
+    # For small d, the share is exact.
     assert springs_on_a_cylinder(1e-4, 0.3, curved) == pytest.approx((share,) * 2, rel=1e-3)
 
 

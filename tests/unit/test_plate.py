@@ -1,4 +1,4 @@
-"""Test the plate that presses on an emulated tip: syntax, motion, and invalid input."""
+"""Test the plate that presses on an emulated tip, with valid and invalid input."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Test the forward model: cell averages against plain integration, sums against closed forms."""
+"""Test the forward model's cell averages against integrals, and its sums against closed forms."""
 
 import math
 
@@ -12,7 +12,8 @@ from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, tilts
 def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
     """Return a cell's mean σ(ε).
 
-    The midpoint rule is used in y, and Gauss quadrature in t, where x = R sin t.
+    The integral over y uses the midpoint rule. The integral over x = R sin t uses Gauss quadrature
+    in t.
     """
     n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
     n_z = math.sqrt(1.0 - n_x**2 - n_y**2)
@@ -23,7 +24,7 @@ def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
     y = (y_first + (row + (np.arange(lines) + 0.5) / lines) * pitch_y)[:, None]
     radius2 = A**2 - y**2
     q = (A - d) - y * n_y
-    # On each line, the footprint ends where (h − x n_x − y n_y)² = n_z² (R² − x²).
+    # The ends of the footprint on a line y satisfy (h − x n_x − y n_y)² = n_z² (R² − x²).
     a2 = n_x**2 + n_z**2
     root = (q * n_x) ** 2 - a2 * (q**2 - n_z**2 * radius2)
     inside = (root > 0.0) & (radius2 > 0.0)
@@ -60,7 +61,7 @@ def test_cell_averages_for_all_kinds_of_cells(material, d, degrees, azimuth):
     touched = np.argwhere(p > 0.0)
     order = np.argsort(p[p > 0.0])
     allowed = 1e-5 if degrees < 30.0 else 1e-4 if degrees < 36.0 else 1e-3
-    # Use the weakest cells, which the outline cuts, and some other cells.
+    # Test the weakest cells, through which the outline runs, and some other cells.
     chosen = np.unique(np.concatenate([order[:25], order[:: max(1, len(order) // 15)]]))
     for row, col in touched[chosen]:
         expected = cell_mean(grid, material, d, tilt_x, tilt_y, row, col)

@@ -1,4 +1,4 @@
-"""Test finding, identifying and configuring servos, on an emulated line without a port."""
+"""Test the search, identification and configuration of servos on an emulated line."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -50,18 +50,20 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         # Both servos are configured.
         (BOTH, [servo(1), servo(2)], []),
         (BOTH, [servo(1), servo(2), servo(9)], ["stranger 9@2000000"]),
-        # A correct ID at another baud rate identifies the expected servo.
+        # The ID identifies a servo, even at another baud rate.
         (
             BOTH,
             [servo(1, 57600), servo(2, 57600)],
             ["0: 57600 → 2000000 baud", "1: 57600 → 2000000 baud"],
         ),
-        # If one servo is missing and one servo is unexpected, they are the same servo.
+        # If one servo is missing and one servo is unexpected, the unexpected servo is the missing
+        # servo.
         (BOTH, [servo(1), servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
         (BOTH, [servo(1), servo(7)], ["1: ID 7 → 2"]),
         (OTHER_IDS, [servo(1, 57600)], ["0: ID 1 → 11, 57600 → 2000000 baud"]),
-        # A servo whose finger is not in the scene cannot be the missing servo. A servo with factory
-        # settings at another baud rate may belong to any finger, so it can be the missing servo.
+        # A servo with the ID of a finger outside the scene cannot be the missing servo. A servo
+        # with the factory ID and baud rate may belong to any finger, so it can be the missing
+        # servo.
         (ONLY_LEFT, [servo(2)], ["missing 0", "stranger 2@2000000"]),
         (ONLY_RIGHT, [servo(1)], ["missing 1", "stranger 1@2000000"]),
         (ONLY_RIGHT, [servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
@@ -80,7 +82,8 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         ),
         # An emulator without line timing replies at every baud rate.
         (BOTH, [servo(servo_id, rate) for servo_id in (1, 2) for rate in RATES], []),
-        # Servos with garbled replies are not configured, and their IDs are not assigned.
+        # A servo with garbled replies is not configured, and its ID is not assigned to another
+        # servo.
         (BOTH, [servo(1, 57600), Garbled(1, 57600)], ["missing 0", "missing 1"]),
         (
             BOTH,
@@ -103,7 +106,7 @@ def test_servos_are_identified(settings, found, told):
 
 
 class Bus:
-    """The settings' servos on free joints; ``silent`` servos are unplugged."""
+    """Bus with the servos of the settings on free joints; ``silent`` servos are unplugged."""
 
     def __init__(self, baud: int = HOME, **options: Any) -> None:
         self.settings = Settings.model_validate({"servos": {"backend": "dynamixel"}})
@@ -131,7 +134,7 @@ class Bus:
 
 @pytest.fixture
 def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Bus]:
-    """Return a function that creates buses for the test's lines."""
+    """Return a function that creates the bus behind the line that the test opens."""
 
     def make(**options: Any) -> Bus:
         bus = Bus(**options)

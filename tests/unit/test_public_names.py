@@ -1,4 +1,4 @@
-"""Test that the public names are exported, fully documented, and found by the site."""
+"""Test that public names are exported and fully documented, and that the site lists them."""
 
 import ast
 import dataclasses
@@ -30,7 +30,7 @@ RECORDS = [name for name in NAMES if fields(getattr(softfinger, name)) and name 
 
 
 def listed(text: str) -> dict[str, str]:
-    """Return the names in a docstring's Attributes and Parameters sections, with descriptions."""
+    """Return the names and descriptions in a docstring's Attributes and Parameters sections."""
     found = {}
     for section in re.findall(
         r"(?ms)^(?:Attributes|Parameters)\n-+\n(.*?)(?=^\w[^\n]*\n---|\Z)", text
@@ -96,7 +96,7 @@ def test_every_public_name_and_method_is_documented(name):
 
 
 def imported() -> list[tuple[str, str]]:
-    """Return the submodules of softfinger that pages import from, with the imported names."""
+    """Return a pair of submodule and name for each name that the pages import."""
     pairs = {
         (module, name.strip())
         for path in CODE

@@ -1,4 +1,4 @@
-"""Test publication rates and loop-time histograms, against NumPy and without allocation."""
+"""Test publication rates; test loop-time histograms against NumPy and for memory allocation."""
 
 import math
 import tracemalloc
@@ -61,7 +61,7 @@ def test_each_topic_is_published_on_every_nth_tick_or_frame():
     assert ticks["state"] == list(range(5, 2001, 5))
     assert ticks["stats"] == [3, 503, 1003, 1503]
     assert not set(ticks["state"]) & set(ticks["stats"])
-    # Frames arrive at 100 Hz, and the publisher sends every fourth frame, that is, 25 per second.
+    # Frames arrive at 100 Hz, and the publisher sends every fourth frame.
     for frames in listener.frames:
         assert [seq // 4 for seq in frames] == list(range(len(frames)))
         assert len(frames) == pytest.approx(100, abs=1)
@@ -101,7 +101,7 @@ def test_quantiles_match_the_samples_within_one_bin(count):
     for j, name in enumerate(TIMES):
         for share, told in zip(QUANTILES, spreads[name], strict=False):
             true = np.quantile(rows[:, j], share, method="inverted_cdf")
-            if true < 2.0**-30:  # All times below a nanosecond share one bin.
+            if true < 2.0**-30:  # All times below a nanosecond are in one bin.
                 assert told <= 2.0**-29, (name, share)
             else:
                 assert true * (1 - 1e-12) <= told <= true * (1 + 1 / 31), (name, share)

@@ -1,4 +1,4 @@
-"""Compare a tip's closed forms and reference integrals with NumPy integrals."""
+"""Test the closed forms and the reference integrals of a tip against integrals by NumPy."""
 
 import math
 from fractions import Fraction
@@ -26,9 +26,10 @@ MATERIALS = [LINEAR, TABLE_I, STIFFENING, SOFTENING]
 def twin(
     tip: Fingertip, material: Material, d: complex, theta: complex, nodes: int = 110
 ) -> tuple[complex, complex]:
-    """Return F and U by Gauss quadrature on the base plane, x = h s + ρ c sin t, y = b sin τ.
+    """Return F and U by Gauss quadrature on the base plane.
 
-    Complex arguments allow exact derivatives with the complex-step method.
+    The variables are t and τ, where x = h s + ρ c sin t and y = b sin τ. Complex arguments are
+    valid, so complex steps give exact derivatives.
     """
     a, s, c = tip.radius, np.sin(theta), np.cos(theta)
     h = a - d
@@ -91,7 +92,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
         usual, finer = np.empty((2, 5, 1))
         ratios_at(gauss_rule(), circle_rule(material.degree), parts, *place, usual)
         ratios_at(gauss_rule(40), circle_rule(40), parts, *place, finer)
-        # Scale by F tan θ, because ∂F/∂θ may pass through zero.
+        # Scale the error of ∂F/∂θ by F tan θ, because ∂F/∂θ may pass through zero.
         scale = np.abs(finer)
         scale[3] = max(scale[3], scale[0])
         assert np.all(np.abs(np.subtract(usual, finer)) <= tolerance * scale)
@@ -104,7 +105,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
 )
 @settings(max_examples=60)
 def test_every_admissible_material_has_its_minimum_energy_upright(slopes, depth, share):
-    """The tangent moduli are random positive Bernstein polynomials, so the laws curve both ways."""
+    """Use random positive Bernstein polynomials as tangent moduli; laws may stiffen or soften."""
     n = len(slopes) - 1
     modulus = np.polynomial.Polynomial([0.0])
     for k, slope in enumerate(slopes):
@@ -134,7 +135,7 @@ def test_values_outside_the_domain():
 radii = st.floats(1e-4, 1.0)
 moduli = st.floats(1.0, 1e9)
 fractions = st.floats(5e-8, 0.9999)  # fraction of the radius
-# Fraction of the θ limit. Tilts close to denormal numbers have no relative precision.
+# Fraction of the limit of θ. A tilt close to the denormal numbers has no relative precision.
 shares = st.floats(-1.0, 1.0).map(lambda share: share if abs(share) > 1e-150 else 0.0)
 
 
@@ -152,8 +153,7 @@ def test_tilt_limit():
     assert TIP.theta_limit(0.02) == TIP.theta_limit(1.0) == 0.0
     assert math.isnan(TIP.theta_limit(math.nan))
     assert all(isinstance(TIP.theta_limit(d), float) for d in (0, 0.004, np.array(0.03)))
-    # The cosine of the limit is √(2ad − d²)/a. This form is accurate in all digits, even where
-    # asin((a − d)/a) is not.
+    # The cosine of the limit is √(2ad − d²)/a, which is accurate for any d. asin((a − d)/a) is not.
     d = 10.0 ** np.arange(-17.0, -2.0)
     np.testing.assert_allclose(
         np.pi / 2 - Fingertip(1.0).theta_limit(d),
@@ -164,7 +164,7 @@ def test_tilt_limit():
 
 
 def _complex(modulus: float, d: complex, theta: complex) -> tuple[complex, complex]:
-    """Return force and energy in complex arithmetic, for complex-step differentiation."""
+    """Return force and energy for complex arguments, so that complex steps give derivatives."""
     force = math.pi * modulus * d * d / np.cos(theta)
     return force, force * d / (3 * np.cos(theta))
 

@@ -1,4 +1,4 @@
-"""Test the text and pictures of stream records, at a prompt and in a notebook."""
+"""Test the texts and pictures that represent stream records at a prompt and in a notebook."""
 
 import re
 from typing import Any
@@ -77,7 +77,7 @@ def test_a_state_is_a_table_in_a_notebook():
 
 
 def drawn(found: TactileFrame) -> tuple[ElementTree.Element, np.ndarray]:
-    """Return a frame's picture and the opacity of each of its cells; row 0 is at the bottom."""
+    """Return the picture of a frame, and the opacity of each cell; row 0 is at the bottom."""
     picture, _ = ElementTree.fromstring(f"<p>{found._repr_html_()}</p>")
     cells = np.zeros((found.rows, found.cols))
     for path in picture:

@@ -1,4 +1,4 @@
-"""Test tip relaxation: the plant against the integrals of its Prony terms, and energy decay."""
+"""Test tip relaxation in the plant against integrals of the Prony terms, and its energy decay."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,7 @@ SPEED = 0.02  # m/s
 
 
 def pressed(**more: Any) -> SimulatedHand:
-    """Yield one finger against which the object is moved back and forth."""
+    """Return a hand with one finger, against which the object moves back and forth."""
     simulation = {
         "tip_relaxation": STRENGTHS,
         "tip_relaxation_times": TIMES,
@@ -73,7 +73,7 @@ def test_pressing_and_releasing_follow_the_prony_terms():
 
 
 def test_relaxing_tips_do_not_generate_energy():
-    """A free object that bounces between relaxing tips comes to rest without any other damping."""
+    """Let a free object bounce between relaxing tips without other damping, until it rests."""
     settings = Settings.model_validate(
         {
             "material": {"law": "constant"},
@@ -100,7 +100,7 @@ def test_relaxing_tips_do_not_generate_energy():
 
 @pytest.mark.parametrize("strengths", [(0.0, 0.15, 0.25), (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)])
 def test_press_and_hold_gives_the_strengths(strengths):
-    """The frames (100 Hz, noisy, from a separate ODE) cannot resolve the shortest time constant."""
+    """Noisy frames at 100 Hz, from a separate ODE, cannot resolve the shortest time constant."""
     t = np.arange(-1.0, 6.0, 0.01)
     lasting = 12.0 * np.clip(t / 0.1, 0.0, 1.0) ** 1.6
 
@@ -127,7 +127,7 @@ def test_too_short_a_hold_is_refused():
 
 
 def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
-    """Return true force / 8 N after 1 s of a hold and at the end, and the warnings."""
+    """Hold with 8 N; return the relative true force after 1 s and at the end, and the warnings."""
     sections: dict[str, dict[str, Any]] = {name: dict(values) for name, values in tip.items()}
     sections.setdefault("simulation", {})["tip_relaxation"] = STRENGTHS
     if aware:

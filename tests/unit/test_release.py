@@ -1,4 +1,4 @@
-"""Test a release: its changelog section, and the same version and date in all project files."""
+"""Test that a release has a changelog section, and one version and date in all project files."""
 
 import datetime
 import importlib.util

@@ -1,4 +1,4 @@
-"""Test hands that differ from their settings, evaluated with the plant's true values."""
+"""Test hands that differ from their settings; the plant's true values are the reference."""
 
 import math
 
@@ -46,7 +46,7 @@ def test_unknown_hand_parameters_do_not_change_the_force(name, seed):
     ],
 )
 def test_a_falling_zero_offset_is_named_and_the_grip_continues(name, seed):
-    """With readings clipped at 0, only the joints' motion shows how far the offset has fallen."""
+    """Readings are clipped at 0, so only the joints' motion shows how far the offset has fallen."""
     found = grip(ROW[name], seed)
     assert found.end == "holding"
     assert found.settled == pytest.approx(1.0, abs=0.2)
@@ -72,8 +72,8 @@ def test_joint_friction_is_estimated_during_the_approach(friction, stiction):
         grip.loop.advance(0.1)
         grip.command("grasp", force=6.0)
         assert grip.until("holding", 4.0)
-        # The estimate includes joint damping, and the static friction that remains when a joint
-        # starts to move.
+        # The estimate includes the joint damping. The estimate also includes the static friction
+        # that remains when a joint starts to move.
         shown = grip.estimator.grasp.free_torque
         assert (shown > friction + 0.5 * stiction).all()
         assert (shown < friction + stiction + 0.025).all()
@@ -88,7 +88,7 @@ def test_equal_seeds_give_equal_hands():
 
 
 def frames(zero: float, cells: int = 32, pressed: int = 200) -> np.ndarray:
-    """Return the counts for a 20 mm tip indented by 3 mm, with a zero offset."""
+    """Return the counts of a 20 mm tip that is indented by 3 mm, plus a zero offset."""
     at = (np.arange(cells) - 0.5 * (cells - 1)) * 0.058 / cells
     inside = np.hypot(*np.meshgrid(at, at)) < 10.5e-3
     return np.where(inside, pressed + zero, zero).astype(np.uint16)

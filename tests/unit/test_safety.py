@@ -1,4 +1,4 @@
-"""Test limits on goals from any source, and the rule that only Safety writes goals."""
+"""Test the limits on goals, and test that only `Safety` sends goals to servos."""
 
 import ast
 import math
@@ -39,7 +39,7 @@ def bounded(judge: Safety, state: State, wanted: Goal) -> Goal:
 
 def test_goals_are_bounded_by_joint_and_current_limits():
     judge, state = safety(), sound()
-    for _ in range(1000):  # This time is enough for the step and the slew.
+    for _ in range(1000):  # 1000 ticks are enough for the step and the slew.
         found = bounded(judge, state, goal((9.0, -9.0), (5.0, -0.2)))
     assert found.valid
     assert found.q == [SETTINGS.hand.q_max[0], SETTINGS.hand.q_min[1]]

@@ -18,7 +18,7 @@ state_message = message_maker(STATE)
 
 
 def holding_demo(daemon: Daemon) -> list[Event]:
-    """Run the demo until the hand holds the object; return the list of later events."""
+    """Run the demo until the hand holds the object; return a list that collects later events."""
     advance_to(daemon, "holding", 5.0)
     return heard(daemon)
 
@@ -66,7 +66,7 @@ def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
 def test_a_demo_with_an_endless_step_restarts(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
-    daemon.loop._task._end_mode = "moving"  # The task never reaches this mode.
+    daemon.loop._task._end_mode = "moving"  # The hand never enters this mode.
     advance_to(daemon, "disarmed", 13.0)
     assert events[0][2].startswith("still holding after 10 s; the simulated hand's task stops")
     advance_to(daemon, "holding", 6.0)

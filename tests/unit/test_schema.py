@@ -1,4 +1,4 @@
-"""Test that sent messages match the schema byte for byte, and that the schema page is current."""
+"""Test that messages match the schema byte for byte, and that the schema page is up to date."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ def test_sent_messages_match_the_schema(topic):
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
 def test_messages_equal_golden_bytes(topic):
-    """Existing analysis tools require messages that do not change in any byte."""
+    """Existing analysis tools require that no byte of the messages changes."""
     golden = golden_file(topic).read_bytes()
     assert packer(topic)(*arguments(topic)) == golden
     assert msgpack.unpackb(golden) == sample(topic)

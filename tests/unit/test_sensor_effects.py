@@ -1,4 +1,4 @@
-"""Test the simulated sensor's effects on the pressure, each against plain NumPy."""
+"""Test each effect of the simulated sensor on the pressure against plain NumPy."""
 
 import math
 from dataclasses import replace
@@ -28,8 +28,8 @@ def counts(model, contact, t=0.0):
 def test_without_defects_the_forward_model_is_rounded():
     model = sensor()
     for contact in CONTACTS:
-        # A reading between two counts may be rounded up or down. The sensor model averages over
-        # fewer points, which causes an error of 1e-4 of the modulus at the outline.
+        # A reading between two counts may be rounded up or down. At the outline, the sensor model's
+        # error is 1e-4 of the modulus, because the model averages over fewer points.
         signal = 0.2 * model.grid.pressure(TIP, LINEAR, *contact)
         np.testing.assert_allclose(counts(model, contact), signal, rtol=0, atol=0.5 + 6.0)
     assert not counts(model, (0.0, 0.2, -0.1)).any()
@@ -40,8 +40,8 @@ def test_noise_has_the_configured_deviation_and_is_clipped_at_zero():
     clean = 0.2 * model.grid.pressure(TIP, LINEAR, *CONTACTS[2])
     strong = clean > 4000.0
     rest = np.concatenate([(counts(model, CONTACTS[2]) - clean)[strong] for _ in range(20)])
-    # For n numbers, the relative scatter of the standard deviation is 1/√(2n), and the scatter of
-    # the mean is 1/√n standard deviations.
+    # For n numbers, the standard deviation has a relative scatter of 1/√(2n). The mean has a
+    # scatter of 1/√n standard deviations.
     assert rest.std() == pytest.approx(600.0, rel=4.5 / np.sqrt(2 * rest.size))
     assert abs(rest.mean()) < 4.0 * 600.0 / np.sqrt(rest.size)
     free = counts(model, (0.0, 0.0, 0.0))
@@ -90,7 +90,7 @@ def test_hysteresis_affects_only_unloading_and_loops_close():
     assert force(0.004) == pytest.approx(1.0, abs=1e-9)
     assert force(0.0038) > 1.03
     assert force(0.002) == pytest.approx(1.1, abs=0.005)
-    assert 1.0 < force(0.0021) < 1.07  # The sensor is loaded again within the hysteresis loop.
+    assert 1.0 < force(0.0021) < 1.07  # loading within the hysteresis loop
     assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # The hysteresis loop is closed.
     assert force(0.006) == pytest.approx(1.0, abs=1e-9)
     assert not counts(model, (0.0, 0.0, 0.0)).any()
@@ -102,7 +102,7 @@ def test_a_lag_is_the_exact_response_to_linear_segments():
     shape = np.array([[1.0, 2.0], [0.5, 0.0]])
     times = [0.0, 0.7, 0.7, 5.0, 5.001, 30.0]
     values = [0.0, 100.0, 40.0, 40.0, 0.0, 10.0]
-    # The reference integrates dz/dt = (p − z)/time in small steps.
+    # Integrate dz/dt = (p − z)/time in small steps as a reference.
     z = 0.0
     for k in range(1, len(times)):
         elapsed = times[k] - times[k - 1]
@@ -219,7 +219,7 @@ def test_crosstalk_is_a_fraction_of_both_line_means():
     signal = counts(sensor(), CONTACTS[1])
     expected = signal + 0.3 * (signal.mean(axis=0) + signal.mean(axis=1)[:, None])
     np.testing.assert_allclose(counts(model, CONTACTS[1]), expected, atol=1.01)
-    assert expected[0].max() > 100.0  # This cell belongs to the ghost image away from the contact.
+    assert expected[0].max() > 100.0  # This cell is in a ghost image, away from the contact.
 
 
 @pytest.mark.parametrize("least", [0, 3])
@@ -281,7 +281,7 @@ def frame(grid: SensorGrid, d: float, tilt: float, curvature: float) -> np.ndarr
 
 
 def literal(d: float, tilt: float, radius: float, rotation: float, parts: int = 24) -> np.ndarray:
-    """Return the mean pressure on 44 × 44 rotated cells, each sampled at ``parts``² points."""
+    """Return the mean pressure of 44 × 44 rotated cells, sampled at ``parts``² points per cell."""
     at = (np.arange(44 * parts) + 0.5) * PITCH / parts - 0.029
     sensor_x, sensor_y = np.meshgrid(at, at)
     x = math.cos(rotation) * sensor_x - math.sin(rotation) * sensor_y

@@ -1,4 +1,4 @@
-"""Test that measurement faults during a grip are rejected and do not affect the true force."""
+"""Test that the daemon rejects wrong measurements during a grip, so that the force is correct."""
 
 import math
 from collections.abc import Callable
@@ -15,10 +15,10 @@ from tests.unit.test_control import grasped
 FORCE = 6.0
 BOTH = {"consistency.left_sensor", "consistency.right_sensor"}
 
-# Each fault has a kind, a value, a duration [s], the affected fingers, the expected events, and the
-# mode expected afterwards. A falling zero offset completely hides a light touch, and the joints
-# then hold their position. If only one tip seems to let go, the daemon rejects the frames of this
-# tip instead. A rising zero offset is visible next to the footprint.
+# For each fault: kind, value, duration [s], affected fingers, expected events and expected final
+# mode. A falling zero offset hides a light touch completely, and the joints then hold their
+# positions. If only one tip seems to lose contact, the daemon rejects the frames of this tip
+# instead. A rising zero offset shows in the cells next to the footprint.
 LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
     "one zero sinks": ("drift", -0.1, 1.0, (0,), {"consistency.left_sensor"}, "armed"),
     "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, "armed"),
@@ -56,7 +56,7 @@ def test_a_measurement_fault_is_named_and_has_no_effect(lie: str) -> None:
         assert hand.mode == mode
         if mode == "holding":
             assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.1)
-        if mode == "fault":  # The sensor is invalid, as if its frames were missing.
+        if mode == "fault":  # The daemon treats the frames as missing.
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 
@@ -195,7 +195,7 @@ def test_real_loads_and_turns_are_not_measurement_faults(load: tuple[float, floa
 
 
 def given(repeats: RepeatDetector, frames: list[float]) -> bool:
-    for number in frames:  # An increase by 10 % affects only one cell.
+    for number in frames:  # Only one cell increases by 10 %.
         repeats.update(np.array([number, number, number, 10.0 * number]).astype(np.uint16))
     return repeats.is_fault
 

@@ -1,4 +1,4 @@
-"""Test the emulated servo bus: published exchanges byte for byte, reply rules, line faults."""
+"""Test published exchanges, reply rules and line faults on the emulated servo bus."""
 
 import struct
 from typing import Any

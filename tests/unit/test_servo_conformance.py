@@ -1,4 +1,4 @@
-"""Test the simulated and the Dynamixel servo backend in each operating mode.
+"""Test the simulated servo backend and the Dynamixel backend in each operating mode.
 
 Both backends must pass the same tests. To test another backend, add it to ``RIGS``.
 """
@@ -38,7 +38,7 @@ class Rig(Protocol):
     clock: Clock
 
     def torque(self) -> list[bool]:
-        """Return True for each motor that is driven, as reported by the servos themselves."""
+        """Return, for each servo, True if its motor is driven."""
 
     def close(self) -> None:
         """Close the backend."""
@@ -63,9 +63,9 @@ class SimulatedRig:
 
 
 class DynamixelRig:
-    """The Dynamixel backend with the SDK and an emulated bus on the same clock.
+    """The Dynamixel backend with the SDK, and an emulated bus that uses the same clock.
 
-    Bytes are transferred immediately, without a pty, so the machine's load has no effect.
+    Bytes are transferred immediately, without a pty, so a busy machine has no effect.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ def make(
 
 
 def ticks(rig: Rig, goal: Goal, seconds: float) -> list[Reading]:
-    """Read and write as the loop does; return every reading."""
+    """Read and write on each tick as the loop does; return all readings."""
     readings = []
     deadline, end = rig.clock.now(), rig.clock.now() + seconds
     while deadline < end:
@@ -213,7 +213,7 @@ def test_torque_off_and_close_release_the_joints(make, mode):
 def test_a_finger_outside_the_scene_stays_zero(make, mode):
     rig = make(mode, scene={"fingers": ("right",)})
     if isinstance(rig, DynamixelRig):
-        put_fault(rig.bus, "silent=1", 0.0)  # The test does not address this servo.
+        put_fault(rig.bus, "silent=1", 0.0)  # The backend does not address this servo.
     armed(rig)
     reading = ticks(rig, Goal(q=[0.1, -0.1], current=[0.4, 0.4]), 0.4)[-1]
     assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0
@@ -232,7 +232,7 @@ def test_a_model_without_current_sensing_only_supports_position_mode(make, mode)
     assert ticks(rig, Goal(q=[0.08, -0.1]), 0.5)[-1].q == pytest.approx([0.08, -0.1], abs=0.01)
 
 
-# Current mode has its own control loop, and position mode has its own checks.
+# The control loop of current mode, and the checks of position mode.
 
 
 def test_the_control_loop_of_current_mode():

@@ -1,4 +1,4 @@
-"""Test the servo temperature prediction, and reactions when thermal constants are unknown."""
+"""Test the prediction of servo temperatures with unknown constants, and the daemon's reactions."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ from tests.harness.golden_recording import RECORDING
 from tests.soak.heat import Bench, foreseen, least_at_half_load
 
 LIMIT = 70.0
-# Heating, cooling and heat capacity of the plant's servos, relative to the model.
+# Heating, cooling and heat capacity of the plant's servos, as factors of the model's values.
 FAST = (1.2, 0.8, 0.3)
 
 
@@ -36,7 +36,7 @@ def law(state: HeatState) -> HeatState:
 
 
 def derivative(state: HeatState, x: Any, square: float) -> Any:
-    """Return the derivatives of W, C, A and k by the equations in the module docstring."""
+    """Return the derivatives of W, C, A and k (equations in the docstring of `hand.servo_heat`)."""
     c = state.law
     winding, case, ambient, heating = x
     copper = 1.0 + 0.0039 * (winding - 25.0)
@@ -113,7 +113,7 @@ HOLD = 600.0  # s
 
 
 def recorded(plant: ServoHeat) -> dict[str, Any]:
-    """Return a hold at 1 A in the form of a recording."""
+    """Return the recorded values of a hold at 1 A."""
     t, shown = np.arange(0.0, HOLD, 0.5), []
     for _ in t:
         plant.step(1.0, 0.5)
@@ -141,7 +141,7 @@ def test_servo_constants_are_identified_from_a_hold(tmp_path, monkeypatch, capsy
     assert told == pytest.approx(t, rel=0.05)
     follow(law(state).array, 1.0, 0.5, 25.0)
     state.x[:3] = 25.0
-    # This prediction uses the constants of the model.
+    # With the model's constants, the prediction is wrong.
     assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2
 
 
@@ -153,7 +153,7 @@ def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
-    """Grip with servos that quickly overheat, at half the usual frame rate."""
+    """Grip with servos that overheat quickly; frames have half the usual rate."""
     sections |= {"simulation": {"servo_heat": FAST, "ambient": 35.0}, "tactile": {"rate": 50.0}}
     hand = SimulatedDaemon(sections)
     hand.grasp(force)

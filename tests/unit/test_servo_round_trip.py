@@ -1,4 +1,4 @@
-"""Test instructions through softfinger's packet handler and the bus against table access."""
+"""Compare instructions sent through packet handler and bus with direct access to the tables."""
 
 import dynamixel_sdk as sdk
 import numpy as np
@@ -15,8 +15,8 @@ ADDRESSES = st.one_of(
     st.integers(0, 663),
     st.integers(640, 663),  # Some of these reads extend beyond the end of the table.
 )
-# FF and FD are frequent so that stuffing is needed, and small numbers are frequent because they are
-# valid.
+# FF and FD are frequent, because they require stuffing. Small numbers are frequent, because most
+# registers accept them.
 DATA = st.one_of(
     st.lists(st.sampled_from([0xFF, 0xFD, 0, 1, 5, 100]), min_size=1, max_size=20).map(bytes),
     st.binary(min_size=1, max_size=20),
@@ -34,15 +34,15 @@ STEPS = st.one_of(
 
 
 def placed(angles: tuple[float, float]) -> ServoBus:
-    # The check below protects the status and ID registers, so that the servos stay reachable.
+    # `out_of_reach` excludes writes after which a servo might not reply.
     return make_bus("XM430-W210", for_daemon=True, counts=[angle / RADIAN for angle in angles])
 
 
 def out_of_reach(address: int, data: bytes) -> bool:
-    """Return True if a write could change which servos reply; such writes are not compared."""
+    """Return True if a write could change which servos reply; the test excludes such a write."""
     span = range(address, address + len(data))
     kept = (reg.ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
-    # Indirect addresses could refer to these registers.
+    # Indirect data could refer to these registers.
     return any(a in span for a in kept) or address >= 168
 
 

@@ -1,4 +1,4 @@
-"""Test that profiles are loaded, and that one report lists all their errors."""
+"""Test that profiles are loaded, and that one report lists all errors of a profile."""
 
 import json
 import tomllib
@@ -161,7 +161,7 @@ def test_wrong_values_do_not_hide_contradictions_between_other_keys(tmp_path):
         "tip.radius",
         "hand.q_max",
         "servos.ids",
-        # safety.d_max is missing here because it was compared with a different radius.
+        # safety.d_max is not reported, because its limit depends on the wrong radius.
     ]
 
 

@@ -1,4 +1,4 @@
-"""Test the simulated hand's servos and sensors on a virtual clock, and frame arrival times."""
+"""Test the servos, sensors and frame arrival times of the simulated hand in virtual time."""
 
 import math
 from itertools import pairwise
@@ -35,7 +35,7 @@ class Bench:
         self.goal = Goal()
 
     def run(self, seconds: float, period: float = 0.002) -> None:
-        """Tick as the loop does: read the joints, then write the goal."""
+        """Read the joints and then write the goal on each tick, as the loop does."""
         end = self.clock.now() + seconds
         while self.clock.now() < end - 1e-9:
             self.clock.sleep_until(self.clock.now() + period)
@@ -132,7 +132,7 @@ def test_the_sample_is_available_after_a_long_delay():
 
 
 def collect(arrivals, until, step=0.0005):
-    """Poll every ``step`` [s] and return (number, arrival) of each new frame."""
+    """Poll every ``step`` [s]; return the number and the arrival time of each new frame."""
     found = []
     for k in range(round(until / step)):
         if arrivals.take(k * step):

@@ -1,4 +1,4 @@
-"""Test the grip's reactions to external loads, missing frames, and a single finger."""
+"""Test how grips of one or two fingers react to external loads and missing frames."""
 
 import math
 
@@ -14,7 +14,7 @@ from tests.harness.plant import push_along
 from tests.unit.test_control import KNOWN, PAPER, grasped
 
 FORCE = 10.0
-BORNE = 2.0 * 0.6 * FORCE  # load that the friction of both tips can carry at this grip force [N]
+BORNE = 2.0 * 0.6 * FORCE  # maximum load that friction at both tips can carry [N]
 FRICTION = 0.05 / 0.03  # load that joint friction can hide at a moment arm of 30 mm [N]
 
 
@@ -22,7 +22,7 @@ FRICTION = 0.05 / 0.03  # load that joint friction can hide at a moment arm of 3
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
 def test_a_push_beyond_the_margin_is_held_with_more_force(sections):
-    """The push is away from the palm; a push towards it would hardly change the torques."""
+    """Push away from the palm, because a push towards the palm would hardly change the torques."""
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
         with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
@@ -49,7 +49,7 @@ def test_the_grip_force_decreases_after_the_load_is_removed():
         hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
-        # If the load is removed while the fingers are closing, the estimator attributes part of the
+        # The load is removed while the fingers close. The estimator then attributes part of the
         # change to a stiffer tip.
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.1)
 
@@ -77,8 +77,7 @@ def test_an_object_that_twists_in_the_grip_is_gripped_with_more_force():
         with Hand({"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             start = hand.plant.object_pose[2]
-            # With the object width as the moment arm, the friction at both tips resists about 0.25
-            # N·m.
+            # The friction at both tips resists a moment of about 0.25 N·m.
             for k in range(1, 76):
                 hand.plant.apply_load(0.0, 0.0, 0.4 * k / 75)
                 hand.watch(0.02)
@@ -89,7 +88,7 @@ def test_an_object_that_twists_in_the_grip_is_gripped_with_more_force():
 
 
 class GripUnderLoad:
-    """A grip of an imaginary object with prescribed loads."""
+    """Grip controller with prescribed loads, without an object."""
 
     def __init__(self, asked: float = FORCE, **control: float) -> None:
         self.held = held = GraspState()
@@ -112,10 +111,10 @@ class GripUnderLoad:
         speed: float = 0.0,
         sense: float = 1.0,
     ) -> float:
-        """Run ``ticks`` under a load with joints closing at ``speed``; return the goal force [N].
+        """Run ``ticks`` under a load while joints close at ``speed``; return the goal force [N].
 
-        ``sense`` is the ratio of the right joint's values to the left joint's values; -1 is a
-        twist.
+        ``sense`` is the ratio of the right joint's values to the left joint's values. The ratio is
+        -1 for a twist.
         """
         torque = self.held.load_arm * load
         self.held.torque_residual = [torque, sense * torque]
@@ -131,7 +130,7 @@ def test_a_load_is_detected_only_beyond_joint_friction():
     watched.grip.begin_holding()
     assert watched.run(1.5, 500) == FORCE
     assert watched.grip.slip.load == 0.0
-    # The detected load is increased by the amount that friction may hide.
+    # The controller increases the detected load by the load that friction may hide.
     for load in np.linspace(1.5, 6.0, 500):
         watched.run(load, 1)
     found = watched.run(6.0, 500)
@@ -140,7 +139,7 @@ def test_a_load_is_detected_only_beyond_joint_friction():
 
 
 def at_rest(asked: float = FORCE) -> GripUnderLoad:
-    """Return a grip that has been held for a while."""
+    """Return a grip that has held without a load for 600 ticks."""
     watched = GripUnderLoad(asked, friction_speed=1e6)
     watched.run(0.0, 500, holding=False, normal=asked)
     watched.grip.begin_holding()
@@ -161,10 +160,10 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
     assert state.grip_force > 1.15 * (FORCE + 10.0), "must take effect on the same tick"
-    # The limit is the force with torque constant error, plus friction and load.
+    # The limit is the force including the error of the torque constant, plus friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9
-    # The measured force rises, so the controller now holds the force that the reflex has set.
+    # Once the measured force has risen, the controller holds the force that the reflex has set.
     watched.held.force = [FORCE + 10.0] * 2
     watched.run(2.0 * FRICTION, 1)
     assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
@@ -179,7 +178,7 @@ def test_a_sudden_twist_immediately_raises_the_grip():
 
 
 def test_a_constant_load_leaves_less_margin_for_a_sudden_one():
-    """With 3 N on each tip, a sudden load that would be harmless alone triggers the reflex."""
+    """If each tip carries 3 N, the reflex reacts to a sudden load that would be harmless alone."""
     watched = at_rest()
     for load in np.linspace(0.0, 3.0, 500):
         watched.run(load, 1)
@@ -197,7 +196,7 @@ def test_shear_of_solid_tips_reveals_a_load(kind):
 
 
 def test_a_load_on_one_joint_alone_is_not_a_sudden_load():
-    """Only a current measurement fault or a failed joint causes a load on one joint alone."""
+    """If only one joint appears loaded, its current is wrong or the joint has failed."""
     watched = at_rest()
     for torque in (0.3, -0.3, 0.3):
         watched.held.torque_residual = [0.0, torque]
@@ -210,7 +209,7 @@ def test_a_load_on_one_joint_alone_is_not_a_sudden_load():
     ("shown", "raised"), [((0.3, 0.3), True), ((0.6, 0.0), False), ((0.6, -0.2), False)]
 )
 def test_a_turn_seen_by_one_tip_alone_is_ignored(shown, raised):
-    """One tip's image is mirrored or shifted."""
+    """If one tip's image is mirrored or shifted, only one tip appears to turn."""
     watched = at_rest()
     watched.held.unexplained_rotation = list(shown)
     assert (watched.run(0.0, 1) > FORCE) == raised
@@ -218,7 +217,7 @@ def test_a_turn_seen_by_one_tip_alone_is_ignored(shown, raised):
 
 @pytest.mark.parametrize("force", [5.0, 10.0])
 def test_current_noise_is_not_a_load_but_does_not_hide_one(force):
-    """The noise is 30 mA on each joint, and a load towards the palm is the hardest to detect."""
+    """Add noise of 30 mA; use a load towards the palm, which is the hardest to detect."""
     rng = np.random.default_rng(1)
     watched = at_rest(force)
     watched.held.load_arm, watched.held.load_curvature = 0.025, 0.02 / force
@@ -234,7 +233,7 @@ def test_current_noise_is_not_a_load_but_does_not_hide_one(force):
 
 
 def standing(load: float, asked: float = 4.0) -> GripUnderLoad:
-    """Return a grip under a load that increased slowly without joint motion."""
+    """Return a grip under a load that has increased slowly while the joints did not move."""
     watched = at_rest(asked)
     for part in np.linspace(0.0, load, 500):
         watched.run(part, 1, normal=asked)
@@ -249,7 +248,7 @@ def test_a_load_is_still_known_after_the_force_has_changed():
     watched.run(3.0 * FRICTION, 50, holding=False, normal=raised)
     watched.grip.begin_holding()
     assert watched.run(3.0 * FRICTION, 1000, normal=raised) > 1.5 * 4.4
-    # If the load is removed during a change, the force returns to the commanded value.
+    # The load is removed during a change, and the force then returns to the commanded value.
     watched.grip.retarget(4.8)
     watched.run(0.0, 50, holding=False, normal=raised)
     watched.grip.begin_holding()
@@ -273,7 +272,7 @@ def test_friction_identified_during_the_approach_limits_load_detection():
         for load in np.linspace(0.0, 5.5, 500):
             watched.run(load, 1)
         assert (watched.run(5.5, 100) > FORCE) == raised
-        # The approach current of 0.15 A limits the torque.
+        # The current of 0.15 A during the approach limits the torque.
         assert watched.grip.slip.friction == pytest.approx(min(shown, 0.15 * 1.78))
 
 
@@ -296,7 +295,7 @@ def test_the_force_increase_is_limited_by_its_setting_and_the_force_limit():
 
 
 def test_the_more_loaded_tip_is_not_pressed_beyond_the_force_limit():
-    """A push across the faces presses the object into one tip, which looks like a twist."""
+    """A push across the faces, which presses the object into one tip, resembles a twist."""
     watched = GripUnderLoad(grip_raise_share=10.0)
     watched.grip.begin_holding()
     watched.held.force = [FORCE - 9.0, FORCE + 9.0]

@@ -1,4 +1,4 @@
-"""Run short soak sequences; test that all requirements are met and that violations are detected."""
+"""Test that short soak sequences meet all requirements, and that the soak detects violations."""
 
 import math
 from collections.abc import Iterator

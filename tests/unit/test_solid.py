@@ -1,4 +1,4 @@
-"""Test solid rubber tips: table, frames, estimation, and a hand with such tips."""
+"""Test the contact table, frames and estimates of solid rubber tips, and a hand with such tips."""
 
 import json
 import math
@@ -38,8 +38,8 @@ def test_partial_derivatives_belong_to_one_energy(tip):
     c, h = table(d, theta), 1e-6
     assert c.inside.all()
     if tip.face == "sticking":
-        # A shear force up the slope increases the force on the base. The increase is larger at
-        # larger tilts.
+        # A shear force up the slope increases the force on the base. A larger tilt causes a larger
+        # increase.
         held = c.force / (np.cos(theta) * c.energy_d) - 1.0
         assert held[2] == pytest.approx(0.0, abs=1e-12)
         assert (held[0] < 0.2).all()
@@ -56,7 +56,7 @@ def test_partial_derivatives_belong_to_one_energy(tip):
             size = np.abs(slope).max()
             assert getattr(c, f"{name}_{field}") == pytest.approx(slope, rel=1e-5, abs=1e-6 * size)
     one = table(float(d[1, 1]), float(theta[1, 1]))
-    # In a loop, the compiler may use fused multiply-add for different products.
+    # In a loop, the compiler may fuse other multiplications and additions.
     assert one[:6] == pytest.approx([float(each[1, 1]) for each in c[:6]], rel=1e-12)
 
 
@@ -64,8 +64,8 @@ def test_partial_derivatives_belong_to_one_energy(tip):
 def test_small_contacts_are_hertzian_and_large_ones_end_with_the_data(tip):
     table = ContactTable.build(tip, RUBBER)
     stiffness = 4.0 / 3.0 * 0.304e6 / (1.0 - tip.poisson**2) * math.sqrt(tip.radius)
-    # The confinement of the rubber increases the force. The increase depends on √(d/a), the ratio
-    # of the contact radius to a.
+    # The base confines the rubber and increases the force. The increase depends on √(d/a), which is
+    # the ratio of the contact radius to a.
     ratios = [float(table(d, 0.0).force) / (stiffness * d**1.5) for d in (1e-8, 1e-7)]
     assert ratios == pytest.approx([1.0, 1.0], abs=0.01)
     end = table(0.008, 0.0)
@@ -125,8 +125,8 @@ def test_the_estimate_reaches_its_bound_for_any_shear(tip, counts):
                 assert [found.shear_x, found.shear_y] == pytest.approx(shear, rel=0.01, abs=0.1)
                 error = [found.d - d, found.tilt_x - tilt_x, found.tilt_y - tilt_y]
                 squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
-    # For 96 frames with three values each, the mean is 1 ± 0.08. The mean is larger where cells in
-    # tension carry no information.
+    # With 96 frames of three values, the mean is 1 ± 0.08. The mean is larger for contacts in which
+    # some cells are under tension and measure nothing.
     assert 0.7 < np.mean(squares) < 1.4
 
 
@@ -151,8 +151,7 @@ def test_frames_of_other_elements_are_estimated_correctly():
             error = [found.d - d, found.tilt_x - theta, found.tilt_y]
             squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
             upright += [squares[-1]] if theta == 0.0 else []
-            # At d = 0.5 mm and 1 mm, the errors are within the targets or, where the noise
-            # dominates, within the noise.
+            # The tolerance includes three standard deviations, because noise dominates at small d.
             turned = math.radians(1.5) + 3.0 * found.tilt_x_std
             assert found.d == pytest.approx(d, rel=0.05, abs=3.0 * found.d_std)
             assert math.hypot(*error[1:]) < turned
@@ -240,7 +239,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
             assert contact.d == pytest.approx(hand.d[finger], abs=5.0 * contact.d_std)
             assert contact.theta == pytest.approx(hand.theta[finger], abs=math.radians(0.3))
             assert contact.force == pytest.approx(hand.force[finger], rel=0.06)
-            # The shear force on the face causes a moment, and the base measures this moment over
+            # The base measures the moment of the shear force on the face, whose moment arm is about
             # the height a.
             shear = hand.tangential[finger] * (1.0 - hand.d[finger] / 0.020)
             assert abs(shear) > 0.2
@@ -255,7 +254,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
 
 @pytest.mark.extended
 def test_turning_back_and_forth_does_not_change_the_force_of_a_solid_tip(make):
-    """Rolling changes d with hardly any joint motion; the gain must not absorb this change."""
+    """When a tip rolls, d changes without joint motion. The estimated gain must not change."""
     daemon = make(**load(Path("solid")).model_dump(exclude={"loop"}))
     grasped(daemon, 10.0)
     daemon.loop.advance(1.0)
@@ -284,7 +283,7 @@ def test_unsuitable_profiles_of_a_solid_tip_are_refused():
 
 
 def _odd_frames() -> dict[str, np.ndarray]:
-    """Return strong signals that are impossible for a solid tip's contact."""
+    """Return frames with strong signals that no contact of a solid tip causes."""
     (pitch, _), shape = GRID.pitches, GRID.shape
     y, x = (np.indices(shape) - 0.5 * (np.array(shape)[:, None, None] - 1.0)) * pitch
     radius = np.hypot(x, y)

@@ -1,4 +1,4 @@
-"""Test the solid tip's data file and finite elements against another finite element method."""
+"""Test the data file and the finite elements of solid tips against another method."""
 
 from pathlib import Path
 
@@ -13,12 +13,12 @@ from research.solid_tip.green import Meridian
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
 REFERENCE = Path(__file__).parents[1] / "golden" / "solid_frames.npz"
 BASES = ("bonded", "lying", "bonded-sticking", "lying-sticking")
-# Pitch, number of cells, and a millimetre, in tip radii.
+# Pitch in tip radii, number of cells, and a millimetre in tip radii.
 PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0
 
 
 def centroid_and_extent(frame: NDArray[np.float64], pitch: float) -> tuple[float, float, float]:
-    """Return a frame's measured centroid along x and measured extents σ_x and σ_y."""
+    """Return the centroid of a frame along x and its extents σ_x and σ_y."""
     place = (np.arange(len(frame)) - (len(frame) - 1) / 2) * pitch
     total = frame.sum()
     x, y2 = (frame.sum(axis=0) @ place) / total, (frame.sum(axis=1) @ place**2) / total
@@ -35,9 +35,9 @@ def tips(arrays: dict[str, np.ndarray]) -> list[SolidTip]:
     return [SolidTip(arrays, base, poisson) for base in BASES for poisson in (*NU, 0.49)]
 
 
-# Values from a different method: triangles and tetrahedra with quadratic displacements and linear
-# pressures (Taylor-Hood), and a plane with a penalty at points within the faces. The tip is
-# Neo-Hookean and bonded, with ν = 0.49, a = 20 mm and E = 0.304 MPa.
+# Values from a different method, which uses Taylor-Hood triangles and tetrahedra with quadratic
+# displacements and linear pressures. A penalty at points within the faces keeps the tip outside the
+# plane. The tip is neo-Hookean and bonded, with ν = 0.49, a = 20 mm and E = 0.304 MPa.
 TAYLOR_HOOD = [  # d [mm], θ [°], N [N], tolerance
     (0.9985, 0, 2.8482, 3e-3),
     (1.9979, 0, 8.9695, 3e-3),
@@ -68,7 +68,7 @@ def test_the_extent_hardly_depends_on_the_depth(arrays, d):
 
 @pytest.mark.extended
 def test_frames_match_three_dimensional_elements(arrays):
-    """The frames come from solid_reference.py in tests/harness, which uses different meshes."""
+    """Compare with the frames of tests/harness/solid_reference.py, which uses different meshes."""
     with np.load(REFERENCE) as data:
         names = ("base", "nu", "d", "theta", "push", "energy", "force", "frame")
         rows = list(zip(*(data[name] for name in names), strict=True))

@@ -1,9 +1,9 @@
 """Test that a stop cancels all earlier requests, in any order of events and clients.
 
-Clients, gateway and loop act one at a time, in an order that Hypothesis chooses. Requests that
-libzmq has received are kept in a list, from which the gateway reads only a few at a time. When a
-stop is executed, a request may therefore wait in its connection, in the gateway, on the link, or in
-the loop.
+Clients, gateway and loop act one at a time, in an order that Hypothesis chooses. A list contains
+the requests that libzmq has received. The gateway reads only a few of these requests at a time.
+When a stop is executed, a request may therefore wait in its connection, in the gateway, on the
+link, or in the loop.
 """
 
 import math
@@ -34,8 +34,8 @@ action = st.one_of(
 class Scene:
     """Gateway, link and loop that act step by step.
 
-    Each event increments a counter. The counter value at which an ``arm`` was first sent identifies
-    this ``arm``.
+    Each event increments a counter. The value of the counter when an ``arm`` was first sent
+    identifies the ``arm``.
     """
 
     def __init__(self, folder: str) -> None:
@@ -43,12 +43,12 @@ class Scene:
         self.arrived: deque[list[zmq.Frame]] = deque()
         self.replies: list[dict[str, Any]] = []
         self.served = Served(commands=f"ipc://{folder}/c", per_second=1e6, clock=self.clock)
-        # Simulated time per message read [s], so that each step reads few messages.
+        # Simulated time for reading a message [s], which limits the messages per step.
         self.reading = 0.4 * bounds.TURN_TIME
         self.now = 0
         self.stopped_at = 0
         self.asked = 0
-        self.last: dict[int, float] = {}  # last arm request of each client, which may be sent again
+        self.last: dict[int, float] = {}  # last ``arm`` of each client, which the client may repeat
         self.carried_out: set[float] = set()
         self.busy = False
 
@@ -104,7 +104,7 @@ class Scene:
 
 @contextmanager
 def played() -> Iterator[Scene]:
-    """Yield a scene whose gateway reads and replies through the scene."""
+    """Yield a scene that replaces the socket of its gateway."""
     with TemporaryDirectory() as folder:
         scene = Scene(folder)
         with (
@@ -120,12 +120,12 @@ def test_no_request_from_before_a_stop_is_executed(actions):
     with played() as scene:
         for what, client in actions:
             scene.act(what, client)
-        for _ in range(100):  # Let the loop read all requests, including stops.
+        for _ in range(100):  # Let the loop read all requests.
             scene.act("gateway")
             scene.act("loop")
         asked = scene.asked
         assert len(scene.replies) == asked, "each request must have exactly one reply"
-        # Requests that are sent later are executed.
+        # Later requests are executed.
         scene.ask(0, command="arm", force=1e9)
         for _ in range(3):
             scene.act("gateway")
@@ -134,7 +134,7 @@ def test_no_request_from_before_a_stop_is_executed(actions):
 
 
 def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
-    """The queue is empty at times, although most earlier requests have not been delivered yet."""
+    """libzmq delivers earlier requests so slowly that the gateway's queue is empty at times."""
     with played() as scene:
         scene.reading = 1e-5
         scene.stopped_at = 2
@@ -158,7 +158,7 @@ def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
 
 
 def test_a_flood_does_not_count_as_old_forever():
-    """The number of connections limits the backlog, even if the socket is never empty."""
+    """The limit on connections limits the backlog, even if the socket is never empty."""
     with (
         patch.object(bounds, "CLIENT_COUNT_MAX", 1),
         patch.object(bounds, "SOCKET_QUEUE_LENGTH", 20),

@@ -1,4 +1,4 @@
-"""Test the publisher on a real socket: wire format, and all kinds of subscribers."""
+"""Test the publisher on a real socket, with subscribers of all kinds."""
 
 import json
 from collections.abc import Iterator
@@ -155,7 +155,7 @@ def test_late_subscribers_receive_settings_and_events_again(context, addresses, 
     publisher.settings(98.0, 0.5, HandInfo("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
-    served.settle()  # Otherwise, the subscription could arrive before the events.
+    served.settle()  # Deliver the events before the subscription.
     early = subscribe(context, addresses[0])
     told: list[tuple[bytes, dict[str, Any]]] = []
 
@@ -177,7 +177,7 @@ def test_late_subscribers_receive_settings_and_events_again(context, addresses, 
     publisher.event(200.0, 100.0, "info", "mode", "new")
     until(lambda: tick(early) == 1)
     assert not told[0][1]["again"]
-    # If a second client subscribes to a single topic, only that topic is sent again.
+    # When another client subscribes to a single topic, only this topic is sent again.
     told.clear()
     late = subscribe(context, addresses[0], b"hand/event")
     until(lambda: tick(late) == 50)
@@ -189,7 +189,7 @@ def test_a_long_message_is_sent_in_pieces_and_received_whole(context, addresses,
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorInfo(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     served.publisher.settings(98.0, 0.5, facts)
-    served.settle()  # Otherwise, the first subscriber would receive the message twice.
+    served.settle()  # Without this step, the subscriber would receive the message twice.
     socket = subscribe(context, addresses[0])
     assert receive(socket, served)[1]["settings"] == facts.settings
     served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)
@@ -198,7 +198,7 @@ def test_a_long_message_is_sent_in_pieces_and_received_whole(context, addresses,
 
 def test_commands_are_published_only_to_subscribers(context, addresses, served):
     publisher = served.publisher
-    # Without subscribers, the command is not even counted.
+    # Without subscribers, this command is neither sent nor counted.
     publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")
     socket = subscribe(context, addresses[0], b"hand/command")
     until(lambda: wanted(served, COMMAND))

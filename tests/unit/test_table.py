@@ -1,4 +1,4 @@
-"""Test contact tables: accuracy over the domain, error bound, forms, files and edge-case inputs."""
+"""Test the accuracy, error bounds, forms, files and edge cases of contact tables."""
 
 import functools
 import math
@@ -30,7 +30,7 @@ HARD = {
     "s-shaped": Material.from_points(Y, 1e5 * (Y + 0.12 * np.sin(6.0 * Y))),
     "root": Material.from_points(Y, 1e5 * Y**0.7),
 }
-# In a loop, the compiler may fuse different multiply-adds than in a function call.
+# The compiler may fuse other multiplications and additions in a loop than in a function call.
 FUSED = 1e-12
 OUTPUTS = ("force", "energy", "force_d", "force_theta", "energy_d", "energy_theta")
 
@@ -43,7 +43,7 @@ def table() -> ContactTable:
     return ContactTable.build(TIP, TABLE_I, 1e-9)
 
 
-# Maps the number of pieces to a material law and a tolerance.
+# Material law and tolerance for each number of pieces.
 SPLITS = {
     1: (TABLE_I, 1e-6),
     2: (TABLE_I, 1e-9),
@@ -57,7 +57,7 @@ def split(pieces: int) -> ContactTable:
 
 
 def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndarray) -> float:
-    """Return the maximum relative error of any output, as in Certificate; 0/0 counts as 0."""
+    """Return the maximum relative error over all outputs, as in `Certificate`; 0/0 counts as 0."""
     found = table(d, theta)
     exact = integrate(table.tip, material, d, theta, nodes=40)
     errors = []
@@ -74,7 +74,7 @@ def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndar
 def hard_points(
     radius: float, points: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return random d [m] and θ [rad], dense near the edges and corners of the domain."""
+    """Return random d [m] and θ [rad]; many points are near the edges and corners of the domain."""
     which = rng.integers(0, 9, points)
     small = 10.0 ** rng.uniform(-9.0, -0.3, points)
     least = 10.0 ** rng.uniform(-16.0, -0.3, points)
@@ -150,7 +150,7 @@ def test_symmetry_sign_and_monotonicity(table, depth, share):
 @pytest.mark.parametrize("modulus", [1.0, 1e9])
 @pytest.mark.parametrize("radius", [1e-4, 1.0])
 def test_scaling_with_radius_and_modulus(table, radius, modulus):
-    """Tip radii range from 0.1 mm to 1 m, and moduli at zero strain range from 1 Pa to 1 GPa."""
+    """Test radii from 0.1 mm to 1 m, and moduli at zero strain from 1 Pa to 1 GPa."""
     scale, share = radius / TIP.radius, Fraction(modulus) / TABLE_I.coefficients[0]
     other = Material(tuple(value * share for value in TABLE_I.coefficients))
     large = ContactTable.build(Fingertip(radius), other, 1e-9)
@@ -212,7 +212,7 @@ def test_values_outside_the_domain_are_clamped_and_flagged(table):
         for sign in (1, -1):
             c = table(0.008, sign * theta)
             assert not c.inside
-            # The test and the lookup compute the limit separately.
+            # The test's limit and the lookup's limit may differ in rounding.
             assert c.force == pytest.approx(edge.force, rel=FUSED)
             assert c.energy_theta == pytest.approx(sign * edge.energy_theta, rel=FUSED)
     for theta in (0.0, 0.1, -0.12):
@@ -234,7 +234,7 @@ def test_values_outside_the_domain_are_clamped_and_flagged(table):
 
 @pytest.fixture(scope="module")
 def forms() -> list[ContactTable]:
-    """Return the closed form, and a table for each number of pieces."""
+    """Return the closed form, and one table for each number of pieces."""
     return [ContactTable.build(TIP, CONSTANT), *map(split, SPLITS)]
 
 

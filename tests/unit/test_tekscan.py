@@ -1,4 +1,4 @@
-"""Test Tekscan-style exports: supported variants, and messages for other files."""
+"""Test the supported variants of Tekscan-style exports, and the messages for other files."""
 
 import numpy as np
 import pytest

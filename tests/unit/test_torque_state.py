@@ -1,4 +1,4 @@
-"""Test torque switching under arbitrary servo replies, and commands that may change torque."""
+"""Test how commands switch torque while servos reply arbitrarily."""
 
 import math
 
@@ -28,7 +28,7 @@ def test_a_non_finite_goal_is_a_fault_even_after_a_refused_command(make):
 
 
 def test_joints_are_held_at_their_positions_once_torque_is_on(make):
-    """While torque is being switched on, the joints may still move."""
+    """Move a joint while the daemon switches torque on."""
     daemon = make()
     daemon.loop.advance(daemon.loop.period)
     command(daemon, "arm")
@@ -40,7 +40,7 @@ def test_joints_are_held_at_their_positions_once_torque_is_on(make):
 
 
 def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
-    """All writes are lost, but the reads still succeed and keep resetting the servo watchdogs."""
+    """Lose all writes; successful reads keep resetting the watchdogs of the servos."""
     daemon = make()
     events = heard(daemon)
     command(daemon, "arm")
@@ -93,7 +93,7 @@ def test_torque_off_is_tried_repeatedly_at_exit(make):
 
 
 class Deaf:
-    """Servos that reply but ignore writes, for a number of attempts or until repaired."""
+    """Servos that reply but ignore writes, for ``tries`` attempts or until they are repaired."""
 
     def __init__(self, daemon: Daemon, tries: float = math.inf) -> None:
         self._servos = daemon.loop.torque.servos
@@ -147,7 +147,7 @@ def test_a_stall_that_trips_the_servo_watchdog_is_a_fault(make):
 def test_stop_and_disarm_always_turn_torque_off(make):
     daemon = make()
     for name, more in (("stop", {}), ("disarm", {}), ("stop", {"client": 5, "why": "smoke"})):
-        daemon.loop.torque.servos.torque_on()  # Simulate another program that switches torque on.
+        daemon.loop.torque.servos.torque_on()  # Another program switches torque on.
         assert command(daemon, name, **more)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
         assert not torque_of(daemon).any()

@@ -1,4 +1,4 @@
-"""Test that untrusted files are rejected in one line, quickly and with limited memory."""
+"""Test that untrusted files are rejected quickly, with a one-line message and little memory."""
 
 import base64
 import json
@@ -26,7 +26,7 @@ from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
 
-ROOM = 200e6  # number of additional bytes that may be mapped
+ROOM = 200e6  # bytes by which the address space may grow
 
 
 @pytest.fixture(autouse=True)
@@ -97,13 +97,13 @@ def test_a_malformed_profile_is_reported_quickly_and_briefly(tmp_path, text):
 
 
 def begin(file: IO[bytes], frames: int) -> None:
-    """Write the header of an array with the given number of frames."""
+    """Write the header of an array that contains the given number of frames."""
     shape = {"descr": "<u2", "fortran_order": False, "shape": (frames, 44, 44)}
     np.lib.format.write_array_header_1_0(file, shape)
 
 
 def claiming(path: Path) -> None:
-    """Write an array whose header states a size of 3.5 TiB."""
+    """Write a short array file whose header states a size of 3.5 TiB."""
     with path.open("wb") as file:
         begin(file, 10**9)
         file.write(bytes(100))
@@ -116,7 +116,7 @@ def holes(path: Path) -> None:
 
 
 def packed(path: Path, method: int = zipfile.ZIP_DEFLATED, *, honest: bool = True) -> None:
-    """Write an archive with 20 MB of zeros or, if not ``honest``, with a header for more data."""
+    """Write an archive with 20 MB of zeros; if not ``honest``, the header states more data."""
     with zipfile.ZipFile(path, "w", method) as archive, archive.open("frames.npy", "w") as file:
         begin(file, 5_000 if honest else 10**9)
         for _ in range(20 if honest else 1):
@@ -185,7 +185,7 @@ def head() -> bytes:
 
 
 def frame_of_zeros() -> bytes:
-    """Write a finger's frame of 4096² cells, 45 MB in base64."""
+    """Return a finger's frame of 4096² cells, which takes 45 MB in base64."""
     data = base64.b64encode(bytes(2 * 4096 * 4096)).decode()
     fields = {"finger": "left", "unix": 1e9, "rows": 4096, "cols": 4096, "data": data}
     return channel("hand/tactile/left") + message(json.dumps(fields).encode())
@@ -197,7 +197,7 @@ def recording_of_holes(path: Path) -> None:
 
 
 def chunks_of_holes(path: Path) -> None:
-    """Write 4 GB of records in chunks that are sparse except for their beginnings."""
+    """Write 4 GB of chunks as a sparse file that contains only the beginning of each chunk."""
     with path.open("wb") as file:
         file.write(head())
         for _ in range(256):
@@ -209,7 +209,7 @@ def chunks_of_holes(path: Path) -> None:
 
 
 SMALL, LARGE = message(b"{}") * 100_000, bytes(70 << 20)
-# Each value is a function that returns the content after the header or writes the whole file.
+# Functions that return the content after the header, or that write the whole file.
 BOMBS: dict[str, Callable[[], bytes] | Callable[[Path], None]] = {
     "zstd": lambda: squeezed(LARGE),
     "zstd that claims little": lambda: squeezed(LARGE, 1000),

@@ -1,4 +1,4 @@
-"""Test that a held object is brought upright without a measurement of its angle."""
+"""Test that a grip turns an object upright without measuring the object's angle."""
 
 import math
 from pathlib import Path
@@ -12,7 +12,7 @@ from softfinger.kinematics.hand.upright import upright_spring
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
-# Half the pivot distance, finger length, finger offset and tip radius.
+# half the distance of the pivots, finger length, finger offset and tip radius [m]
 LENGTHS = (0.05, 0.08, 0.0, 0.02)
 START = math.radians(5.0)
 DEPTH, FORCE = 0.0032, 10.0  # The paper's tip has this force at this depth.
@@ -20,7 +20,7 @@ spring_of = upright_spring.py_func
 
 
 def resting_ratio(spring: float) -> float:
-    """Return φ/φ0 by the closed form in `kinematics.hand.upright`, with c = 2/3."""
+    """Return φ/φ0 from the closed form in `kinematics.hand.upright` with c = 2/3."""
     half_separation, _, _, radius = LENGTHS
     inward = half_separation - radius + DEPTH - 0.5 * WIDTH
     b = spring / (FORCE * half_separation)
@@ -30,7 +30,7 @@ def resting_ratio(spring: float) -> float:
 
 
 def at_rest(spring: float) -> SimulatedHand:
-    """Close slowly to 10 N on a tilted object, with friction only at the tips."""
+    """Increase the force on a tilted object slowly to 10 N, with friction only at the tips."""
     hand = make(
         PAPER, object_angle=START, joint_friction=0.0, table_friction=0.0, joint_damping=0.1
     )
@@ -52,7 +52,7 @@ def test_sticking_tips_leave_the_object_at_the_angle_of_the_closed_form(share):
     spring = share * spring_of(q, DEPTH, FORCE, 2.0 / 3.0, LENGTHS)
     hand = at_rest(spring)
     expected = resting_ratio(spring)
-    # The closed form neglects q², which is 0.03.
+    # The closed form neglects q², which is 0.03 here.
     assert hand.object_pose[2] / START == pytest.approx(expected, abs=0.03)
     if share == 1.0:
         assert expected == pytest.approx(0.0, abs=1e-12)
@@ -95,8 +95,8 @@ def test_the_upright_law_does_not_use_the_angle(sense, angle_known, simulation):
 
 
 def test_solid_tips_bring_the_object_upright() -> None:
-    # Bonded rubber has no local minimum. The control law therefore uses a different stiffness,
-    # computed from the contact table of these tips.
+    # The energy of bonded rubber has no local minimum. The control law therefore computes another
+    # stiffness from the contact table of these tips.
     sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
     simulation = {"object_angle": START}
     with SimulatedDaemon(
@@ -110,7 +110,7 @@ def test_solid_tips_bring_the_object_upright() -> None:
 
 
 def test_late_ticks_do_not_slow_the_dither() -> None:
-    # At a quarter of its frequency, the dither would swing the object out of the grip.
+    # A dither with a quarter of the frequency would swing the object out of the grip.
     with SimulatedDaemon(
         {"control": {"law": "upright"}, "simulation": {"object_angle": START}}
     ) as hand:

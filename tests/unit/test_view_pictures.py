@@ -1,4 +1,4 @@
-"""Test viewer drawings against the model: footprints on frames, planar hand, landscape."""
+"""Test the viewer's drawings of footprints, hand and landscape against the model."""
 
 import json
 import math
@@ -52,8 +52,7 @@ def test_the_footprint_matches_the_forward_model(grid, contact):
     centroid = (pressure * cols).sum(), (pressure * rows).sum()
     outline, middle = shown
     assert middle == pytest.approx(np.array(centroid) / pressure.sum(), abs=0.05)
-    # Every loaded cell has a corner inside the outline. The cells at the ends of the outline are
-    # loaded.
+    # The outline overlaps every loaded cell, and the cells at the ends of the outline are loaded.
     pressed = np.column_stack((cols[pressure > 0.0], rows[pressure > 0.0]))
     low, high = outline.min(axis=0), outline.max(axis=0)
     assert (pressed >= low - 0.5).all()
@@ -152,7 +151,7 @@ def test_an_indented_tip_ends_at_the_face_of_the_object(finger: int) -> None:
     centre = HAND.tips(Q)[finger]
     assert -outwards @ out == pytest.approx(math.cos(theta[finger]))
     assert (middle - centre) @ outwards == pytest.approx(-(0.02 - d[finger]))
-    # The drawn force starts where the axis through the pressure centroid meets the face.
+    # The drawn force starts at the point of the face above the pressure centroid on the base.
     along = (lines.base[1] - lines.base[0]) / 0.04
     assert -outwards @ along == pytest.approx(math.sin(theta[finger]))
     foot = (lines.push[0] - centre) @ along
@@ -185,7 +184,7 @@ def test_colours_are_steps_of_the_cube_root_of_energy() -> None:
         np.minimum(root, 1.0), abs=0.6 / (LEVELS - 1.0)
     )
     assert (np.abs(theta) <= TIP.theta_limit(d) + 1e-3).all()
-    assert (shown.levels == LEVELS).any()  # The picture contains impossible contacts.
+    assert (shown.levels == LEVELS).any()  # The picture also shows contacts that are impossible.
 
 
 # Settings of the hand

@@ -1,4 +1,4 @@
-"""Test that miswired servos (wrong finger or direction) are detected before they do harm."""
+"""Test that servos with swapped IDs or wrong directions are detected before they do harm."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -17,7 +17,7 @@ from softfinger.daemon.types import State
 from softfinger.kinematics.estimation.invalid import Invalid
 from tests.harness.loop import command, heard
 
-# Sign and offset [rad] of each joint's readings.
+# Signs and offsets [rad] of the readings of both joints.
 JOINTS = {
     "reversed": ((-1.0, -1.0), (0.0, 0.0)),
     "left reversed": ((-1.0, 1.0), (0.0, 0.0)),
@@ -60,7 +60,7 @@ Make = Callable[..., Daemon]
 
 @pytest.fixture
 def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
-    """Return a function that creates armed daemons on the virtual clock with a given wiring."""
+    """Return a function that creates an armed daemon in virtual time with the given wiring."""
     with ExitStack() as stack:
 
         def make(wiring: str, **simulation: Any) -> Daemon:
@@ -82,7 +82,7 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
 
 def greatest_force(daemon: Daemon, seconds: float) -> float:
-    """Return the maximum true tip force within ``seconds``, or until a fault."""
+    """Return the maximum true tip force during ``seconds`` or until a fault."""
     greatest = 0.0
     for _ in range(round(seconds / 0.02)):
         daemon.loop.advance(0.02)
@@ -109,7 +109,7 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
 
 @pytest.mark.parametrize(("follows", "swapped"), [(0, True), (1, False)])
 def test_the_tilt_shows_whose_motion_a_tip_follows_despite_a_light_contact(follows, swapped):
-    """The right tip's contact is lost every 50 ms, and its tilt follows one joint's angle."""
+    """Tilt the right tip as one joint rotates, and interrupt the tip's contact every 50 ms."""
     watch, state = WiringWatch((0, 1)), State(mode=Mode.GRASPING)
     state.reading.valid = True
     state.contacts[0].invalid = state.contacts[1].invalid = Invalid.NONE
@@ -125,7 +125,7 @@ def test_the_tilt_shows_whose_motion_a_tip_follows_despite_a_light_contact(follo
 
 
 def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
-    # With a centred object, the approach is the same with and without swapped servos.
+    # If the object is centred, swapped servos do not change the approach.
     daemon = make("swapped")
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 2.0)

@@ -1,1 +1,1 @@
-"""Minimal backends in a separate package."""
+"""Minimal backends in a package of their own."""

@@ -6,7 +6,7 @@ from softfinger.daemon.types import Goal, Reading
 
 
 class FollowingServos:
-    """Servos without a bus or motors; the measured position is the last goal."""
+    """Servos without a bus or motors, which report the last goal as the measured angle."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._clock = clock
@@ -24,11 +24,11 @@ class FollowingServos:
         reading.valid = True
 
     def torque_on(self) -> None:
-        """Follow goals from now on."""
+        """Turn torque on, so that joints move to their goals."""
         self._on = True
 
     def torque_off(self, reading: Reading) -> bool:
-        """Ignore goals from now on."""
+        """Turn torque off, so that joints ignore their goals."""
         self._on = False
         self.read(reading)
         return True
