@@ -368,7 +368,10 @@ def _reboot_if_needed(
     model: ServoModel,
     result: list[Finding],
 ) -> None:
-    """Reboot a servo that has a hardware error or has lost a turn."""
+    """Reboot a servo that has a hardware error or has lost a turn.
+
+    The servo's limits must be corrected first.
+    """
     servo_id = settings.servos.ids[finger]
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
     table = Registers(line.read(servo_id, 0, CHECKED) or b"")
