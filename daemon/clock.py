@@ -40,7 +40,7 @@ class LoopClock(Clock, Protocol):
     behind: float  # total time by which `now` lags behind the machine's clock [s]
 
     def host(self) -> float:
-        """Return the machine's monotonic time [s] for measuring computing times and delays."""
+        """Return the machine's monotonic time [s] for measuring computation times and delays."""
 
 
 def make_clock(settings: Settings) -> LoopClock:

@@ -320,7 +320,7 @@ class SoftTips:
         solve(*law, work, self._inertial, data.qacc, data.qfrc_passive, self._own)
 
     def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
-        """Set the pressure sensors, which MuJoCo clears in each step (`mjcb_sensor`)."""
+        """Write the pressure readings, which MuJoCo clears on each step (`mjcb_sensor`)."""
         if data is self.data and stage == mujoco.mjtStage.mjSTAGE_VEL:
             is_due = data.time >= self._due
             self._due = data.time + self._period - 1e-9 if is_due else self._due

@@ -101,7 +101,7 @@ def pytest_unconfigure() -> None:
 
 @pytest.fixture(autouse=True)
 def ended_with_the_test() -> Iterator[None]:
-    """After a test, kill the test's processes, restore signal handlers and enable the collector."""
+    """Kill the test's processes, restore signal handlers and re-enable garbage collection."""
     before = descendants.running()
     handlers = {each: signal.getsignal(each) for each in _SIGNALS}
     yield

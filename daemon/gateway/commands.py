@@ -143,7 +143,7 @@ class CommandEndpoint:
 
     def _take(self, parts: list[bytes], name: str, now: float) -> None:
         """Queue or refuse one client message."""
-        # Like a REP socket, prefix the reply with the frames up to the first empty frame.
+        # Like a REP socket, prefix the reply with the request's frames up to the first empty frame.
         ends = parts.index(b"", 1) + 1 if b"" in parts[1:-1] else 1
         route, payload = parts[:ends], parts[-1]
         if sum(map(len, route)) > bounds.ENVELOPE_SIZE_MAX or len(parts) > bounds.PART_COUNT_MAX:

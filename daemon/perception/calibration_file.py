@@ -147,7 +147,7 @@ class Calibration(_StepModel):
 
     @property
     def identity(self) -> str:
-        """Sensor label and date of the file. The finger identifies a sensor without a label."""
+        """Sensor label (or finger, if there is no label) and date of the file."""
         return f"{self.sensor.label or self.sensor.finger} {self.date}"
 
     def summary(self) -> str:

@@ -478,7 +478,7 @@ def _joint_opens(view: View, state: State, _: float) -> str:
 _CURRENT_FRACTION_MAX = 0.95  # minimum fraction of the maximum current that counts as saturation
 
 
-@Limit("joint.strained", "joint that requires the maximum current in a grip", "warn",
+@Limit("joint.strained", "joint that draws the maximum current in a grip", "warn",
     ("safety.current_max",), "servos", in_turn=True, lasts=1.0).each  # fmt: skip
 def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     limit = view.limits.current_max

@@ -186,7 +186,7 @@ class Plan:
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
-    """Assign the found servos to the joints. ``rates`` are the baud rates of the search.
+    """Assign the found servos to the joints. ``rates`` are the baud rates to try.
 
     A servo that replies with the ID of a missing servo at another baud rate counts as the missing
     servo. If exactly one servo is missing and exactly one servo is unassigned, the unassigned servo

@@ -44,7 +44,8 @@ _NOISE_SIGMA_MAX = 6.0  # maximum magnitude of negative readings, in noise stand
 _CLIPPED_COUNT_MIN = 3  # minimum number of saturated cells that causes a warning
 _UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # time units other than s
 _DATE_RANGE = (1e9, 4e9)  # range of Unix times [s], 2001 to 2096
-_INTERVAL_RATIO_MAX = 100.0  # maximum ratio of actual to expected frame interval if times are in s
+# If the ratio of actual to expected frame interval is larger, the times are not in s.
+_INTERVAL_RATIO_MAX = 100.0
 _INTERVAL_RATIO_NOTED = 10.0  # ratio of actual to expected frame interval that causes a note
 
 

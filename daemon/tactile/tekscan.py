@@ -277,8 +277,8 @@ _GROUPS = str.maketrans("", "", "'\N{RIGHT SINGLE QUOTATION MARK}\N{NO-BREAK SPA
 def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
-    If both a point and a comma occur, the last one is the decimal sign, and the other character
-    groups digits. Apostrophes and narrow spaces only group digits.
+    If both a point and a comma occur, whichever comes last is the decimal separator, and the other
+    separates groups of digits. Apostrophes and narrow spaces only group digits.
     """
     text = text.translate(_GROUPS)
     if "," in text:

@@ -82,7 +82,8 @@ KINDS: dict[str, EventKind] = {
         "warning",
         "No object was grasped, or the hand is unlikely to hold an object with this size, "
         "friction and load.",
-        "Place the object between the tips; check `object.width_min` and `softfinger envelope`.",
+        "Place the object between the tips; check `object.width_min`; run `softfinger envelope` to "
+        "list the objects that the hand can hold.",
     ),
     "rotate": EventKind(
         "warning",

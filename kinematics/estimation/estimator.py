@@ -209,9 +209,10 @@ def cell_centres(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return height, x and y of the cells as flat arrays.
 
-    The height is √(a² − x² − y²) at the cell centre. For a cell centre outside the rim, the point
-    of the cell nearest to the tip centre is used. The height of unused cells is −∞. Unused cells
-    are outside the mask ``active`` [rows, cols] or farther than ``radius`` [m] from the tip centre.
+    The height is √(a² − x² − y²) at the cell centre. If this centre lies outside the rim, the point
+    of the cell that is nearest to the tip centre is used instead. The height of unused cells is −∞.
+    Unused cells are outside the mask ``active`` [rows, cols] or farther than ``radius`` [m] from
+    the tip centre.
     """
     a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
     x, y = np.meshgrid(*axes(grid))

@@ -178,7 +178,7 @@ class MeasuredEstimator:
         return t
 
     def _contact(self, sums: FloatArray, result: ContactEstimate) -> Invalid:
-        """Set the contact from the sums; check the frame extent and the range of the curves."""
+        """Compute the contact; check that the frame and the curves cover it."""
         force, along, across, square = sums.tolist()
         moment = math.hypot(along, across)
         s_max = _EXTRAPOLATION_MAX * self._tilt_sine_max

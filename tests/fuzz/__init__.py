@@ -30,7 +30,7 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
             made[at:at] = made[at : at + rng.randrange(1, 40)]
         elif kind == 5:
             del made[at:]
-        elif kind == 6:  # Insert a delimiter byte of a packet format.
+        elif kind == 6:  # Insert a byte that is a delimiter in one of the packet formats.
             made.insert(at, rng.choice((0, 1, 10, 11, 42, 43, 0x55, 0xAA, 0xFD, 254, 255)))
         elif rng.random() < 0.02:
             made[at:at] = rng.randbytes(1) * rng.choice((100, 5000, 20_000))

@@ -100,7 +100,7 @@ def test_a_hand_in_use_is_not_moved(hand, calibrate, capsys):
     client.wait_for(lambda state: state.mode == "holding", 120.0)
     try:
         assert calibrate("friction") == 1
-        assert "found the mode holding, expected disarmed or armed" in capsys.readouterr().err
+        assert "found mode holding, expected disarmed or armed" in capsys.readouterr().err
         assert client.state().mode == "holding"
     finally:
         client.stop()

@@ -30,7 +30,7 @@ REFUSED = "left:shift-x=3"  # fault after which the hand releases the object
 def running(hand: Sequence[str] = ()) -> Iterator[Rig]:
     """Yield an emulated hand and its daemon, which share a clock that tolerates a busy machine.
 
-    ``hand`` contains additional settings of the hand.
+    ``hand`` contains additional settings for the hand.
     """
     with Rig() as made:
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")

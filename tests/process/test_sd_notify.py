@@ -26,7 +26,7 @@ from tests.harness.descendants import ending
 
 
 class Manager:
-    """Socket on which the service manager would receive notifications."""
+    """Socket that replaces the notification socket of the service manager."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "notify"

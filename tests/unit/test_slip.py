@@ -152,7 +152,7 @@ GIVES_WAY = -0.024  # one velocity count [rad/s]
 
 def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     watched = at_rest()
-    # A jump without joint motion is a frame error. A load within the friction is harmless.
+    # A jump without joint motion is a frame error. A load below the friction limit is harmless.
     assert watched.run(3.0 * FRICTION, 1) == FORCE
     watched = at_rest()
     assert watched.run(0.8 * FRICTION, 1, speed=GIVES_WAY) == FORCE

@@ -177,7 +177,7 @@ def test_late_subscribers_receive_settings_and_events_again(context, addresses, 
     publisher.event(200.0, 100.0, "info", "mode", "new")
     until(lambda: tick(early) == 1)
     assert not told[0][1]["again"]
-    # When another client subscribes to a single topic, only this topic is sent again.
+    # When another client subscribes to a single topic, only that topic is resent.
     told.clear()
     late = subscribe(context, addresses[0], b"hand/event")
     until(lambda: tick(late) == 50)

@@ -8,7 +8,7 @@ Each frame has 44 × 44 cells on a 58 mm square. The contact has d = 4 mm and a 
 row gives other values. The noise is 0.2 % of the modulus. As in the control loop, the estimator is
 called from Python. Spring tips and solid tips are measured in turn. The table lists the RMS errors
 over these frames and the Cramér-Rao bound. The "sensor" rows show the errors for a profile's sensor
-after one second under the same contact.
+after one second of constant contact.
 """
 
 from __future__ import annotations

@@ -384,8 +384,8 @@ def _check_beginning(strain: FloatArray, stress: FloatArray) -> None:
     secant = stress[first[0]] / strain[first[0]]
     if secant < slope / _TOE or secant > slope * _TOE:
         raise CalibrationError(
-            f"found a modulus of {secant / 1e3:.3g} kPa up to a strain of {strain[first[0]]:.3g} "
-            f"and {slope / 1e3:.3g} kPa above this strain, which indicates a toe region or a zero "
+            f"found a modulus of {secant / 1e3:.3g} kPa below a strain of {strain[first[0]]:.3g}, "
+            f"but {slope / 1e3:.3g} kPa above this strain, which indicates a toe region or a zero "
             f"offset; expected a curve through 0: subtract {-start / slope:.3g} from the strain, "
             "and remove the points with negative strain"
         )

@@ -47,7 +47,7 @@ class LiveHand:
             stack.push(self._leave)
             mode = next(self.states()).mode
             if mode not in ("disarmed", "armed"):
-                raise CalibrationError(f"found the mode {mode}, expected disarmed or armed")
+                raise CalibrationError(f"found mode {mode}, expected disarmed or armed")
             if mode == "disarmed":
                 self.command("arm")
                 self._disarm = True

@@ -280,7 +280,7 @@ class StreamState:
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
 
     def waited(self, now: float) -> float:
-        """Return the time [s] for which a simulated hand recently waited for a busy machine."""
+        """Return how long [s] a simulated hand recently paused because the machine was busy."""
         while self._waits and self._waits[0][0] < now - RECENT_TIME:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)

@@ -241,7 +241,7 @@ class Emulator:
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Serve the ports until :meth:`end` is called.
 
-        Call ``on_ready`` as soon as each sensor has a frame.
+        Call ``on_ready`` once, as soon as all sensors have a frame.
         """
         ready = False
         while not self._stopping:
