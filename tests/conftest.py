@@ -229,7 +229,7 @@ def make() -> Iterator[Make]:
 
 @pytest.fixture
 def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set the errors of solid tip data to zero, because tests simulate frames from that data."""
+    """Set the errors of the solid-tip data to zero; the tests simulate frames from these data."""
     from softfinger.kinematics.estimation import error_budget, estimator
 
     data = estimator.solid_data

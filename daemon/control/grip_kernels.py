@@ -265,8 +265,8 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
 def _distribute(g: GripState, grasp: GraspState) -> None:
     """Equalise the tip forces if friction between the object and its support makes them unequal.
 
-    The force controller acts only on the mean tip force. To equalise the forces, both fingers move
-    sideways by a small angle. The object then rotates by at most _DISTRIBUTE_ANGLE.
+    The force controller acts only on the mean tip force. To equalise the forces, both fingers
+    rotate by a small angle in the same direction. The object then rotates by at most _DISTRIBUTE_ANGLE.
     """
     off = (
         0.5

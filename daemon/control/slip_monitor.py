@@ -227,7 +227,7 @@ def update(
     # Ignore the torques if joint friction could hide a load that is too large for the grip.
     if law.friction * commanded * grasp.load_arm <= s.friction:
         s.load = 0.0
-    if law.has_shear:  # A load above the measured shear results from a force error.
+    if law.has_shear:  # Any load beyond the measured shear is due to a force error.
         s.load = min(s.load, pull + _SHEAR_JUMP)
     if grasp.sensor_fault:
         s.load = pull = s.needed_force = 0.0

@@ -318,7 +318,7 @@ class Control:
         return None
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the grip force to ``force_max`` [N]; reach this limit within ``duration`` [s]."""
+        """Limit the force to ``force_max`` [N], reducing a larger force within ``duration`` [s]."""
         if isinstance(self.state, Gripping):
             self.grip.limit_force(force_max, duration)
             self._change(self.state)

@@ -227,7 +227,7 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     match = _WORD.fullmatch(word)
     side, kind, text, start, end = match.groups() if match else (None, "", None, None, None)
     if side is not None and side not in FINGERS:
-        raise refused(f"found the prefix {side}:, expected left: or right:")
+        raise refused(f"found the prefix '{side}:', expected 'left:' or 'right:'")
     value = None if text is None else _number(text)
     if value is not None and not math.isfinite(value):
         raise refused(f"{text!r} is not a number")

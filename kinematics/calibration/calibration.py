@@ -358,7 +358,7 @@ def fit_centre(
         )
     for k, frame in enumerate(stack):
         if not frame.max() > _PRESSED_SIGMA * noise:
-            raise CalibrationError(f"centre: press {k + 1} does not give a valid contact")
+            raise CalibrationError(f"centre: press {k + 1} did not produce a valid contact")
     used = np.broadcast_to(True if active is None else active, stack.shape)
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)

@@ -135,8 +135,8 @@ def rising(d: FloatArray) -> tuple[slice, int]:
     turns = _turning_points(d, _SLACK * span)
     if len(turns) - 2 > max(2, d.size // _TURNS):
         raise CalibrationError(
-            f"d reverses {len(turns) - 2} times in {d.size} rows, expected rows in test order: "
-            "sort the rows by time"
+            f"d changes direction {len(turns) - 2} times in {d.size} rows, expected rows in "
+            "measurement order: sort the rows by time"
         )
     top = d.max() - (1.0 - _DEEP) * span
     found = [(i, j) for i, j in itertools.pairwise(turns) if d[j] > d[i] and d[j] >= top]

@@ -13,7 +13,7 @@ from softfinger.kinematics.calibration.friction_fit import DURATION_MAX, duratio
 
 FloatArray = NDArray[np.float64]
 
-_STEP = 1e-3  # step of the time grid and of the delays that are tried first [s]
+_STEP = 1e-3  # step of the time grid, and of the first (coarse) search for the delay [s]
 _DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # range of latencies to search [s]
 # Minimum closing speed in a ramp [m/s], and averaging time of the speed [s].
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05

@@ -227,7 +227,7 @@ def widen_covariance(state: EstimatorState) -> float:
 
 @fast_inner_kernel
 def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> tuple[float, float]:
-    """Sum the products of neighbouring residuals in a row; return the sum [Pa²] and the count.
+    """Sum the products of residuals that are adjacent in a grid row; return sum [Pa²] and count.
 
     Only cells with a modelled pressure above ``lowest`` [Pa] are included.
     """

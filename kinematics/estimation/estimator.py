@@ -192,7 +192,7 @@ _RESULTS = (
     "rejected_count", "contact", "has_second_contact", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
-_TOLERANCE = 16.0  # the iteration ends below this squared ratio of step to noise floor
+_TOLERANCE = 16.0  # The iteration stops below this squared ratio of the step to the noise floor.
 # Minimum number of model points per tip radius, for linear and for nonlinear material laws. For
 # tilts up to 25° and a noise of 0.2 % of the modulus, the bias is at most a quarter of the noise
 # floor. Within 4° of the domain limit, the bias is up to four times the noise floor.

@@ -52,7 +52,7 @@ def dense(
     grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
 ) -> np.ndarray[Any, Any]:
     """Return the mean blurred pressure of each cell, from ``pieces``² samples per cell."""
-    from scipy.ndimage import gaussian_filter  # Importing SciPy takes long, and few tests need it.
+    from scipy.ndimage import gaussian_filter  # SciPy is slow to import, and few tests need it.
 
     d, tilt_x, tilt_y = contact
     axes = []

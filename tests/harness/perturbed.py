@@ -2,8 +2,8 @@
 
 ``pytest --perturb SEED`` changes the following values by -1, 0 or 1 unit in the last place:
 
-- the results of NumPy's and `math`'s elementary functions, sums and products, in modules of tests
-  and of softfinger that contain no kernels;
+- the results of elementary functions, sums and products from NumPy and `math`, in test modules and
+  in softfinger modules that contain no kernels;
 - the results of `numpy.linalg` in all modules;
 - the results of functions passed to `solve_ivp` and `curve_fit`;
 - the results of contact tables, closed forms, quadrature, material laws and pressure grids;

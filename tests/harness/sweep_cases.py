@@ -1,4 +1,4 @@
-"""Define cases for sweeps, in a module that worker processes import quickly."""
+"""Define the cases of test sweeps. Worker processes can import this module quickly."""
 
 import os
 import random

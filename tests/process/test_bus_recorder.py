@@ -17,7 +17,7 @@ UNIT = by_name("XM430-W350").current_unit
 
 
 class Hand(BusClient):
-    """Client of a configured hand; higher counts close the left and open the right finger."""
+    """Client for a configured hand; higher counts close the left finger and open the right one."""
 
     def __init__(self) -> None:
         super().__init__(hand_bus(10.0))

@@ -12,7 +12,7 @@ from softfinger.daemon.wire.schema import Event
 from tests.conftest import Addresses
 from tests.harness.daemon_process import Running
 
-STILL = 1.0  # duration of a stall [s]; watchdog time and maximum frame age are a tenth
+STILL = 1.0  # duration of a stall [s]; ten times the watchdog time and the maximum frame age
 PATIENCE = 60.0  # timeout for an event on a busy machine [s]
 
 

@@ -38,7 +38,7 @@ def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_example_meets_the_backend_interface(caplog):
     settings = load(changes=METAL)
     check_tactile(settings)
-    assert not caplog.records  # A closed board without a frame is not an error.
+    assert not caplog.records  # Closing a board before its first frame is not an error.
     check_servos(settings, torque=True)
     check_shape(load(changes=["simulation.object_shape=hexagon"]))
     found = {each.subject: each for each in doctor.results(settings, False)}

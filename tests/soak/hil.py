@@ -126,7 +126,7 @@ class Account:
 
 
 def soak(seconds: float, seed: int = 1) -> Account:
-    """Run the soak; raise RigError if the emulated hand has ended or a process does not start."""
+    """Run the soak test; raise RigError if the hand has exited or a process fails to start."""
     chance = random.Random(seed)
     account = Account()
     with Rig() as rig, ExitStack() as others:

@@ -223,7 +223,7 @@ def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, 
         (["curve", "--recording", "rest.npz"], "expected --force or --d"),
         (["curve", "--recording", "rest.npz", "--force", "1", "2"], "2 values for 1 loads"),
         (["modulus", "--recording", "rest.npz"], "expected --d"),
-        (["centre", "--recording", "rest.npz"], "press 1 does not give a valid contact"),
+        (["centre", "--recording", "rest.npz"], "press 1 did not produce a valid contact"),
         (["tare", "--recording", "none.npz"], "No such file"),
         (
             ["tare", "--recording", "rest.npz", "--finger", "right"],

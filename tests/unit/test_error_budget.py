@@ -160,7 +160,7 @@ HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")
 
 
 def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
-    """Return the mean NEES of (d, tilts) at the worst depth, without flagged frames."""
+    """Return the mean NEES of (d, tilts) at the worst depth, excluding flagged frames."""
     estimator = ContactEstimator(tip, LINEAR, grid, noise, known=known)
     rng, worst = np.random.default_rng(3), 0.0
     for d in (0.5e-3, 1e-3, 2e-3, 4e-3, 6e-3):

@@ -192,7 +192,7 @@ def test_load_from_torques_equals_the_load_on_the_tips(table, load, delta):
     rolled = 0.5 * (shear[0] + shear[1])
     found, slope = found_load(table, state, rolled)
     assert found == pytest.approx(0.5 * load, rel=0.02, abs=0.01)
-    # The slope is the ratio of a torque error to the load error.
+    # The slope is the ratio of the torque error to the load error.
     more = 1e-5  # N·m
     again, _ = found_load(table, state, rolled, more)
     assert again - found == pytest.approx(more / slope, rel=0.02)

@@ -47,7 +47,7 @@ class Report:
 
 
 def attempt(title: str, part: Callable[[], Report]) -> Report:
-    """Run one part of a measurement; after an error, return a failed report with the reason.
+    """Run one part of a measurement; on an error, return a report with the reason of the failure.
 
     The remaining parts still run after an error, e.g. if a hand loses its grip on a busy machine.
     """

@@ -386,6 +386,6 @@ def _check_beginning(strain: FloatArray, stress: FloatArray) -> None:
         raise CalibrationError(
             f"found a modulus of {secant / 1e3:.3g} kPa below a strain of {strain[first[0]]:.3g}, "
             f"but {slope / 1e3:.3g} kPa above this strain, which indicates a toe region or a zero "
-            f"offset; expected a curve through 0: subtract {-start / slope:.3g} from the strain, "
-            "and remove the points with negative strain"
+            f"offset; expected a curve through the origin: subtract {-start / slope:.3g} from the "
+            "strain, and remove the points with negative strain"
         )

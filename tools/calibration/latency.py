@@ -27,7 +27,7 @@ from softfinger.tools.recordings.recomputed import counts_of, recorded_models, r
 FloatArray = NDArray[np.float64]
 
 _STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, divided by the first force
-_HELD = 0.5  # hold time per force [s]
+_HELD = 0.5  # hold time at each force [s]
 _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
 # Accepted range for the ratio of d from frames to d from joints. A ratio outside this range means
 # that the frames do not match the motion of the joints.

@@ -360,7 +360,9 @@ def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArra
     d, theta, frames = step.loads.truths["d"], step.theta, step.loads.frames
     sensor, converter, tare = step.calibration.sensor, step.converter, step.calibration.tare
     if any((each >= sensor.full_count).any() for each in frames):
-        raise CurvesError("a press saturates a cell, so its force can't be used; reduce the load")
+        raise CurvesError(
+            "a cell saturated during a press, so the press can't be used; reduce the load"
+        )
     seen = [np.stack([converter(frame).copy() for frame in each]) for each in frames]
     pressures = np.stack([converter.pressure(each) for each in step.over])
     rest = converter.pressure((tare.excess if tare else 0.0) * converter.gain)

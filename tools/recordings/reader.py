@@ -90,7 +90,7 @@ class Recording:
     ``end`` (Unix times [s]). In an empty recording, ``start`` and ``end`` are NaN. If the summary
     is incomplete, or if the file contains other programs' channels, the whole file is read once
     instead. ``truncated`` is True if the end of the file is missing, for example because the
-    recorder was killed. Corrupted chunks are skipped. Messages in other programs' channels are
+    recorder was killed. Corrupted chunks are skipped. Messages on other programs' channels are
     ignored and counted in ``others``. ``say`` is called once for each kind of problem found.
     """
 

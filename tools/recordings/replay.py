@@ -145,7 +145,9 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     if not result.differences:
         print("all states are bit-identical")
         return 0
-    print(f"{'field':24} {'differ':>8} {'first tick':>10}  recorded → recomputed; worst")
+    print(
+        f"{'field':24} {'differ':>8} {'first tick':>10}  recorded → recomputed; largest difference"
+    )
     for name, each in result.differences.items():
         line = f"{name:24} {each.count:8} {each.first_tick:10}  {each.recorded} → {each.recomputed}"
         print(line + (f"; {each.worst:.3g} at tick {each.worst_tick}" if each.worst else ""))

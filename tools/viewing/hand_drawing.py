@@ -204,7 +204,7 @@ def footprint(
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return a contact's closed outline [n, 2] and centroid [2] in picture coordinates.
 
-    ``radius`` and ``d`` are in m. The tilts are in rad, in the finger's axes. Returns None if the
+    ``radius`` and ``d`` are in m. The tilts about the finger's axes are in rad. Returns None if the
     values do not describe a contact.
     """
     if not 0.0 < d < radius or not math.isfinite(tilt_x) or not math.isfinite(tilt_y):

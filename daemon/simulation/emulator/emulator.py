@@ -51,7 +51,7 @@ _STEP = 0.002  # maximum interval between physics updates [s]
 _REQUESTS = ("report", "forget", "place")  # words that are requests instead of faults
 # Joint goals [rad]. A goal of 6 rad lies beyond the joint stops.
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
-_TURN_CURRENT = 0.3  # motor current that simulates a hand turning a joint [A]
+_TURN_CURRENT = 0.3  # motor current that simulates a person turning a joint [A]
 _TURN_TIME = 1.0  # s
 _STALL_TIME = 0.05  # maximum time that one call adds to the hand's clock [s]
 # Maximum lead of the hand's clock over the daemon's clock [s].
@@ -178,7 +178,7 @@ class Emulator:
         self._boards: dict[str, TactileBoard] = {}
         self._sources: dict[str, SimulatedTactile] = {}
         self._plates: dict[str, Plate] = {}
-        self._turned = 0.0  # time at which the last joint rotation by hand ends
+        self._turned = 0.0  # time at which the last manual joint rotation ends
         self._tell = tell
         self._advance_due = 0.0
         try:

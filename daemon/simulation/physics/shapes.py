@@ -28,7 +28,7 @@ class Shape:
     """Outline of an object whose centre of mass is at the origin. Lengths are in m."""
 
     kind: int  # shape constant from plant_state
-    corners: FloatArray  # in counter-clockwise order [n, 2]; a disc has its bounding square
+    corners: FloatArray  # counter-clockwise [n, 2]; for a disc, corners of the bounding square
     roundness: float  # radius of a disc, or 0 for other shapes
     gyration: float  # radius of gyration
     mean_radius: float  # mean distance of the shape's points from the centre

@@ -140,7 +140,7 @@ class SensorModel:
         """Apply the contact at time ``t`` to the cells, but do not read the cells.
 
         ``curvature`` [1/m] is the curvature of the face in the plane of ``tilt_x``, or 0 for a
-        plane face. A curved face is a cylinder whose axis is parallel to the finger's y axis. All
+        flat face. A curved face is a cylinder whose axis is parallel to the finger's y axis. All
         pressures are multiplied by ``fraction``. A solid tip ignores ``curvature``, because
         ``fraction`` already includes its effect. The frame of a solid tip also depends on the
         ``shear`` force [N], which acts along x at height a.
