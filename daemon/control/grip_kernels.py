@@ -266,7 +266,8 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
     """Equalise the tip forces if friction between the object and its support makes them unequal.
 
     The force controller acts only on the mean tip force. To equalise the forces, both fingers
-    rotate by a small angle in the same direction. The object then rotates by at most _DISTRIBUTE_ANGLE.
+    rotate by a small angle in the same direction. The object then rotates by at most
+    _DISTRIBUTE_ANGLE.
     """
     off = (
         0.5

@@ -111,7 +111,7 @@ class GripUnderLoad:
         speed: float = 0.0,
         sense: float = 1.0,
     ) -> float:
-        """Run ``ticks`` under a load while joints close at ``speed``, and return the goal force [N].
+        """Run ``ticks`` under a load; return the goal force [N]. The joints close at ``speed``.
 
         ``sense`` is the ratio of the right joint's values to the left joint's values. The ratio is
         -1 for a twist.
