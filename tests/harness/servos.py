@@ -12,6 +12,7 @@ from typing import Any
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort
@@ -54,6 +55,11 @@ def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
     backend = DynamixelServos(backend_settings(bus.port, **servos), RealClock())
     backend.connect()
     return backend
+
+
+def lasting_notices(backend: DynamixelServos) -> list[Finding]:
+    """Return the notices of `connect`, excluding those about slow replies on a busy machine."""
+    return [each for each in backend.notices if "ticks will be late" not in each.text]
 
 
 class BusClient:

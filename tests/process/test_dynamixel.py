@@ -16,7 +16,7 @@ from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
 from tests.conftest import until
-from tests.harness.servos import RADIAN, backend_settings, make_bus
+from tests.harness.servos import RADIAN, backend_settings, lasting_notices, make_bus
 
 FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fast sync read"])
 
@@ -53,7 +53,9 @@ def test_readings_match_the_servos(running, firmware, connect):
     assert reading.alert == 0
     # The direction is +1 for the left joint and −1 for the right joint.
     assert reading.q == pytest.approx([100 * RADIAN, 50 * RADIAN])
-    assert [bool(n) for n in map(str, backend.notices)] == [True] * (2 if firmware == 44 else 0)
+    assert [bool(each.text) for each in lasting_notices(backend)] == [True] * (
+        2 if firmware == 44 else 0
+    )
 
 
 def test_torque_on_starts_at_the_current_position(bus, connect):

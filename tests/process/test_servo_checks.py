@@ -24,7 +24,7 @@ from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import Goal, Reading
 from tests.conftest import until
-from tests.harness.servos import RunningBus, backend_settings, connected
+from tests.harness.servos import RunningBus, backend_settings, connected, lasting_notices
 from tests.process.conftest import Connect
 
 
@@ -181,7 +181,7 @@ def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     backend = connected(bus, model="XL330-M288")
     constant = "control.torque_constant is 1.78 N·m/A, but the servo's data sheet states 0.354"
     gears = "gear friction consumes 25% of the transmitted torque, so a grip may never settle"
-    assert [each.text for each in backend.notices] == 2 * [constant, gears]
+    assert [each.text for each in lasting_notices(backend)] == 2 * [constant, gears]
     backend.close()
     for name in ("hil", "small"):  # The servos in these profiles are strong enough.
         settings = load(find(Path(name)), Path("/tmp"))
@@ -199,7 +199,7 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     assert refusal(bus.port, reply_timeout=0.004)[0] == f"{bus.port} latency timer: {text}: {fix}"
     backend = connected(bus)  # The reply timeout is longer than the latency timer.
-    assert (backend.notices[0].text, backend.notices[0].fix) == (text, fix)
+    assert [(each.text, each.fix) for each in lasting_notices(backend)] == [(text, fix)]
     backend.close()
     # If a port has a low-latency mode, the driver sets the timer to 1 ms.
     asked = []
@@ -211,7 +211,7 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     monkeypatch.setattr(serial.Serial, "set_low_latency_mode", low)
     backend = connected(bus)
     assert asked == [True]
-    assert backend.notices == ()
+    assert lasting_notices(backend) == []
     backend.close()
     place.write_text("nonsense")
     assert "can't be read" in checks.check_latency_timer(bus.port, 1.0).text
