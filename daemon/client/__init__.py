@@ -12,5 +12,6 @@
         for state in hand.stream():
             ...
 
-`AsyncHand` is the asyncio version. A client needs only the daemon's two addresses.
+`AsyncHand` is the asyncio version. To connect, a client needs only the daemon's stream address and
+command address.
 """

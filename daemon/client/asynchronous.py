@@ -81,7 +81,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return await self._states.next(self.timeout if timeout is None else timeout)
 
     def stream(self, timeout: float | None = None) -> AsyncSubscription[HandState]:
-        """Subscribe to all published states, in order."""
+        """Subscribe to all states that the daemon publishes."""
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> AsyncSubscription[TactileFrame]:
@@ -97,7 +97,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return AsyncSubscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     async def collect(self, seconds: float) -> list[HandState]:
-        """Collect all states for ``seconds``, measured by the daemon's clock. Raises NoStream."""
+        """Collect all states for ``seconds``, timed by the daemon's clock. Raises NoStream."""
         async with self.stream(self.timeout) as states:
             collected = [await anext(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)

@@ -1,4 +1,4 @@
-"""Send commands to a daemon with the general `send` function or the methods of `HandClient`."""
+"""Send commands to a daemon, either with `send` or with the methods of `HandClient`."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Attempts:
 def _now() -> float:
     """Return the monotonic time [s].
 
-    On Linux, the clock also counts the time during which the computer is suspended.
+    On Linux, the time includes periods in which the computer is suspended.
     """
     return time.clock_gettime(_CLOCK) if _CLOCK is not None else time.monotonic()
 
@@ -87,11 +87,11 @@ def send(
 ) -> dict[str, Any]:
     """Send one command and return the reply. Raises NoAnswer if no reply arrives in time.
 
-    If the daemon refuses the command because it is late, the client sends the command again until
-    ``timeout`` expires. If the reply takes longer than 1 s, a warning is logged. If no logging
-    handler exists, the warning is printed to standard error. If the daemon runs on this machine
-    under the same user account, ``stop`` is sent over a local socket. The local socket bypasses the
-    queues of other clients.
+    If the daemon refuses a late command, the client sends the command again until ``timeout``
+    expires. If the reply takes longer than 1 s, a warning is logged. If no logging handler exists,
+    the warning is printed to standard error. If the daemon runs on this machine under the same user
+    account, ``stop`` is sent over a local socket. A stop on the local socket does not wait for the
+    commands of other clients.
     """
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
@@ -158,7 +158,7 @@ def _number(what: str, value: Any) -> float:
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """Return the reply without ``ok``. Raises Refused if the daemon refused the command.
+    """Return the reply without its ``ok`` field. Raises Refused if the daemon refused the command.
 
     A warning is logged if the servos have not confirmed that torque is off.
     """
@@ -171,7 +171,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_done(command: str, status: dict[str, Any]) -> bool:
-    """Return True if the hand is already in the state that a refused command would produce."""
+    """Return True if the hand is already in the state that ``command`` would produce."""
     mode = status.get("mode", "fault")
     if command == "arm":
         return mode not in ("disarmed", "fault")
@@ -184,9 +184,9 @@ class HandClient(Generic[_Done]):
     """Base class of `Hand` and `AsyncHand`; stores the addresses and defines the commands.
 
     A command method raises Refused if the daemon refuses the command, and NoAnswer if the daemon
-    does not reply. If the daemon refuses a command because it is late, the client sends the command
-    again until ``timeout`` expires. ``arm``, ``disarm``, ``clear`` and ``release`` may be repeated.
-    For example, arming an armed hand is not an error.
+    does not reply. If the daemon refuses a late command, the client sends the command again until
+    ``timeout`` expires. ``arm``, ``disarm``, ``clear`` and ``release`` may be repeated. For
+    example, arming an armed hand is not an error.
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context
@@ -272,8 +272,9 @@ class HandClient(Generic[_Done]):
         """Send one setpoint; call this method repeatedly, for example at 50 to 100 Hz.
 
         Pass the ``force`` [N] per tip, the object ``angle`` [rad], or both. If the hand is not
-        gripping yet, the first setpoint starts a grasp. The angle is limited to the range of this
-        grip. The angular rate is limited to ``control.rotate_speed``.
+        gripping yet, the first setpoint starts a grasp. The daemon limits the angle to the range
+        that this grip can reach. The daemon limits the rate of rotation to
+        ``control.rotate_speed``.
         """
         return self._carry_out("hold", force=force, angle=angle)
 
@@ -282,7 +283,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("release")
 
     def set(self, **numbers: float) -> _Done:
-        """Set a grip property: ``compliance`` [rad/(N·m)]."""
+        """Set the grip's rotational ``compliance`` [rad/(N·m)]."""
         return self._carry_out("set", **numbers)
 
     def stop(self) -> _Done:

@@ -15,17 +15,17 @@ from softfinger.daemon.errors import SettingsError, WrongThread
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
 REPLY_TIMEOUT = 5.0  # default timeout for a reply or the first message [s]
-SILENCE_TIME = 1.0  # waiting time before a warning is logged [s]
+SILENCE_TIME = 1.0  # time without a message before a warning is logged [s]
 
 _QUEUE_LENGTH = 100_000  # maximum number of messages queued for a slow program
-# Maximum message size [bytes]. A frame of the largest grid has 131 kB.
+# Maximum message size [bytes]. A tactile frame with the largest grid is 131 kB.
 _MESSAGE_SIZE_MAX = 4_000_000
 
 
 def default_addresses() -> tuple[str, str]:
-    """Return the addresses in SOFTFINGER_ADDRESS, or the default addresses on this machine.
+    """Return the addresses from SOFTFINGER_ADDRESS if the variable is set, otherwise the defaults.
 
-    Raises SettingsError like :func:`both_addresses`.
+    Raises SettingsError if the variable is malformed.
     """
     named = os.environ.get("SOFTFINGER_ADDRESS", "").strip()
     if not named:
@@ -34,11 +34,11 @@ def default_addresses() -> tuple[str, str]:
 
 
 def both_addresses(named: str, where: str) -> tuple[str, str]:
-    """Parse a string into the stream and command addresses.
+    """Parse ``named`` into the stream address and the command address.
 
-    The string is either ``tcp://HOST``, which implies the default ports, or both addresses
-    separated by a comma. Raises SettingsError if the string has any other form. The message begins
-    with ``where``.
+    The string ``tcp://HOST`` selects the default ports. Otherwise, ``named`` contains both
+    addresses, separated by a comma. Raises SettingsError if the string has any other form. The
+    error message begins with ``where``.
     """
     addresses = [part.strip() for part in named.split(",")]
     if is_host(named):
@@ -63,7 +63,7 @@ def is_host(named: str) -> bool:
 def require_host(address: str) -> None:
     """Raise SettingsError if this machine cannot resolve the host name of a TCP address.
 
-    If the host is unknown, ZeroMQ does not report an error but retries forever.
+    If the host is unknown, ZeroMQ reports no error and keeps trying to connect.
     """
     if not address.startswith("tcp://"):
         return
@@ -137,7 +137,7 @@ def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
 
 
 def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
-    """Unpack a stream message into its topic and map. Raises ValueError for an invalid message."""
+    """Unpack a stream message into a topic and a dict. Raises ValueError for an invalid message."""
     try:
         topic, packed = frames
         message = msgpack.unpackb(packed)
@@ -149,5 +149,5 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
 
 
 def still_waiting(what: str, timeout: float) -> str:
-    """Return the text of the warning to log while a client waits for data."""
+    """Return the text of the warning that is logged while a client waits for data."""
     return f"no {what} yet; waiting up to {round(timeout, 2):g} s"

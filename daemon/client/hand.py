@@ -55,7 +55,7 @@ class Subscription(Subscriber[_Record]):
 
 
 class Hand(HandClient[None]):
-    """Client of one hand. Create one `Hand` in each thread.
+    """Client for one hand. Create a separate `Hand` in each thread.
 
     Commands may be sent from any thread. The methods `state`, `stream`, `frames`, `events`,
     `collect` and `wait_for` read the stream. The first thread that calls one of these methods owns
@@ -101,7 +101,7 @@ class Hand(HandClient[None]):
         return self._states.next(self.timeout if timeout is None else timeout)
 
     def stream(self, timeout: float | None = None) -> Subscription[HandState]:
-        """Subscribe to all published states, in order."""
+        """Subscribe to all states that the daemon publishes."""
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> Subscription[TactileFrame]:
@@ -117,7 +117,7 @@ class Hand(HandClient[None]):
         return Subscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     def collect(self, seconds: float) -> list[HandState]:
-        """Collect all states for ``seconds``, measured by the daemon's clock. Raises NoStream."""
+        """Collect all states for ``seconds``, timed by the daemon's clock. Raises NoStream."""
         with self.stream(self.timeout) as states:
             collected = [next(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)

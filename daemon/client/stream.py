@@ -1,7 +1,8 @@
-"""Read the stream: decode messages into records, count lost messages, and wait for a state.
+"""Decode stream messages into records, count lost messages, and wait for states.
 
-Messages are untrusted input. Fields that are missing or have the wrong type become NaN, 0, False or
-empty. Unknown fields are ignored, so a program still works if the daemon uses a newer schema.
+Messages are untrusted input. A missing field, or a field of the wrong type, becomes NaN, 0, False
+or an empty value. Unknown fields are ignored, so a program still works if the daemon uses a newer
+schema.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ __all__ = ["read", "to_columns"]
 
 _Record = TypeVar("_Record")
 
-_STORED_MESSAGE_COUNT = 1000  # number of stored message numbers, used to detect repetitions
+_STORED_MESSAGE_COUNT = 1000  # number of message numbers stored to detect repetitions
 
 _log = logging.getLogger(__name__)
 
 
 def read(record: type[_Record], message: object) -> _Record:
-    """Convert a message, given as a map, to a `wire.schema` record.
+    """Convert a decoded message to a record from `wire.schema`.
 
     Raises ValueError if the data size of a tactile frame does not match its grid.
     """
@@ -73,8 +74,8 @@ _CONVERTERS: dict[Any, Callable[[object], Any]] = {
 def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
     """Convert states to one array per field; nested fields have names such as ``left.force``.
 
-    The result can be passed to ``pandas.DataFrame``. Records of other topics can be converted in
-    the same way.
+    The result can be passed to ``pandas.DataFrame``. The function also converts records of other
+    topics.
     """
     rows = list(states)
     names = [field.name for field in fields_of(type(rows[0]) if rows else HandState)]
@@ -82,12 +83,12 @@ def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
 
 
 class Gaps:
-    """Counter of the lost messages of one topic.
+    """Counter for lost messages on one topic.
 
     A message is identified by its ``number``. A message without ``number`` is identified by ``seq``
-    divided by ``seq_step``. If the number decreases, no loss is counted, because the daemon has
-    restarted or a second daemon is running. If the first copy of a message was lost, a repeated
-    copy (``again``) fills the gap.
+    divided by ``seq_step``. If the number decreases, no loss is counted, because either the daemon
+    has restarted or a second daemon is running. If a copy marked ``again`` replaces a lost message,
+    the count decreases by 1.
     """
 
     def __init__(self) -> None:
@@ -123,7 +124,7 @@ class Gaps:
 
 
 def no_stream(address: str, topic: bytes, timeout: float) -> NoStream:
-    """Return the exception to raise if no message of a topic arrives."""
+    """Return the exception to raise if no message arrives on a topic."""
     return NoStream(
         f"no {topic.decode()} from {address} within {timeout:g} s; is softfinger running?"
     )
