@@ -1,8 +1,8 @@
-"""Look up whether the simulated hand can hold an object of given size, friction and mass.
+"""Look up whether the simulated hand can hold an object of a given size, friction and mass.
 
 `softfinger envelope --keep` creates a map of the objects that the hand can hold. The `grasp`
-command uses the map for warnings. A map is valid only for the hand that was simulated; the packaged
-map is valid for the built-in hand.
+command uses the map to warn about grasps that may fail. A map is valid only for the hand that was
+simulated. The packaged map was simulated with the built-in hand.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ def identity(settings: Settings) -> dict[str, Any]:
 
 
 def increased_force_limit(settings: Settings, force: float) -> float:
-    """Return the maximum grip force [N] after slip, given the commanded ``force`` [N]."""
+    """Return the highest force [N] to which the slip monitor can increase ``force`` [N]."""
     control, force_max = settings.control, GRIP_FRACTION * settings.safety.force_max
     increase = min(control.grip_raise_max, control.grip_raise_share * force)
     return max(min(force + increase, force_max), force)
 
 
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
-    """Describe the first setting that differs between map and hand; return "" if none differs.
+    """Describe the first setting in which the map and the hand differ; return "" if they agree.
 
-    If an old map lacks a setting, the default of the setting is used.
+    If an old map lacks a setting, the setting's default is used.
     """
     defaults = identity(Settings())
     for name, section in expected.items():
@@ -56,7 +56,7 @@ def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
 
 
 class Envelope:
-    """Map of simulated grasps, reduced to the object in the settings."""
+    """Map of simulated grasps for the object size and the tip friction in the settings."""
 
     def __init__(self, settings: Settings) -> None:
         """Read the map named in the settings.
@@ -96,10 +96,10 @@ class Envelope:
     def warning(self, force: float) -> str:
         """Return a warning if a grasp with ``force`` [N] may fail; otherwise, return "".
 
-        The lookup uses the object size that is nearest to `object.width`. The friction coefficient
-        is the highest one that does not exceed `control.tip_friction`. The mass is calculated from
-        `control.object_load` and then multiplied by the ratio of the map's force limit to the force
-        limit of this grip.
+        The map contains several object sizes. The lookup uses the size nearest to `object.width`.
+        The map also contains several friction coefficients. The lookup uses the highest coefficient
+        up to `control.tip_friction`. The mass is calculated from `control.object_load`. It is then
+        scaled by the ratio (force limit in the map)/(force limit of this grip).
         """
         if not self._is_valid:
             return ""

@@ -1,4 +1,4 @@
-"""Give the control state machine access to the fingers' contacts and joint goals."""
+"""Read the fingers' contacts and set the joint goals for the control state machine."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Goal, State
 
-# Distance from the current angle to the goal angle of a torque-controlled joint [rad]. The distance
-# must be at least 0.25 rad, so that the current limit determines the torque (see `hand_estimator`).
-# The distance is smaller than `safety.goal_reach`, so the goal may jump from one side of the joint
-# angle to the other.
+# Distance from the joint angle to the goal angle under torque control [rad]. If the distance is at
+# least 0.25 rad, the motor current limit determines the torque (see `hand_estimator`). The distance
+# is smaller than `safety.goal_reach`, so the goal may jump from one side of the joint angle to the
+# other.
 _GOAL_OFFSET = 0.35
 # Margin between the maximum tilt during a rotation and the tilt that triggers a fault [rad].
 _TILT_RESERVE = 0.1
@@ -52,9 +52,9 @@ class Fingers:
     def turning_range(self) -> tuple[float, float]:
         """Return the minimum and maximum angle [rad] to which this grip can rotate the object.
 
-        When the object rotates by φ, each joint moves by ψ. The angle ψ is φ divided by the sum of
-        the two rotation Jacobians. The tilt of each tip then changes by φ + ψ. The joint and tilt
-        limits determine the range.
+        When the object rotates by φ, each joint rotates by ψ = φ/(r1 + r2). The factors r1 and r2
+        are in `GraspState.jacobian_rotation`. The tilt of each tip then changes by φ + ψ. The joint
+        and tilt limits determine the range.
         """
         settings, present_angle = self._settings, self.pose.angle
         rotation = self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1]
@@ -81,19 +81,19 @@ class Fingers:
     # Setpoints
 
     def hold_here(self) -> None:
-        """Set all setpoints to the current joint angles and their speeds to zero."""
+        """Set all setpoints to the present joint angles, and set the setpoint speeds to zero."""
         for index, q in enumerate(self.reading.q):
             self._setpoints[index].reset(q)
 
     def set_target(self, index: int, q: float) -> None:
-        """Set the target of one joint's setpoint to ``q`` [rad]."""
+        """Set the setpoint target of one joint to ``q`` [rad]."""
         self._setpoints[index].target = q
 
     def close_fingers(self, touching: set[int]) -> set[int]:
-        """Close the fingers that are not in contact; return the fingers in contact.
+        """Close the fingers that are not in contact; return the indices of the fingers in contact.
 
         ``touching`` is the set that this function returned on the previous tick. A finger that has
-        just come into contact stops at its current angle.
+        just come into contact stops at its present angle.
         """
         law, now_touching = self._settings.control, set[int]()
         for index in self.indices:
@@ -107,7 +107,7 @@ class Fingers:
         return now_touching
 
     def advance_setpoints(self, rate: float) -> bool:
-        """Advance setpoints at up to ``rate`` [rad/s]; return True once all targets are reached."""
+        """Advance the setpoints at up to ``rate`` [rad/s]; return True if all have arrived."""
         arrived = [joint.step(rate) for joint in self._setpoints]
         return all(arrived)
 
@@ -119,13 +119,13 @@ class Fingers:
     # Goals
 
     def follow_setpoints(self, goal: Goal, current: float) -> None:
-        """Set goals so that the joints follow their setpoints; ``current`` [A] is the limit."""
+        """Set goals so that the joints follow their setpoints with at most ``current`` [A]."""
         for index in self.indices:
             goal.q[index] = self._setpoints[index].value
             goal.current[index] = current
 
     def apply_torques(self, goal: Goal, torques: tuple[float, float]) -> None:
-        """Set goals for joint ``torques`` [N·m]; positive torques close the fingers."""
+        """Set goals that produce joint ``torques`` [N·m]; positive torques close the fingers."""
         for index in self.indices:
             current = torques[index] / self._settings.control.torque_constant
             goal.q[index] = self.reading.q[index] + math.copysign(_GOAL_OFFSET, current)

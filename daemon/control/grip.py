@@ -1,28 +1,27 @@
 """Compute the joint torques of a grip from the tip forces and the object angle.
 
-`control.grip_kernels` contains the computations. Two fingers can make two motions. If both fingers
+`control.grip_kernels` contains the computations. Two fingers can move in two ways. If both fingers
 close, the grip force changes. If one finger closes and the other opens (q1 + δ, q2 − δ), the object
 moves. Every control law therefore has two parts:
 
-1. The *grip* part controls the force. It adds a feed-forward torque (moment arm × target force +
-   joint friction), feedback of the force error (proportional and integral), and damping that is
-   matched to the tip stiffness.
+1. The *grip* part controls the force. The feed-forward torque is moment arm × target force + joint
+   friction. A PI controller corrects the force error. The damping is matched to the tip stiffness.
 2. The *steering* part controls the object angle. It is the serial two-phased controller from the
-   soft-fingertip literature. The integral of the angle error is added to the goal of one joint and
-   subtracted from the goal of the other joint. A PD controller makes the joints follow their goals.
-   The object rotates at φ̇ = r1 q̇1 − r2 q̇2 (`GraspState.jacobian_rotation`).
+   literature on soft fingertips. The integral of the angle error is added to the goal of one joint
+   and subtracted from the goal of the other joint. A PD controller makes the joints follow their
+   goals. The object rotates at φ̇ = r1 q̇1 − r2 q̇2 (`GraspState.jacobian_rotation`).
 
-If ``control.law`` is ``"energy"``, each moment arm is the derivative of the contact table's energy
-with respect to a joint angle. The tips are assumed to roll. The moment arms therefore account for
-the moments and shear forces of the tips.
+If ``control.law`` is ``"energy"``, the moment arms are computed from the gradient of the tips'
+elastic energy. The contact table stores the elastic energy. The computation assumes that the tips
+roll, so the moment arms include the effect of moments and shear forces at the tips.
 
-If ``control.law`` is ``"upright"``, the control law ignores the object angle until a command steers
-the object. The upright law applies the same torque and the same damping to both joints, as in the
-literature on blind grasping. A virtual spring acts between the fingers (`hand.upright`). The spring
-moves the minimum of the tips' elastic energy to the upright object pose, regardless of residual
+If ``control.law`` is ``"upright"``, the control law ignores the object angle until a command sets a
+target angle. The upright law applies the same torque and the same damping to both joints, as in the
+literature on blind grasping. A virtual spring acts between the fingers (`hand.upright`). With the
+spring, the elastic energy of the tips is lowest when the object is upright, whatever the residual
 shear in the tips. Antisymmetric dither overcomes the joint friction until the object is upright.
-Afterwards, the control law holds the antisymmetric joint angle. Once a command steers the object,
-the moment arm is the distance from the pivot to the line of action of the force.
+The control law then holds the antisymmetric joint angle. After a command has set a target angle,
+each moment arm is the distance from the pivot to the line of action of the force.
 """
 
 from __future__ import annotations
@@ -98,14 +97,14 @@ class Grip:
 
     @property
     def is_dithering(self) -> bool:
-        """True while the dither that brings the object upright is running or pending."""
+        """True while dither moves the object upright, or while the dither has not started yet."""
         state = self._state
         awaited = state.law.is_blind and self._single_finger is None and not state.is_steering
         return awaited and state.dither_elapsed < state.law.dither_time
 
     @property
     def stopping_ratio(self) -> float:
-        """Smallest possible stop angle relative to the current angle; 0 unless |angle| rises."""
+        """Smallest possible stop angle divided by the angle, or 0 if |angle| is not rising."""
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
             return 0.0
@@ -113,7 +112,7 @@ class Grip:
 
     @property
     def is_turning(self) -> bool:
-        """True while the setpoint of the object angle has not reached its target."""
+        """True while the setpoint of the object angle is moving to its target."""
         return self._state.is_steering and self.angle.value != self.target_angle
 
     def start(self, measured: float, force: float) -> None:
@@ -140,13 +139,13 @@ class Grip:
         self._state.force_rate = change / self._control.force_time
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the force to ``force_max`` [N], reducing a larger force within ``duration`` [s]."""
+        """Limit the force to ``force_max`` [N]; reduce a larger force within ``duration`` [s]."""
         self.commanded_max = force_max
         self.retarget(force_max)
         self._state.force_rate = abs(self.force.value - force_max) / duration
 
     def force_for_load(self) -> float:
-        """Return the force [N] that the load requires, including slip margin and hidden load."""
+        """Return the force [N] that the load requires, with the slip margin and hidden load."""
         law, grasp = self.slip.law, self._grasp
         load = self.slip.assumed_load
         if not law.has_shear and law.object_load == 0.0:  # Joint friction may hide a load.
@@ -161,7 +160,7 @@ class Grip:
         self._state.is_steering = True
 
     def set_joint_stiffness(self, joint_stiffness: float) -> None:
-        """Set the antisymmetric joint stiffness [N·m/rad] without a step in the torques."""
+        """Set the antisymmetric joint stiffness [N·m/rad] without a jump in the joint torques."""
         state, (q1, q2) = self._state, self._grasp.q
         present = 0.5 * (q1 - q2)
         ratio = state.joint_stiffness / joint_stiffness
@@ -192,7 +191,7 @@ class Grip:
         )
 
     def hold_goal(self, reading: Reading) -> tuple[float, float]:
-        """Return joint torques [N·m] that hold the force and end a rotation while frames are late.
+        """Return joint torques [N·m] that hold the force and stop a rotation if frames are late.
 
         Joint readings are still available, so damping and steering continue. With constant torques,
         the object would continue to rotate.

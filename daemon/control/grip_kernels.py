@@ -1,7 +1,7 @@
 """Define the state and the kernels of the grip control laws; see `control.grip`.
 
-Kernels that Python calls take the controller state, the grasp state of this tick, and the averaging
-windows of both setpoints. Pairs are (left, right). All quantities are in SI units.
+The kernels receive the controller state, the grasp state of this tick, and the averaging windows of
+the setpoints. Pairs are ordered (left, right). All quantities are in SI units.
 """
 
 from __future__ import annotations
@@ -68,11 +68,11 @@ class GripState(Record):
     joint_stiffness: float  # [N·m/rad]
     is_steering: bool  # True if a target has been set for the object angle
     integral: float  # [N]
-    grip_force: float  # sum of feed-forward and feedback [N]
+    grip_force: float  # sum of feed-forward and feedback force [N]
     offset_rate: float  # rate of change of `offset` [rad/s]
     offset: float  # goal for (q1 − q2)/2 [rad]
     dither_elapsed: float  # time since the dither began [s]
-    last_time: float  # time of the last tick with equal joint torques, or of the start [s]
+    last_time: float  # time of the last call of `_equal_torques` or `start` [s]
     balance_offset: float  # part of `offset` that equalises the tip forces [rad]
     closing_friction: float  # fraction of the joint friction that is compensated during closing
     torque: Pair  # most recent torques of both joints [N·m]
@@ -152,7 +152,7 @@ def grip_torques(
 def hold_goal(
     grips: Records[GripState], grasps: Records[GraspState], dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return joint torques [N·m] that hold the force and end a rotation while frames are late.
+    """Return joint torques [N·m] that hold the force and stop a rotation if frames are late.
 
     Call this kernel instead of :func:`grip_torques`.
     """
@@ -233,11 +233,11 @@ def _grip_force(g: GripState, target: float, measured: float, bound: float, limi
 
 @inner_kernel
 def _force_limit(g: GripState, load: float, arm: float) -> float:
-    """Return a sensor-independent upper limit for the grip force [N].
+    """Return an upper limit for the grip force [N] without using the sensors.
 
-    The limit is the target force plus margins for the torque constant error, for the joint friction
-    and for the torque ``load`` [N·m] of the detected load. ``arm`` is the moment arm of the force
-    [m].
+    The limit is the target force plus three margins. The margins cover the torque constant error,
+    the joint friction and the torque ``load`` [N·m] that the detected load causes. ``arm`` is the
+    moment arm of the grip force [m].
     """
     law = g.law
     force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * law.torque_error)
@@ -263,7 +263,7 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
 
 @inner_kernel
 def _distribute(g: GripState, grasp: GraspState) -> None:
-    """Equalise the tip forces if friction between the object and its support makes them unequal.
+    """Equalise the tip forces if friction between the object and its support unbalances them.
 
     The force controller acts only on the mean tip force. To equalise the forces, both fingers
     rotate by a small angle in the same direction. The object then rotates by at most
@@ -325,9 +325,9 @@ def _torques(
 def _equal_torques(
     g: GripState, grasp: GraspState, target: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return joint torques that make both tips push equally hard at any object angle.
+    """Return joint torques at which both tips push with equal force at any object angle.
 
-    After the dither, the joints hold their antisymmetric angle.
+    After the dither, the joints hold the antisymmetric angle (q1 − q2)/2.
     """
     law, q = g.law, grasp.q
     closing_rate = _closing_rate(grasp, g.force.speed, 0.0)
@@ -355,22 +355,22 @@ def _equal_torques(
 def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     """Advance the dither; return its antisymmetric torque [N·m].
 
-    The virtual spring from `hand.upright` acts between the fingers, and an oscillating torque
-    overcomes the joint friction. The oscillating torque decays slowly, so friction does not leave a
-    bias.
+    The virtual spring from `hand.upright` acts between the fingers. An oscillating torque overcomes
+    the joint friction. The oscillating torque decays slowly, so that friction does not leave a bias
+    in the joint angles.
     """
     law, q = g.law, grasp.q
     antisymmetric = 0.5 * (q[0] - q[1])
     lengths = (law.half_separation, law.length, law.offset, law.radius)
     spring = upright_spring(mean(q), mean(grasp.d), target, grasp.tilt_moment_ratio, lengths)
     spring = min(spring, g.joint_stiffness)
-    # When the dither ends, the hold must start with the current spring torque.
+    # Set `offset` so that the torque does not jump when the dither ends and the hold begins.
     g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
     # The amplitude rises during the first period and decays to zero by the end of the dither.
     phase = law.dither_rate * g.dither_elapsed
     amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
     if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-        # Measure time with the clock. A tick count would slow the dither when ticks are late, and a
+        # Measure the time by the clock. If ticks are late, counting ticks would slow the dither. A
         # slow dither could excite the resonance of the fingers on the soft tips at 1 to 2 Hz.
         g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
@@ -381,7 +381,7 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
 def _motor_torque(law: GripLaw, torque: float, rate: float) -> float:
     """Return the motor torque [N·m] required for a tip ``torque`` at a joint ``rate`` [rad/s].
 
-    At standstill, the torque required for closing is returned.
+    A rate of 0 counts as closing.
     """
     opening = min(max(-rate / law.friction_speed, 0.0), 1.0)
     return torque * (law.driving - opening * (law.driving - 1.0 / law.driving))

@@ -43,10 +43,10 @@ _NONE: Mapping[Any, Any] = MappingProxyType({})
 
 
 class CommandKind(NamedTuple):
-    """Description of a command: effect, modes that accept it, parameters, reply and refusals.
+    """Description of a command and of the modes in which the hand accepts the command.
 
     ``reply`` lists the reply fields other than ``mode``; `REPLY` explains all fields. ``refusals``
-    maps each reason to a cause that is specific to this command.
+    maps reasons for a refusal to causes that are specific to this command.
     """
 
     modes: frozenset[Mode]
@@ -204,5 +204,5 @@ COMMANDS: dict[str, CommandKind] = {
     ),
 }
 
-# Commands that never stiffen or move the hand and therefore have a higher age limit.
+# Commands that never stiffen or move the hand. These commands have a higher age limit.
 SAFE_COMMANDS = frozenset({"disarm", "tare", "clear"})

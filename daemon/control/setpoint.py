@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 
 
 class RunningMean(Record):
-    """Running mean of the last ``length`` values; the values are stored in a separate window."""
+    """Running mean of the last ``length`` values; a separate array stores the values."""
 
     length: int
     index: int  # index of the oldest value
@@ -23,7 +23,7 @@ class RunningMean(Record):
 
 
 class SetpointState(Record):
-    """State of a setpoint. The values for both running means are stored in separate windows."""
+    """State of a setpoint. A separate array stores the averaged values."""
 
     target: float
     value: float
@@ -37,7 +37,7 @@ class SetpointState(Record):
 
 @inner_kernel
 def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
-    """Set the setpoint to ``value`` and its speed to zero."""
+    """Set the setpoint to ``value``, and set its speed to zero."""
     s.target = s.ramp = s.value = value
     s.speed = 0.0
     s.idle_count = s.first.length + s.second.length
@@ -106,13 +106,13 @@ def _reset(setpoints: Records[SetpointState], windows: FloatArray, value: float)
 class Setpoint:
     """Rate-limited ramp, smoothed by two running means in series.
 
-    The first mean limits the acceleration to rate/window; the second limits the jerk to
-    rate/(window · window/2). The value never overshoots, whatever the sequence of targets. The
-    value reaches the target 1.5 windows later than the ramp.
+    The first mean limits the acceleration to rate/window. The second mean limits the jerk to
+    rate/(window · window/2). The value never overshoots, even if the target changes repeatedly. The
+    value reaches the target 1.5 · window after the ramp reaches the target.
     """
 
     def __init__(self, dt: float, window: float, state: SetpointState) -> None:
-        """Create a setpoint in ``state`` with tick period ``dt`` and averaging ``window`` [s]."""
+        """Create a setpoint with tick period ``dt`` [s] and averaging time ``window`` [s]."""
         self.state = state
         self.state.dt = dt
         self.state.first.length = max(round(window / dt), 1)
@@ -122,7 +122,7 @@ class Setpoint:
         self.step(0.0)  # Compile the kernel before the first tick.
 
     def reset(self, value: float) -> None:
-        """Set the setpoint to ``value`` and its speed to zero."""
+        """Set the setpoint to ``value``, and set its speed to zero."""
         _reset(self.state.array, self.windows, value)
 
     def step(self, rate: float) -> bool:

@@ -1,6 +1,6 @@
 """Estimate the load on a held object and the grip force that the load requires.
 
-The monitor computes these quantities on each tick; see `SlipLaw`, `SlipState` and `GraspState`:
+On each tick, the monitor computes (see `SlipLaw`, `SlipState` and `GraspState` for the symbols):
 
     r         low-pass filtered torque residual of each joint; r̄ is the mean of both joints
     L         load per tip: r̄ − offset = load_arm L + load_curvature L²               (`load_of`)
@@ -12,24 +12,24 @@ The monitor computes these quantities on each tick; see `SlipLaw`, `SlipState` a
 **Offset.** Gear friction, modulus errors and torque constant errors cause a residual even without a
 load. The offset is measured when holding begins, and again after the force or the angle has
 changed. A load detected during the previous hold is not part of the offset. The offset then follows
-r̄ slowly, with a time constant of up to _SETTLING_TIME. While the joints are at standstill, the
-offset immediately follows any change in the commanded torque. Friction balances a torque that is
-added to a stationary joint. The offset stays within ±`friction` of its initial value. Because
-rubber relaxes, the offset may also fall below this range, by up to _RELAXATION_SHARE of the tip
-moment.
+r̄ slowly, with a time constant of up to _SETTLING_TIME. While the joints are stationary, friction
+balances any change in the commanded torque, so the change is added to the offset immediately. The
+offset stays within ±`friction` of its initial value. Because rubber relaxes, the lower end of the
+range is extended by _RELAXATION_SHARE of the tip moment.
 
-**Load.** Friction hides loads of up to friction/load_arm, which is 2 N per tip for the default
-hand. Loads below half of this value are ignored. The estimate of a larger load is increased by the
-load that friction may hide. Without confirmation, a load increases the grip force by at most
-_UNCONFIRMED_SHARE. A load is confirmed if the object has rotated, both joints have yielded
-simultaneously, or |L| exceeds 2 friction/load_arm.
+**Load.** Friction hides loads of up to friction/load_arm, which is 2 N per tip for the built-in
+hand. Loads below half of friction/load_arm are ignored. The estimate of a larger load is increased
+by the load that friction may hide. An unconfirmed load increases the grip force by at most the
+fraction _UNCONFIRMED_SHARE. A load is confirmed when the object rotates, when both joints yield
+simultaneously, or when |L| exceeds 2 friction/load_arm.
 
-**Sudden events** increase the force immediately. The force increases to its limit in two cases: the
-torques jump beyond the noise while both joints yield, or the shear jumps in the frames of solid
-tips. If the object rotates further than the shear deformation μ (d1 + d2)/2W of the tips, the force
-increases by _ROTATION_INCREASE. A sliding tip transmits only its friction force, so the size of a
-sudden load is unknown. In a pull, the two torques jump in the same direction; in a twist, they jump
-in opposite directions. A sideways push looks like a twist.
+**Sudden events** increase the force immediately. The force increases to its limit if the torques
+jump by more than the noise while both joints yield. With solid tips, a jump in the measured shear
+has the same effect. The shear of the tips allows the object to rotate by up to μ (d1 + d2)/2W. If
+the object rotates further, the force increases by the fraction _ROTATION_INCREASE. A sliding tip
+transmits only its friction force, so the size of a sudden load is unknown. A pull changes both
+torques in the same direction. A twist changes the torques in opposite directions. A sideways push
+has the same effect on the torques as a twist.
 
 A force increase is held for _SETTLING_TIME. The increase then decays at the rate
 increase_max/_DECAY_TIME.
@@ -57,7 +57,7 @@ _DECAY_TIME = 2.0  # time to reduce the force by `grip_raise_max`, and decay tim
 _SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
 _ROTATION_INCREASE = 0.5  # relative force increase after the object has rotated
 _ROTATION_MARGIN = 1.5  # smallest significant rotation, as a multiple of the rotation due to shear
-_SHEAR_JUMP = 0.6  # smallest significant shear jump at solid tips [N]; six standard deviations
+_SHEAR_JUMP = 0.6  # smallest significant shear jump at solid tips [N]; equals 6 σ of the noise
 _AGREEMENT = 0.25  # minimum change at each joint or tip, as a fraction of the mean change
 _UNCONFIRMED_SHARE = 0.3  # maximum force increase without confirmation, as a fraction of the force
 _RELAXATION_SHARE = 0.2  # maximum relative force loss due to relaxation during a hold
@@ -138,7 +138,7 @@ def configure(s: SlipState, settings: Settings) -> None:
 
 @inner_kernel
 def reset(s: SlipState) -> None:
-    """Reset everything except the law and the torque.
+    """Reset the load, the friction and the force increase.
 
     Call this kernel when the object is released or replaced.
     """
@@ -154,9 +154,9 @@ def reset(s: SlipState) -> None:
 def begin(s: SlipState, grasp: GraspState) -> None:
     """Begin holding, or continue after the force or the angle has changed.
 
-    Without a load, the offset equals the residual on this tick. A load from the previous hold is
-    assumed to persist, unless this assumption would move the offset out of its range. The range
-    scales with the force.
+    If the previous hold ended without a load, the offset is set to the present residual. Otherwise,
+    the load is assumed to persist, but the offset is limited to its range. The range scales with
+    the force.
     """
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
@@ -185,7 +185,7 @@ def mean(pair: Pair) -> float:
 
 @inner_kernel
 def _moment(grasp: GraspState) -> float:
-    """Return the mean joint torque [N·m] that balances the normal forces."""
+    """Return the mean moment of the normal forces about the joints [N·m]."""
     return mean(grasp.normal) * mean(grasp.moment_arm)
 
 
@@ -238,9 +238,9 @@ def update(
 
 @inner_kernel
 def _update_friction(s: SlipState, grasp: GraspState) -> float:
-    """Set the joint friction and the usable tip friction; return the latter before clipping.
+    """Set the joint friction and the usable tip friction; return the unclipped tip friction.
 
-    Rolling uses up part of the tip friction, and this part increases with the grip force.
+    Rolling uses part of the tip friction. The part increases with the grip force.
     """
     law = s.law
     free_torque = max(mean(grasp.free_torque), law.joint_friction)
@@ -290,8 +290,8 @@ def _update_needed_force(s: SlipState, needed_force: float, commanded: float) ->
 def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
     """Return the upper limit [N] of an increased grip force.
 
-    An increase to ``declared`` [N], the force that the declared load requires, needs no
-    confirmation.
+    ``declared`` [N] is the force that the declared load requires. An increase up to ``declared``
+    needs no confirmation.
     """
     law = s.law
     share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
@@ -339,8 +339,8 @@ def _has_jumped(
     tests exclude other causes:
 
     1. Both residuals change. A wrong current reading or a wrong frame affects only one joint.
-    2. The change exceeds the noise. The threshold is higher soon after holding begins, because
-       joint friction may be released.
+    2. The change exceeds the noise. The threshold is higher at the start of a hold, because the
+       joint friction may still change.
     3. Both joints yield to the load.
     4. The load increases to a large fraction of the friction force. For this test, half of the load
        that joint friction may hide is added to the measured load.
@@ -401,8 +401,8 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
-    # Joint friction can hide loads of up to `hidden`. While the detected load |L| rises from half
-    # of `hidden` to `hidden`, the estimate rises from 0 to |L| + `hidden`.
+    # Joint friction can hide loads of up to `hidden`. The estimate is 0 up to |L| = `hidden`/2. It
+    # then rises to |L| + `hidden` at |L| = `hidden`.
     threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
     hidden = s.friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)

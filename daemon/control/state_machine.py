@@ -25,15 +25,16 @@ Several states share these transitions:
   fault persists until `clear`.
 - In every state with torque, `release` leads to Travelling (RELEASING).
 - In Settled, Changing and Turning, `rotate` leads to Turning.
-- From Approaching to Turning, contact between the tips for _EMPTY_TIME leads to Travelling
-  (RELEASING).
-- From Pressing to Turning, the joints hold their positions while a contact is missing. After
-  `safety.frame_age_fault` frame periods, the next state is Armed.
+- In the states from Approaching to Turning, the hand enters Travelling (RELEASING) if the tips
+  touch each other for _EMPTY_TIME.
+- In the states from Pressing to Turning, the joints hold their positions while a contact is
+  missing. If the contact is missing for `safety.frame_age_fault` frame periods, the hand enters
+  Armed.
 
-Each transition creates a new instance of a state class. Timers and flags are attributes of a state
-and are discarded when the state ends. `control.modes` lists the commands for each mode, and
-`loop.requests` checks each command. `control.fingers` drives the joints, `control.grip` computes
-the joint torques, and `safety.safety` limits the goals.
+Each transition creates a new instance of a state class. Timers and flags are attributes of the
+state, so they are discarded when the state ends. `control.modes` lists the commands for each mode,
+and `loop.requests` checks each command. `control.fingers` drives the joints, `control.grip`
+computes the joint torques, and `safety.safety` limits the goals.
 """
 
 from __future__ import annotations
@@ -49,31 +50,31 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
 # A joint has arrived if it is within this distance of its goal [rad]. The distance is five times
-# the position error due to joint friction with the default settings.
+# the position error that joint friction causes with the default settings.
 _ARRIVAL_DISTANCE = 0.03
-# Force tolerance as a fraction of the target. With simulated sensors, the force noise is 0.3 to
-# 0.6 % (1 σ).
+# Force tolerance as a fraction of the force target. With simulated sensors, the force noise is 0.3
+# to 0.6 % (1 σ).
 _FORCE_TOLERANCE = 0.03
 # Maximum force error due to joint or gear friction, as a fraction of the force target. With the
 # default finger, a friction torque of 0.05 N·m causes an error of 10 % at a force of 6 N. The
 # integral term removes the friction error within seconds.
 _FRICTION_TOLERANCE = 0.1
-# Waiting time [s]. After this time, a joint that is short of its goal counts as stuck, and a force
-# within _FRICTION_TOLERANCE of its target counts as reached. _STUCK_TIME is ten times the settling
-# time of the force in a hand without friction.
+# Time [s] after which a joint that has not reached its goal counts as stuck. After the same time, a
+# force within _FRICTION_TOLERANCE of its target counts as reached. _STUCK_TIME is ten times the
+# settling time of the force in a hand without friction.
 _STUCK_TIME = 2.0
-# A grip is empty if the tips have apparently been in contact with each other for this time [s].
+# A grip counts as empty after the tips have appeared to touch each other for this time [s].
 # _EMPTY_TIME is longer than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
-# Tolerance for a streamed force target, as a fraction of the target. A streamed target may change
-# continuously. A grip therefore also counts as settled if the force has reached a setpoint within
-# this tolerance of the target.
+# Tolerance for a streamed force target, as a fraction of the target. A streamed target may never
+# stop changing. A grip therefore also counts as settled if the force has reached a setpoint that is
+# within the tolerance of the target.
 _STREAM_TOLERANCE = 0.25
-# A change in a streamed setpoint, or a force increase, is treated as noise if it is smaller than
-# these limits. _FORCE_NOISE is a fraction of the force. _ANGLE_NOISE is the standard deviation of
-# the angle [rad].
+# Limits below which a change in a streamed setpoint, or a force increase, counts as noise.
+# _FORCE_NOISE is a fraction of the force. _ANGLE_NOISE is the standard deviation of the angle
+# [rad].
 _FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
 
 
@@ -259,11 +260,11 @@ class Control:
         self._enter(Travelling(Mode.RELEASING))
 
     def grasp(self, force: float, is_streamed: bool = False) -> None:
-        """Close the fingers until all touch; then increase the mean tip force to ``force`` [N].
+        """Close the fingers onto the object, then increase the mean tip force to ``force`` [N].
 
         If the hand is already gripping, only the force changes and the mode stays the same. Set
         ``is_streamed`` if a client streams setpoints. A streamed force may change before the grip
-        reaches it.
+        reaches the force.
         """
         state = self.state
         if isinstance(state, Gripping):
@@ -318,7 +319,7 @@ class Control:
         return None
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the force to ``force_max`` [N], reducing a larger force within ``duration`` [s]."""
+        """Limit the force to ``force_max`` [N]; reduce a larger force within ``duration`` [s]."""
         if isinstance(self.state, Gripping):
             self.grip.limit_force(force_max, duration)
             self._change(self.state)
@@ -364,7 +365,8 @@ class Control:
     def hold_goal(self, goal: Goal) -> None:
         """Hold the goals while frames are late. Call this method instead of :meth:`step`.
 
-        In a grip, the goals are torques. The joints stay damped, and any rotation stops.
+        Outside a grip, the position goals stay the same. In a grip, the torque goals damp the
+        joints and stop any rotation.
         """
         if goal.valid and isinstance(self.state, Gripping) and not self.state.history.lost_for:
             self.fingers.apply_torques(goal, self.grip.hold_goal(self.fingers.reading))
@@ -379,9 +381,9 @@ class Control:
         # The tip may reach the object before the sensor detects contact. Limit the current so that
         # the tip force can't exceed the commanded force.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
-        # The joint friction may be larger than the setting, so also use `free_torque`, the friction
-        # torque measured in free motion. Otherwise, the joint might not move at the limited
-        # current.
+        # The joint friction may exceed the setting, so also allow for `free_torque`, which is the
+        # friction torque measured in free motion. Otherwise, the joint might not move at the
+        # limited current.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 
@@ -493,7 +495,7 @@ class Control:
     def _is_force_reached(self, is_streamed: bool) -> bool:
         """Return True if the mean tip force has reached its target or a setpoint near the target.
 
-        The mean is used because friction between object and support may make the tip forces
+        The mean is used because friction between the object and its support can make the tip forces
         unequal.
         """
         grip = self.grip

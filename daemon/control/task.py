@@ -1,6 +1,6 @@
-"""Run tasks: command scripts that the daemon executes after startup.
+"""Run a task, which is a script of commands that the daemon executes after startup.
 
-The daemon checks the commands of a task in the same way as client commands.
+The daemon checks task commands in the same way as client commands.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Task:
         return request
 
     def restart(self, state: State, reason: str) -> str:
-        """Pause, leave the current mode and restart the script; return the event text."""
+        """Schedule a pause and a restart of the script; return the event text."""
         way_out, says = (
             ("clear", "clears the fault")
             if state.mode == Mode.FAULT
