@@ -1,7 +1,7 @@
 """Read, check, write and apply a sensor's calibration file.
 
-Each sensor has one JSON file. A calibration step that has not been run is null in the file. The
-settings provide the values of a missing step. `kinematics.calibration` explains the numbers.
+Each sensor has one JSON file. If a calibration step has not been run, its entry is null, and the
+values come from the settings. `kinematics.calibration` explains the numbers.
 """
 
 from __future__ import annotations
@@ -53,9 +53,10 @@ class Sensor(_StepModel):
 class TareStep(_StepModel):
     """Zero offset of each cell, and typical standard deviation of the cell noise [counts].
 
-    ``correlation[i][j]`` is the noise correlation of two cells that are i rows and j columns apart.
-    ``correlation`` is empty if the noise is not correlated. ``drift`` is the standard deviation of
-    the drift that all cells share. ``excess`` [counts] is the mean of max(reading − zero, 0).
+    ``correlation[i][j]`` is the noise correlation between two cells that are i rows and j columns
+    apart. ``correlation`` is empty if the noise is not correlated. ``drift`` is the standard
+    deviation of the drift that all cells share. The mean of max(reading − zero, 0) is stored as
+    ``excess`` [counts].
     """
 
     date: str
@@ -118,7 +119,7 @@ class ScalesStep(_StepModel):
     """A finger's calibration factors, each stored as (mean, relative standard deviation).
 
     The factors are measured while the hand grips an object. ``modulus`` is relative to the modulus
-    in this file, or in the settings if the file contains no modulus.
+    in this file, or to the modulus in the settings if the file contains no modulus.
     """
 
     date: str
@@ -147,7 +148,7 @@ class Calibration(_StepModel):
 
     @property
     def identity(self) -> str:
-        """Sensor label (or finger, if there is no label) and date of the file."""
+        """Label and date of the calibration; the finger's name replaces a missing label."""
         return f"{self.sensor.label or self.sensor.finger} {self.date}"
 
     def summary(self) -> str:
@@ -209,7 +210,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """Describe the differences between two sensors; return "" if the sensors are equal."""
+    """Describe the differences between two sensors; return "" if the sensors are identical."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "unnamed", there.label or "unnamed"),
@@ -235,7 +236,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 class Converter:
-    """Conversion of one sensor's counts to pressures [Pa]."""
+    """Converter from one sensor's counts to pressures [Pa]."""
 
     def __init__(
         self, calibration: Calibration, pascal_per_count: float, full_count: int | None = None
@@ -247,7 +248,7 @@ class Converter:
         calibration
             Calibration of the sensor.
         pascal_per_count
-            Scale factor to use if no curve has been measured.
+            Scale factor [Pa per count] to use if no curve has been measured.
         full_count
             Reading of a saturated cell; None selects the value in the calibration.
         """
@@ -285,7 +286,7 @@ class Converter:
         return np.asarray(np.sign(readings) * (c1 * x**exponent + c2 * x**2 + c3 * x**3))
 
     def at(self, count: int) -> FloatArray:
-        """Return each cell's pressure [Pa] at a reading of ``count`` in a new array."""
+        """Return a new array with each cell's pressure [Pa] at a reading of ``count``."""
         return self(np.full(self.zero.shape, count, np.uint16))
 
     @property
@@ -309,8 +310,8 @@ def least_end(ends: FloatArray) -> float:
     """Return the smallest measuring range of all working cells.
 
     The range of a cell extends from its zero offset to saturation. Cells that are nearly saturated
-    without a load are ignored. The small range of such a cell would make all other cells count as
-    saturated.
+    without a load are ignored. Otherwise, the small range of such a cell would make all other cells
+    count as saturated.
     """
     return float(ends[ends >= _FAULTY * np.median(ends)].min())
 

@@ -143,7 +143,7 @@ def _measured_tip(settings: Settings, finger: int, calibration: Calibration | No
 
 
 def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | None) -> SensorGrid:
-    """Return a sensor's grid, with the calibrated centre and rotation if available."""
+    """Return a sensor's grid; use the calibrated centre and rotation if they are available."""
     if settings.tip.physics == "measured" and calibration is not None and calibration.law:
         return make_grid(settings, finger, calibration.law.centre, calibration.law.rotation)
     if calibration is None or calibration.centre is None:
@@ -165,7 +165,7 @@ def make_estimator(
     Parameters
     ----------
     settings, material, finger
-        Settings of the hand, material of the tip, and finger index.
+        Settings for the hand, material of the tip, and index of the finger.
     active
         True for cells that exist [rows, cols]. The dead cells listed in the settings are also
         excluded.
@@ -205,7 +205,7 @@ def make_estimator(
 
 
 def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertainty:
-    """Return the systematic uncertainties from the settings or the calibration."""
+    """Return the systematic uncertainties from the settings, updated with the calibration."""
     tactile = settings.tactile
     baseline, centre, pitch = tactile.baseline_error, tactile.centre_error, tactile.pitch_error
     modulus, correlation = settings.material.modulus_error, None

@@ -1,4 +1,4 @@
-"""Update the hand's state with a tactile frame: angle, footprint and amplitude channels.
+"""Update the hand's state with the angle, footprint and amplitude channels of a tactile frame.
 
 Channel     Measures                                                   Noise
 angle       φ ∓ α/2 ± ENCODER + ANGLE_BIAS − θ̇ LATENCY                 frame covariance
@@ -7,9 +7,10 @@ footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain:                 frame
 amplitude   MODULUS + GAIN, if the gain was fitted                     2 %, frame covariance
 
 A frame shows the hand at the time when the sensor scanned the cells. Each frame is therefore
-compared with the state at the scan time. The joint history provides the state at the scan time.
+compared with the state at the scan time, which is computed from the joint history.
 `estimate.systematic` is the covariance of the errors that all frames share. The systematic
-covariance does not count as noise; it only increases the published standard deviations.
+covariance is not part of the measurement noise. It only increases the published standard
+deviations.
 """
 
 from __future__ import annotations
@@ -58,17 +59,17 @@ FloatArray = NDArray[np.float64]
 
 D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
 # Smallest shift of a pressure image that counts as a fault [rad, or fraction of the tip radius]. A
-# shift by 0.06 radii changes the measured angle by 0.06 rad. The error of correct frames is at most
-# 0.04 rad.
+# shift of 0.06 radii changes the measured angle by 0.06 rad. Without a shift, the angle error of a
+# frame is at most 0.04 rad.
 IMAGE_SHIFT_MIN = 0.06
 _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
 _NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; an object held with less force may rock
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
 # A footprint that grows within the response time of the cells appears wider and flatter. _WIDENING
-# and _FLATTENING are the relative changes in d and gain, divided by var(d)/d². Both constants
-# result from fitting a paraboloid to the mean of several paraboloids.
+# and _FLATTENING are the relative changes in d and gain, divided by var(d)/d². Both constants were
+# computed by fitting a paraboloid to the mean of several paraboloids.
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
-_SLOPE_SMOOTHING = 0.9  # low-pass coefficient per frame for ∂ ln F/∂d
+_SLOPE_SMOOTHING = 0.9  # low-pass filter coefficient for ∂ ln F/∂d, applied on each frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
 _FIRST_D_ERROR = 0.5  # relative standard deviation of d in the first frames of a contact
 
@@ -107,7 +108,7 @@ class FingerMotion(NamedTuple):
 
 @inner_kernel
 def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int) -> FingerMotion:
-    """Interpolate the motion history at time ``t``, clamped to the ends of the history."""
+    """Interpolate the motion history at time ``t``; clamp ``t`` to the ends of the history."""
     size = len(history)
     before = after = newest
     fraction = 0.0
@@ -139,8 +140,8 @@ def _rates(
 ) -> tuple[float, float]:
     """Return the rates of d [m/s] and θ [rad/s] at the time ``scan``.
 
-    The rates determine the derivatives with respect to the latency. Each rate is averaged over ±1
-    standard deviation of the latency, because the joints may have stopped within this interval.
+    The filter uses the rates as derivatives with respect to the latency. Each rate is averaged over
+    ±1 standard deviation of the latency, because the joints may have stopped within this interval.
     Rates below the velocity resolution are set to 0.
     """
     span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_INTERVAL_MIN)
@@ -161,7 +162,7 @@ def _rates(
 def _motion_since(
     h: HandFilter, history: Records[HistoryRow], finger: int, t: float, sense: float
 ) -> Scan:
-    """Return a finger's motion since the scan of the frame with time stamp ``t``."""
+    """Return a finger's motion since the sensor scanned the frame with time stamp ``t``."""
     scan = t - h.mean[LATENCY]
     row = _motion_at(history, h.newest_row, scan, finger)
     d_rate, theta_rate = _rates(h, history, finger, scan, sense)
@@ -206,7 +207,7 @@ def update(
     systematic: FloatArray,
     table: FloatArray,
 ) -> bool:
-    """Update the state with one finger's frame from time ``t``; return False for a rejected frame.
+    """Update the state with one finger's frame from time ``t``; return False if it is rejected.
 
     ``covariance`` is the 4 × 4 covariance matrix of d, θ, tilt_y and gain. ``systematic`` is the
     part of ``covariance`` that all frames share. A gain variance above 0 means that the gain was
@@ -361,7 +362,7 @@ def _update_angle(
 ) -> None:
     """Update the state with the face angle measured in a frame.
 
-    An innovation beyond the gate means that the object has rotated unexpectedly.
+    An innovation beyond the gate indicates that the object has rotated unexpectedly.
     """
     before = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger]
     _set_angle_slopes(h, finger, sense, theta_rate)
@@ -375,7 +376,7 @@ def _update_angle(
 
 @inner_kernel
 def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: float) -> None:
-    """Update the state with the footprint, using the current slopes.
+    """Update the state with the footprint channel, whose derivatives are in `slopes`.
 
     If the innovations of the two tips have opposite signs, a large innovation means that the object
     has moved sideways. If the signs are equal and the gain is fixed, a large innovation means that
@@ -400,10 +401,10 @@ def _is_rejected(
 
     A jump in angle or displacement is an outlier unless the other tip or the joints confirm the
     jump. A rotation is accepted if both tips show the rotation while the joints are moving. If the
-    joints are at rest, the rotation must continue in the next frame. A displacement is accepted if
-    the joints are moving or if both tips are displaced. A blow displaces both tips, because it
-    presses the object into one tip and away from the other. The first frame of a real jump is also
-    rejected, because the other tip's frame has not arrived yet.
+    joints are at rest, both tips must show the rotation, and the rotation must continue in the next
+    frame. A displacement is accepted if the joints are moving or if both tips are displaced. A blow
+    displaces both tips, because it presses the object into one tip and away from the other. The
+    first frame of a real jump is also rejected, because the other tip's frame has not arrived yet.
     """
     grasp = h.grasp
     tip = h.tip[finger]

@@ -1,4 +1,4 @@
-"""Compute the grasp from the state, and update the state with joint torques and force balance.
+"""Compute the grasp, and update the state with the joint torques and the force balance.
 
 Channel   Measures                                                         Noise
 torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05 N·m and torque
@@ -126,7 +126,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
     if h.closing_speed > h.velocity_unit:  # Friction opposes the closing motion.
         innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
-        # When the torque decreases, gear friction may carry any part of the decrease.
+        # When the torque decreases, gear friction may compensate for any part of the decrease.
         held_torque = min(h.torque_max - torque, h.load_held * torque)
         variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
         if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
@@ -316,7 +316,7 @@ def _has_bias(grasp: GraspState, finger: int) -> bool:
 
 @inner_kernel
 def _is_larger_bias(bias: Pair, finger: int, smallest: float) -> bool:
-    """Return True if a sensor's bias exceeds ``smallest`` and the bias of the other sensor.
+    """Return True if a sensor's bias exceeds both ``smallest`` and the other sensor's bias.
 
     A bias in one sensor also causes a smaller apparent bias in the other sensor.
     """

@@ -7,18 +7,19 @@ values. `hand_state` defines and predicts the state. `frame_channels` and `grasp
 state with measurements.
 
 The object angle φ is the direction of the bisector between the two object faces. The taper α is the
-angle between the faces. The filter starts α at ``object.taper`` and updates it with the frames of
-both tips. A shifted sensor has the same effect on the frames as a taper. The ``hand.angle`` limit
-therefore compares the frames with the setting ``object.taper``.
+angle between the faces. The initial value of α is ``object.taper``. The filter updates α with the
+frames of both tips. A shifted sensor has the same effect on the frames as a taper. The
+``hand.angle`` limit therefore compares the frames with the setting ``object.taper``.
 
 A disc has no faces. For a disc, φ is the direction of the line between the contacts, and ``rotate``
-turns this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per radian of joint angle. With
-the default hand and a disc of radius R = 20 mm, the line rotates by 0.4 rad per radian. The
-prediction assumes faces, which would rotate by 1.5 rad per radian. The frames correct the error of
-the prediction. A rotation of a disc therefore takes longer, and the disc rolls further than
-commanded. A curved contact appears less tilted than it is, so φ is about 5 % too small for a disc.
-If the fingers are straight or lean outwards, the line does not follow the joint motion. A disc with
-R ≥ 30 mm can be held, but its rotation stops at the tip limits.
+rotates this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per radian of joint angle. With
+the built-in hand and a disc of radius R = 20 mm, the line rotates by 0.4 rad per radian of joint
+angle. The prediction assumes faces, which would rotate by 1.5 rad per radian of joint angle. The
+frames correct the error of the prediction. A rotation of a disc therefore takes longer, and the
+disc rolls further than commanded. For a disc, φ is about 5 % too small, because a curved contact
+appears less tilted than it is. If the fingers are straight or lean outwards, the line does not
+follow the joint motion. A disc with R ≥ 30 mm can be held, but its rotation stops at the tip
+limits.
 """
 
 from __future__ import annotations
@@ -53,10 +54,7 @@ _GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal cur
 
 
 class HandEstimator:
-    """Estimator for one hand.
-
-    Without contact, the estimator performs only one comparison per tick.
-    """
+    """Estimator for one hand."""
 
     def __init__(
         self,
@@ -143,7 +141,8 @@ class HandEstimator:
     def predict(self, reading: Reading, goal: Goal | None = None) -> None:
         """Predict the state at the time of a valid reading.
 
-        While a grip sets the servo currents, ``goal`` is the goal at the time of the reading.
+        If a grip sets the servo currents, ``goal`` is the goal at the time of the reading.
+        Otherwise, ``goal`` is None.
         """
         self._joints_read = True
         q1, q2 = reading.q
@@ -179,7 +178,7 @@ class HandEstimator:
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
-            return  # The contact is still predicted from joint motion, but becomes older.
+            return  # The contact is still predicted from joint motion, but `t_valid` is not set.
         # Before the first joint reading, use the frame alone.
         in_contact = estimate.contact and self._joints_read
         if in_contact and self._in_contact[finger] and not has_changed:
@@ -291,7 +290,7 @@ def _fill_from_frame(
 
     ``table`` is the tip's contact table, and ``law`` is the relative error of its forces. The
     amplitude of a frame depends on both the tip modulus and the sensor gain. A deviation in
-    amplitude is divided between modulus and gain in proportion to their prior variances.
+    amplitude is attributed to modulus and gain in proportion to their prior variances.
     """
     contact.d, contact.theta = estimate.d, estimate.tilt_x
     contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std

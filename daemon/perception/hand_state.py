@@ -1,4 +1,4 @@
-"""Define the hand's state, predict it from joint motion, and update it with one measurement.
+"""Define the hand's state, predict the state from joint motion, and update it with measurements.
 
 `docs/estimation.md` derives the model and lists the manoeuvres that make each state observable.
 
@@ -16,7 +16,7 @@ LATENCY         s      frame age beyond `tactile.latency`           (constant in
 FRICTION        N·m    mean joint torque not explained by the       slow drift
                        grip force
 
-The states up to TORQUE exist once per finger. The named index refers to the left finger, and the
+Each finger has its own states from D to TORQUE. The named index refers to the left finger, and the
 next index refers to the right finger. All quantities are in SI units.
 """
 
@@ -38,7 +38,8 @@ FloatArray = NDArray[np.float64]
 D, ENCODER, D_BIAS, ANGLE_BIAS, MODULUS, GAIN, TORQUE = range(0, 14, 2)
 ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 
-# Index of each measurement channel in `grasp.CHANNELS`. The first four channels exist once per tip.
+# Index of each measurement channel in `grasp.CHANNELS`. For the first four channels, the next index
+# refers to the right tip.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
 # Time span of the stored joint motion [s]. The assumed age of a frame is limited to this span.
@@ -132,7 +133,7 @@ class HandFilter(Record):
     relaxation_time: Annotated[FloatArray, 3]  # `tip.relaxation_times` [s]
     torque_constant: float  # output torque per ampere of a closing joint [N·m/A]
     inertia: float  # joint inertia [kg·m²]
-    load_held: float  # fraction of the tip moment that gear friction carries as torque decreases
+    load_held: float  # fraction of the tip moment that gear friction can balance
     is_single: bool  # True for a one-finger hand
     is_gripping: bool  # True if a grip controls the joint torques
     gain_is_known: bool  # True if `estimator.free_gain` is false
@@ -173,7 +174,8 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
     0.
 
     `grasp.nis[channel]` is an exponential moving average of the normalised innovation squared. Each
-    value in the average is limited to ``gate`` squared. The time constant is one second of frames.
+    value in the average is limited to ``gate`` squared. The time constant of the average is
+    ``frame_rate`` updates.
     """
     expected = predicted_variance(h)
     square = innovation * innovation
@@ -235,8 +237,8 @@ def _walk(h: HandFilter, state: int, per_root_second: float, dt: float) -> None:
 def walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: float) -> None:
     """Add process noise to a pair of states.
 
-    ``common`` changes both states by the same amount; ``opposite`` changes them by opposite
-    amounts.
+    The ``common`` noise changes both states by the same amount. The ``opposite`` noise changes the
+    two states by opposite amounts.
     """
     alike = common * common * dt
     other = opposite * opposite * dt
@@ -317,7 +319,7 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 
 @inner_kernel
 def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
-    """Advance the joints, tips and object by the motion at velocities ``dq`` [rad/s] during ``dt``.
+    """Advance the joints, tips and object at joint velocities ``dq`` [rad/s] for ``dt`` seconds.
 
     The object rotates by turn1 Δq1 − turn2 Δq2. Each displacement changes by half the change in d1
     + d2 (docs/estimation.md).
@@ -370,7 +372,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
 def _add_rounding_noise(h: HandFilter, finger: int, by: float, turn: float, dt: float) -> None:
     """Add process noise for the rounding of a joint's velocity.
 
-    Per radian, an error in the joint angle changes d by ``by`` [m] and φ by ``turn`` [rad].
+    A joint angle error of 1 rad changes d by ``by`` [m] and φ by ``turn`` [rad].
     """
     variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
     h.scratch[:] = 0.0
@@ -441,7 +443,7 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
 
 @inner_kernel
 def _edge(h: HandFilter, q: float, direction: float) -> float:
-    """Return the edge of the count ``q`` [rad]: below ``q`` for a positive ``direction``."""
+    """Return the lower edge [rad] of the count ``q`` if ``direction`` > 0, else the upper edge."""
     return q - math.copysign(0.5 * h.encoder_resolution, direction)
 
 

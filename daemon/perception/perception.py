@@ -31,7 +31,7 @@ _CHANGED_CELLS_MIN = 4  # minimum number of changed cells; a few noisy cells may
 
 
 class Perception:
-    """Tactile sensors and contact filter of a hand. Only the loop thread may use this class."""
+    """Tactile sensors and contact filter for a hand. Only the loop thread may use this class."""
 
     def __init__(
         self,
@@ -72,12 +72,12 @@ class Perception:
 
 
 class RepeatDetector:
-    """Detector for sequences of frames that arrive again in the same order.
+    """Detector for repeated sequences of frames.
 
     A noisy sensor never repeats a frame. At standstill, a sensor without noise may send one frame
-    repeatedly or alternate between two similar frames. The detector ignores frames that differ from
-    the previous frame in fewer than four cells. Constant frames are handled by the frozen-sensor
-    check.
+    repeatedly or alternate between two similar frames. The detector therefore ignores frames that
+    differ from the previous frame in fewer than four cells. The frozen-sensor check handles
+    constant frames.
     """
 
     def __init__(self, rate: float, fault_count: float, enabled: bool = True) -> None:
@@ -99,7 +99,7 @@ class RepeatDetector:
 
     @property
     def is_fault(self) -> bool:
-        """True if the number of consecutive repeated frames is too high for a coincidence."""
+        """True if the number of consecutive repeated frames is too high to be a coincidence."""
         return self.is_repeating and self._repeated_count >= self._fault_count
 
     def update(self, data: NDArray[np.uint16]) -> bool:
@@ -169,7 +169,7 @@ class FingerPerception:
 
     @property
     def noise(self) -> float:
-        """Measured cell noise (standard deviation) [Pa]; 0 if unknown."""
+        """Measured standard deviation of the cell noise [Pa]; 0 if unknown."""
         return self._unloaded.scatter * self._quantum
 
     @property

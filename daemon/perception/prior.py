@@ -1,4 +1,4 @@
-"""Priors for a finger's calibration factors: tip modulus, sensor gain and torque constant."""
+"""Define the priors of a finger's tip modulus, sensor gain and torque constant."""
 
 from __future__ import annotations
 
