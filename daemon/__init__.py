@@ -1,1 +1,1 @@
-"""Daemon: all code that depends on time, hardware or the network."""
+"""Daemon and other code that depends on time, hardware or the network."""

@@ -1,13 +1,13 @@
 """Look up servo, tactile and shape backends by name, and import them on demand.
 
-Built-in backends are listed in `BUILT_IN`. A plugin is an entry point of an installed package in
-the ``softfinger.servos``, ``softfinger.tactile`` or ``softfinger.shapes`` group. Servo and tactile
-plugins are classes, and shape plugins are functions. Plugins take the same arguments as the
-built-in backends. A plugin may define these attributes:
+Built-in backends are listed in `BUILT_IN`. A plugin is an entry point that an installed package
+defines in the group ``softfinger.servos``, ``softfinger.tactile`` or ``softfinger.shapes``. Servo
+and tactile plugins are classes, and shape plugins are functions. Plugins take the same arguments as
+the built-in backends. A plugin may define these attributes:
 
 - ``metal``: True (default) if the backend drives real hardware.
 - ``hand``: True if the plugin needs the simulated hand. The daemon then passes the simulated hand
-  to the plugin, as it does to a built-in backend. Instead of True, a servo plugin may specify a
+  to the plugin, as it does to the simulated backends. Instead of True, a servo plugin may specify a
   class that replaces `SimulatedHand` and takes the same arguments.
 - ``Settings``: a pydantic model for the profile table ``[plugins.NAME]``, preferably derived from
   `profile.fields.Section`. The daemon passes the validated settings as the last argument.
@@ -35,7 +35,7 @@ class Backend(NamedTuple):
 
     load: Callable[[], Any]
     metal: bool = True  # True for real hardware
-    hand: Any = False  # True if a simulated hand is needed; may also be the hand's class
+    hand: Any = False  # True, or the class of the hand, if a simulated hand is needed
     name: str = ""  # plugin name, or empty for a built-in backend
     source: str = ""  # plugin name, package and version for messages
     section: type[BaseModel] | None = None  # plugin's settings model
@@ -81,7 +81,7 @@ BUILT_IN: dict[Kind, dict[str, Backend]] = {
 def backend(kind: Kind, name: str) -> Backend:
     """Return the backend with this name.
 
-    Raises KeyError if the name is unknown and PluginError if the plugin is unusable.
+    Raises KeyError if the name is unknown, and PluginError if the plugin is unusable.
     """
     return BUILT_IN[kind].get(name) or _plugin(kind, name)
 
@@ -131,7 +131,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
 def servo_model(name: str) -> Any:
     """Return the `ServoModel` with this name.
 
-    Raises KeyError, which lists all model names, if the name is unknown.
+    If the name is unknown, raises a KeyError that lists all model names.
     """
     table = import_module("softfinger.daemon.servos.control_table")
     try:

@@ -70,8 +70,8 @@ def emulated(settings: Settings) -> bool:
 class Deadline:
     """Start time [s] of the daemon's next tick; an emulated hand must not advance past this time.
 
-    The time is measured by the daemon's clock. The time is stored in a file in the emulator's port
-    folder, and both processes map the file into memory.
+    The daemon's clock measures the time. The time is stored in a file in the emulator's port
+    folder. The daemon and the emulator map the file into memory.
     """
 
     NAME = ".deadline"

@@ -44,7 +44,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 class SettingsError(SoftfingerError):
     """Unusable settings.
 
-    For each error, the message gives the file, the key, the value found and the value expected.
+    For each error, the message states the file, the key, the found value and the expected value.
     """
 
 
@@ -140,7 +140,7 @@ class Refused(SoftfingerError):
     """Rejected command. The reply to the client contains this exception's message."""
 
     def __init__(self, text: str, reason: Reason | str = Reason.STATE) -> None:
-        """``reason`` is a `Reason`, or any string if the versions of client and daemon differ."""
+        """``reason`` is a `Reason`, or any string if the client and daemon versions differ."""
         super().__init__(text)
         self.reason = reason
 

@@ -1,6 +1,6 @@
 """Read user-specified files within size limits, and write files safely in shared folders.
 
-A path given by a user or in another file may refer to a device, a pipe without a writer, or a file
+A path from a user or from another file may refer to a device, a pipe without a writer, or a file
 that does not fit in memory. In a shared folder such as /tmp, another user may have placed a file or
 a link at the output path. Writing through such a link would overwrite its target.
 """
@@ -39,7 +39,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_file(path: Path, most: int = SIZE_MAX) -> bytes:
-    """Read a file. Raises OSError like `open_regular`, or if the file exceeds ``most`` bytes."""
+    """Read a file. Raises OSError if the file exceeds ``most`` bytes or `open_regular` fails."""
     with open_regular(path) as file:
         data = file.read(most + 1)
     if len(data) > most:

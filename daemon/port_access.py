@@ -14,7 +14,7 @@ def port_group_remedy(path: str) -> str:
 
 
 def serial_group() -> str:
-    """Return the group of serial ports: ``dialout``, or ``uucp`` if only ``uucp`` exists."""
+    """Return the group that owns serial ports: ``dialout``, or ``uucp`` if only ``uucp`` exists."""
     import grp  # Some client systems lack this module.
 
     groups = {each.gr_name for each in grp.getgrall()}

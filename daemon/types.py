@@ -1,9 +1,9 @@
 """Define the plain records that the pipeline stages exchange.
 
-Per-finger lists have length 2, left finger first. For a finger that is not in the scene, the values
-stay 0 and ``valid`` is False. Values are plain floats because each tick accesses the values one at
-a time. All quantities are in SI units. A positive joint angle closes the finger. ``t`` is the clock
-time in seconds.
+Per-finger lists have two entries, the left finger first. For a finger that is not in the scene, the
+values stay 0 and ``valid`` is False. Values are plain floats because each tick accesses the values
+one at a time. All quantities are in SI units. A positive joint angle closes the finger. ``t`` is
+the clock time in seconds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # Clients that only send commands do not need NumPy.
 FINGERS = ("left", "right")
 STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # default addresses
 COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
-# Commands that can only make the hand safer.
+# Commands that cannot make the hand less safe.
 NO_LEASE_COMMANDS = frozenset({"stop", "disarm", "status"})
 GRIP_FRACTION = 0.9  # maximum grip force as a fraction of `safety.force_max`
 Event = tuple[str, str, str]  # level, kind, text
