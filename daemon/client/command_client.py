@@ -181,7 +181,7 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 
 
 class HandClient(Generic[_Done]):
-    """Base class of `Hand` and `AsyncHand`; stores the addresses and defines the commands.
+    """Store the addresses and define the commands of `Hand` and `AsyncHand`.
 
     A command method raises Refused if the daemon refuses the command, and NoAnswer if the daemon
     does not reply. If the daemon refuses a late command, the client sends the command again until

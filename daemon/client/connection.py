@@ -34,7 +34,7 @@ def default_addresses() -> tuple[str, str]:
 
 
 def both_addresses(named: str, where: str) -> tuple[str, str]:
-    """Parse ``named`` into the stream address and the command address.
+    """Parse the stream address and the command address from ``named``.
 
     The string ``tcp://HOST`` selects the default ports. Otherwise, ``named`` contains both
     addresses, separated by a comma. Raises SettingsError if the string has any other form. The

@@ -97,7 +97,7 @@ class Gaps:
         self._received: deque[int] = deque(maxlen=_STORED_MESSAGE_COUNT)
 
     def take(self, message: dict[str, Any]) -> bool:
-        """Count one message; return False if it is a repetition."""
+        """Count one message; return False if the message is a repetition."""
         place = message.get("number")
         if not isinstance(place, int):
             seq, step = message.get("seq"), message.get("seq_step", 1)
