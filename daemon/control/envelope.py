@@ -2,7 +2,7 @@
 
 `softfinger envelope --keep` creates a map of the objects that the hand can hold. The `grasp`
 command uses the map to warn about grasps that may fail. A map is valid only for the hand that was
-simulated. The packaged map was simulated with the built-in hand.
+simulated. The packaged map was computed for the built-in hand.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ class Envelope:
 
         The map contains several object sizes. The lookup uses the size nearest to `object.width`.
         The map also contains several friction coefficients. The lookup uses the highest coefficient
-        up to `control.tip_friction`. The mass is calculated from `control.object_load`. It is then
-        scaled by the ratio (force limit in the map)/(force limit of this grip).
+        up to `control.tip_friction`. The mass is calculated from `control.object_load`. The mass is
+        then scaled by the ratio (force limit in the map)/(force limit of this grip).
         """
         if not self._is_valid:
             return ""

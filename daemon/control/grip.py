@@ -4,24 +4,26 @@
 close, the grip force changes. If one finger closes and the other opens (q1 + δ, q2 − δ), the object
 moves. Every control law therefore has two parts:
 
-1. The *grip* part controls the force. The feed-forward torque is moment arm × target force + joint
-   friction. A PI controller corrects the force error. The damping is matched to the tip stiffness.
-2. The *steering* part controls the object angle. It is the serial two-phased controller from the
-   literature on soft fingertips. The integral of the angle error is added to the goal of one joint
-   and subtracted from the goal of the other joint. A PD controller makes the joints follow their
-   goals. The object rotates at φ̇ = r1 q̇1 − r2 q̇2 (`GraspState.jacobian_rotation`).
+1. The *grip* part controls the force. The feed-forward torque is the product of moment arm and
+   target force, plus the joint friction. A PI controller corrects the force error. The damping is
+   matched to the tip stiffness.
+2. The *steering* part controls the object angle. The steering part is the serial two-phased
+   controller from the literature on soft fingertips. The integral of the angle error is added to
+   the goal of one joint and subtracted from the goal of the other joint. A PD controller makes the
+   joints follow their goals. The object rotates at φ̇ = r1 q̇1 − r2 q̇2
+   (`GraspState.jacobian_rotation`).
 
 If ``control.law`` is ``"energy"``, the moment arms are computed from the gradient of the tips'
 elastic energy. The contact table stores the elastic energy. The computation assumes that the tips
 roll, so the moment arms include the effect of moments and shear forces at the tips.
 
 If ``control.law`` is ``"upright"``, the control law ignores the object angle until a command sets a
-target angle. The upright law applies the same torque and the same damping to both joints, as in the
-literature on blind grasping. A virtual spring acts between the fingers (`hand.upright`). With the
-spring, the elastic energy of the tips is lowest when the object is upright, whatever the residual
-shear in the tips. Antisymmetric dither overcomes the joint friction until the object is upright.
-The control law then holds the antisymmetric joint angle. After a command has set a target angle,
-each moment arm is the distance from the pivot to the line of action of the force.
+target angle. The upright law applies equal torque and damping to both joints, as in the literature
+on blind grasping. A virtual spring acts between the fingers (`hand.upright`). With the spring, the
+elastic energy is lowest when the object is upright, even if the tips retain some shear.
+Antisymmetric dither overcomes the joint friction until the object is upright. The control law then
+holds the antisymmetric joint angle. After a command has set a target angle, each moment arm is the
+distance from the pivot to the line of action of the force.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class GripState(Record):
     offset_rate: float  # rate of change of `offset` [rad/s]
     offset: float  # goal for (q1 − q2)/2 [rad]
     dither_elapsed: float  # time since the dither began [s]
-    last_time: float  # time of the last call of `_equal_torques` or `start` [s]
+    last_time: float  # time of the last call to `_equal_torques` or `start` [s]
     balance_offset: float  # part of `offset` that equalises the tip forces [rad]
     closing_friction: float  # fraction of the joint friction that is compensated during closing
     torque: Pair  # most recent torques of both joints [N·m]
@@ -233,7 +233,7 @@ def _grip_force(g: GripState, target: float, measured: float, bound: float, limi
 
 @inner_kernel
 def _force_limit(g: GripState, load: float, arm: float) -> float:
-    """Return an upper limit for the grip force [N] without using the sensors.
+    """Return an upper limit for the grip force [N], independent of the tactile readings.
 
     The limit is the target force plus three margins. The margins cover the torque constant error,
     the joint friction and the torque ``load`` [N·m] that the detected load causes. ``arm`` is the
@@ -370,8 +370,8 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     phase = law.dither_rate * g.dither_elapsed
     amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
     if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
-        # Measure the time by the clock. If ticks are late, counting ticks would slow the dither. A
-        # slow dither could excite the resonance of the fingers on the soft tips at 1 to 2 Hz.
+        # Measure the time with the clock. If ticks are late, counting ticks would slow the dither.
+        # A slow dither could excite the resonance of the fingers on the soft tips at 1 to 2 Hz.
         g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
     return torque

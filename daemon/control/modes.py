@@ -204,5 +204,5 @@ COMMANDS: dict[str, CommandKind] = {
     ),
 }
 
-# Commands that never stiffen or move the hand. These commands have a higher age limit.
+# The age limit is higher for these commands, which never stiffen or move the hand.
 SAFE_COMMANDS = frozenset({"disarm", "tare", "clear"})

@@ -112,7 +112,7 @@ class Setpoint:
     """
 
     def __init__(self, dt: float, window: float, state: SetpointState) -> None:
-        """Create a setpoint with tick period ``dt`` [s] and averaging time ``window`` [s]."""
+        """Create a setpoint with a tick period ``dt`` and an averaging time ``window`` [s]."""
         self.state = state
         self.state.dt = dt
         self.state.first.length = max(round(window / dt), 1)
@@ -131,7 +131,7 @@ class Setpoint:
 
     @property
     def target(self) -> float:
-        """Target value; it may be set on any tick."""
+        """Target value, which may change on any tick."""
         return self.state.target
 
     @target.setter

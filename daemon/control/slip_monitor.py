@@ -1,6 +1,7 @@
 """Estimate the load on a held object and the grip force that the load requires.
 
-On each tick, the monitor computes (see `SlipLaw`, `SlipState` and `GraspState` for the symbols):
+On each tick, the monitor computes the quantities below. `SlipLaw`, `SlipState` and `GraspState`
+define the symbols.
 
     r         low-pass filtered torque residual of each joint; r̄ is the mean of both joints
     L         load per tip: r̄ − offset = load_arm L + load_curvature L²               (`load_of`)
@@ -10,9 +11,9 @@ On each tick, the monitor computes (see `SlipLaw`, `SlipState` and `GraspState` 
     force     min(max(commanded, needed), force_limit)
 
 **Offset.** Gear friction, modulus errors and torque constant errors cause a residual even without a
-load. The offset is measured when holding begins, and again after the force or the angle has
-changed. A load detected during the previous hold is not part of the offset. The offset then follows
-r̄ slowly, with a time constant of up to _SETTLING_TIME. While the joints are stationary, friction
+load. The offset is measured when a hold begins, and again after the force or the angle has changed.
+A load detected during the previous hold is not part of the offset. The offset then follows r̄
+slowly, with a time constant of up to _SETTLING_TIME. While the joints are stationary, friction
 balances any change in the commanded torque, so the change is added to the offset immediately. The
 offset stays within ±`friction` of its initial value. Because rubber relaxes, the lower end of the
 range is extended by _RELAXATION_SHARE of the tip moment.
@@ -25,11 +26,11 @@ simultaneously, or when |L| exceeds 2 friction/load_arm.
 
 **Sudden events** increase the force immediately. The force increases to its limit if the torques
 jump by more than the noise while both joints yield. With solid tips, a jump in the measured shear
-has the same effect. The shear of the tips allows the object to rotate by up to μ (d1 + d2)/2W. If
-the object rotates further, the force increases by the fraction _ROTATION_INCREASE. A sliding tip
-transmits only its friction force, so the size of a sudden load is unknown. A pull changes both
-torques in the same direction. A twist changes the torques in opposite directions. A sideways push
-has the same effect on the torques as a twist.
+has the same effect. Because the tips shear, the object can rotate by μ (d1 + d2)/2W without
+slipping. If the object rotates further, the force increases by the fraction _ROTATION_INCREASE. A
+sliding tip transmits only its friction force, so the size of a sudden load is unknown. A pull
+changes both torques in the same direction. A twist changes the torques in opposite directions. A
+sideways push has the same effect on the torques as a twist.
 
 A force increase is held for _SETTLING_TIME. The increase then decays at the rate
 increase_max/_DECAY_TIME.
@@ -102,7 +103,7 @@ class SlipState(Record):
     moment: float  # moment of the tip forces at the start of the hold [N·m]
     holding_time: float  # time since the start of the hold, at most _SETTLING_TIME [s]
     load: float  # load per tip, including the part hidden by friction [N]
-    assumed_load: float  # largest of `load`, measured shear and half the declared load [N]
+    assumed_load: float  # largest of `load`, the measured shear and half the declared load [N]
     is_confirmed: bool  # True if a load may increase the force by more than _UNCONFIRMED_SHARE
     pull: float  # average pulling force measured by solid tips [N]
     twist: float  # average twisting force measured by solid tips [N]
@@ -155,8 +156,8 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     """Begin holding, or continue after the force or the angle has changed.
 
     If the previous hold ended without a load, the offset is set to the present residual. Otherwise,
-    the load is assumed to persist, but the offset is limited to its range. The range scales with
-    the force.
+    the load is assumed to persist, but the offset stays within the permitted range. The range
+    scales with the force.
     """
     s.is_watched = grasp.load_arm > 0.0
     if not s.is_watched:
@@ -240,7 +241,7 @@ def update(
 def _update_friction(s: SlipState, grasp: GraspState) -> float:
     """Set the joint friction and the usable tip friction; return the unclipped tip friction.
 
-    Rolling uses part of the tip friction. The part increases with the grip force.
+    Rolling uses a part of the tip friction that increases with the grip force.
     """
     law = s.law
     free_torque = max(mean(grasp.free_torque), law.joint_friction)
@@ -370,7 +371,7 @@ def _has_jumped(
 def _detect_shear_jump(
     s: SlipState, pull: float, twist: float, is_held: bool, sudden_min: float
 ) -> bool:
-    """Average the shear loads [N] that solid tips measure; return True if a shear load jumped."""
+    """Average the shear loads [N] that solid tips measure; return True if a load jumped."""
     pull_jump = pull - s.pull
     twist_jump = twist - s.twist
     s.pull += pull_jump * s.law.dt / _AVERAGE_TIME
@@ -401,8 +402,8 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
-    # Joint friction can hide loads of up to `hidden`. The estimate is 0 up to |L| = `hidden`/2. It
-    # then rises to |L| + `hidden` at |L| = `hidden`.
+    # Joint friction can hide loads of up to `hidden`. The estimate is 0 up to |L| = `hidden`/2. The
+    # estimate then rises to |L| + `hidden` at |L| = `hidden`.
     threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
     hidden = s.friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)

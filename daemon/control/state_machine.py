@@ -69,8 +69,8 @@ _EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
 # Tolerance for a streamed force target, as a fraction of the target. A streamed target may never
-# stop changing. A grip therefore also counts as settled if the force has reached a setpoint that is
-# within the tolerance of the target.
+# stop changing. A grip therefore also counts as settled if the force has reached a setpoint within
+# the tolerance.
 _STREAM_TOLERANCE = 0.25
 # Limits below which a change in a streamed setpoint, or a force increase, counts as noise.
 # _FORCE_NOISE is a fraction of the force. _ANGLE_NOISE is the standard deviation of the angle
@@ -381,7 +381,7 @@ class Control:
         # The tip may reach the object before the sensor detects contact. Limit the current so that
         # the tip force can't exceed the commanded force.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
-        # The joint friction may exceed the setting, so also allow for `free_torque`, which is the
+        # The joint friction may exceed the setting. Therefore, also allow for `free_torque`, the
         # friction torque measured in free motion. Otherwise, the joint might not move at the
         # limited current.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
