@@ -119,7 +119,7 @@ class ScalesStep(_StepModel):
     """A finger's calibration factors, each stored as (mean, relative standard deviation).
 
     The factors are measured while the hand grips an object. ``modulus`` is relative to the modulus
-    in this file, or to the modulus in the settings if the file contains no modulus.
+    in this file. If the file contains no modulus, ``modulus`` is relative to the settings.
     """
 
     date: str
@@ -279,7 +279,8 @@ class Converter:
     def pressure(self, readings: FloatArray) -> FloatArray:
         """Convert readings to pressure [Pa].
 
-        Noise may make readings negative, so the curve is extended as an odd function.
+        Noise may make readings negative, so the curve is extended to negative readings as an odd
+        function.
         """
         exponent, c1, c2, c3 = self._curve.tolist()
         x = np.abs(readings)
@@ -348,7 +349,7 @@ def _contradiction(calibration: Calibration) -> str:
 
 
 def _usb_serial(settings: Settings, finger: int) -> str:
-    """Return the serial number of the USB adapter on a finger's port, or "" without an adapter."""
+    """Return the serial number of a finger's USB adapter, or "" if there is no adapter."""
     tactile = settings.tactile
     if tactile.backend in ("simulated", "replay", "none"):
         return ""

@@ -71,7 +71,7 @@ def make_models(
             calibration = calibration_for(settings, finger)
         if measured:
             if name not in settings.scene.fingers:
-                continue  # Copy the model of the other finger below.
+                continue  # The model of the other finger is copied below.
             material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
             table = make_table(settings, material, tip)
         elif calibration is not None and calibration.modulus is not None:

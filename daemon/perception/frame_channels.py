@@ -97,7 +97,7 @@ class Scan(NamedTuple):
 
 
 class FingerMotion(NamedTuple):
-    """Accumulated predicted motion of one finger at one instant."""
+    """Predicted motion of one finger, accumulated up to a given time."""
 
     d: float
     spread: float
@@ -401,10 +401,10 @@ def _is_rejected(
 
     A jump in angle or displacement is an outlier unless the other tip or the joints confirm the
     jump. A rotation is accepted if both tips show the rotation while the joints are moving. If the
-    joints are at rest, both tips must show the rotation, and the rotation must continue in the next
-    frame. A displacement is accepted if the joints are moving or if both tips are displaced. A blow
-    displaces both tips, because it presses the object into one tip and away from the other. The
-    first frame of a real jump is also rejected, because the other tip's frame has not arrived yet.
+    joints are at rest, the rotation must also continue in the next frame. A displacement is
+    accepted if the joints are moving or if both tips are displaced. A blow displaces both tips,
+    because it presses the object into one tip and away from the other. The first frame of a real
+    jump is also rejected, because the other tip's frame has not arrived yet.
     """
     grasp = h.grasp
     tip = h.tip[finger]

@@ -86,7 +86,7 @@ class GraspResult(NamedTuple):
 
 @inner_kernel
 def _log_slope(h: HandFilter, finger: int) -> float:
-    """Return ∂ ln F/∂d [1/m] of a tip.
+    """Return ∂ ln F/∂d [1/m] for a tip.
 
     If the gain is fixed, the slope of the footprint channel is returned. If two channels used
     different slopes, unobservable directions of the state would appear observable.
@@ -100,7 +100,7 @@ def _log_slope(h: HandFilter, finger: int) -> float:
 
 @inner_kernel
 def _set_torque_slopes(h: HandFilter) -> float:
-    """Return the mean joint torque due to the tip forces [N·m], and set the slopes of the torque.
+    """Return the mean joint torque [N·m] due to the tip forces; set its derivatives in `slopes`.
 
     Each joint contributes (1 + TORQUE) M, where M is the moment of the tip force about the joint. M
     equals the joint torque divided by (1 + TORQUE), minus the torque residual. M is proportional to
@@ -201,7 +201,7 @@ def _write_tip(h: HandFilter, finger: int, theta: float, table: FloatArray) -> T
 
 @kernel
 def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArray) -> GraspResult:
-    """Write the grasp for the current state, then update the state with the joint torques."""
+    """Compute the grasp from the current state, then update the state with the joint torques."""
     h = hands[0]
     grasp = h.grasp
     left = h.tip[0]
@@ -271,7 +271,7 @@ def _write_load(
 
 @inner_kernel
 def _write_shear(h: HandFilter) -> None:
-    """Split the shear of solid tips into pull and twist.
+    """Split the shear of solid tips into a pulling part and a twisting part.
 
     A pull shears the two tips in opposite directions. A twist shears both tips in the same
     direction.

@@ -8,17 +8,17 @@ state with measurements.
 
 The object angle φ is the direction of the bisector between the two object faces. The taper α is the
 angle between the faces. The initial value of α is ``object.taper``. The filter updates α with the
-frames of both tips. A shifted sensor has the same effect on the frames as a taper. The
+frames of both tips. A shifted sensor has the same effect on the frames as a tapered object. The
 ``hand.angle`` limit therefore compares the frames with the setting ``object.taper``.
 
-A disc has no faces. For a disc, φ is the direction of the line between the contacts, and ``rotate``
-rotates this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per radian of joint angle. With
-the built-in hand and a disc of radius R = 20 mm, the line rotates by 0.4 rad per radian of joint
-angle. The prediction assumes faces, which would rotate by 1.5 rad per radian of joint angle. The
-frames correct the error of the prediction. A rotation of a disc therefore takes longer, and the
-disc rolls further than commanded. For a disc, φ is about 5 % too small, because a curved contact
-appears less tilted than it is. If the fingers are straight or lean outwards, the line does not
-follow the joint motion. A disc with R ≥ 30 mm can be held, but its rotation stops at the tip
+A disc has no flat faces. For a disc, φ is the direction of the line between the contacts, and
+``rotate`` rotates this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per radian of joint
+angle. With the built-in hand and a disc of radius R = 20 mm, the line rotates by 0.4 rad per radian
+of joint angle. The prediction assumes flat faces, which would rotate by 1.5 rad per radian of joint
+angle. The frames correct the error of the prediction. A rotation of a disc therefore takes longer,
+and the disc rolls further than commanded. For a disc, φ is about 5 % too small, because a curved
+contact appears less tilted than it is. If the fingers are straight or lean outwards, the line does
+not follow the joint motion. A disc with R ≥ 30 mm can be held, but its rotation stops at the tip
 limits.
 """
 
@@ -65,7 +65,7 @@ class HandEstimator:
     ) -> None:
         """Create the estimator.
 
-        Each tip has a contact table, priors and a material. The material provides the error of the
+        Each tip has a contact table, priors and a material. The material specifies the error of the
         stress-strain law.
         """
         hand, gear = settings.hand, settings.servos.gear_ratio
@@ -173,7 +173,7 @@ class HandEstimator:
         """Update the state with the ``estimate`` from a finger's ``frame``, and fill ``contact``.
 
         ``has_changed`` is False for a frame that is identical to an earlier frame. During contact,
-        an identical frame indicates a frozen board or old data, so the filter ignores the frame.
+        an identical frame indicates a frozen board or stale data, so the filter ignores the frame.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
@@ -272,7 +272,7 @@ class HandEstimator:
 
 
 def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
-    """Return (∂U/∂θ)/(F θ d) of a nearly upright tip (springs: 2/3, solid rubber: about 0)."""
+    """Return (∂U/∂θ)/(F θ d) for a nearly upright tip (springs: 2/3, solid rubber: about 0)."""
     d, theta = 0.15 * radius, 0.05
     contact = table(d, theta)
     return float(contact.energy_theta / (contact.force * d)) / theta

@@ -16,8 +16,8 @@ LATENCY         s      frame age beyond `tactile.latency`           (constant in
 FRICTION        N·m    mean joint torque not explained by the       slow drift
                        grip force
 
-Each finger has its own states from D to TORQUE. The named index refers to the left finger, and the
-next index refers to the right finger. All quantities are in SI units.
+Each finger has its own states from D to TORQUE. Each name is the index for the left finger, and the
+next index is for the right finger. All quantities are in SI units.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ FloatArray = NDArray[np.float64]
 D, ENCODER, D_BIAS, ANGLE_BIAS, MODULUS, GAIN, TORQUE = range(0, 14, 2)
 ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 
-# Index of each measurement channel in `grasp.CHANNELS`. For the first four channels, the next index
-# refers to the right tip.
+# Index of each measurement channel in `grasp.CHANNELS`. For the first four channels, each name is
+# the index for the left tip. The next index is for the right tip.
 ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-# Time span of the stored joint motion [s]. The assumed age of a frame is limited to this span.
+# Time span of the stored joint motion [s]. The assumed age of a frame is limited to HISTORY_TIME.
 HISTORY_TIME = 0.5
 LAW_POINTS = 17  # number of evenly spaced values of d from 0 to the tip radius
 
@@ -55,14 +55,14 @@ TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies wi
 # Random walks during a grip (per √s)
 _WALK_CLOSING = 2e-5  # random walk of d1 + d2 [m]; small because the object has a constant width
 _WALK_SIDEWAYS = 3e-4  # random walk of d1 − d2 [m]; the object can move between the tips
-_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # random walk of d1 − d2 if frames measure only force times gain
+_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # random walk of d1 − d2 if frames measure only force × gain
 _WALK_LOOSE_D = 5e-3  # random walk of d for a contact without a grip [m]
 _WALK_LOOSE_ANGLE = 2e-2  # random walk of the angle for a contact without a grip [rad]
 _WALK_ANGLE = 2e-4  # random walk of the angle due to tip creep [rad]
 _WALK_D_BIAS = 1e-4  # zero drift during sensor warm-up [m]
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
-_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force times gain
+_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force × gain
 _VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
 _VARIANCE_MIN = 1e-6  # minimum ratio of measurement variance to predicted variance
 _CURRENT_ERROR = 0.25  # tolerated deviation of a current from its goal, as a fraction of the goal
@@ -76,7 +76,7 @@ class TrackedTip(Record):
     in_contact: bool
     touch_time: float  # time at which the contact began [s]
     has_new_frame: bool  # True if a frame has arrived since the last update with joint torques
-    gain_is_fixed: bool  # True if the frames measure force times gain instead of displacement
+    gain_is_fixed: bool  # True if the frames measure force × gain instead of displacement
     rejected_count: int  # number of consecutive rejected frames
     last_angle_jump: float  # `grasp.angle_jump` of the previous frame [rad]
     current_off_time: float  # time since the current began to differ from its goal [s]
@@ -90,7 +90,7 @@ class TrackedTip(Record):
     speed: float  # joint speed [rad/s]
     torque: float  # joint torque [N·m]
     free_torque: float  # average torque without contact [N·m]
-    free_torque_max: Pair  # maximum |free_torque| in the current and the previous window [N·m]
+    free_torque_max: Pair  # maximum |free_torque| in this window and in the previous window [N·m]
     window_start: float  # [s]
     travel: Pair  # accumulated predicted change in d [m] and in the joint angle [rad]
     law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F
@@ -99,7 +99,7 @@ class TrackedTip(Record):
 
 
 class HistoryRow(Record):
-    """Predicted motion at one instant, low-pass filtered with the response time of the cells."""
+    """Predicted motion up to a given time, low-pass filtered with the cells' response time."""
 
     t: float
     d: Pair
@@ -423,9 +423,9 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
     """Update the state with the encoder angle.
 
-    The angle is precise at the moment when the encoder count changes. Between two changes, the
-    angle is uncertain by one count. ``step`` is the joint motion since the last reading [rad],
-    computed from the joint velocity.
+    The angle is known precisely only when the encoder count changes. Between two changes, the angle
+    is uncertain by one count. ``step`` is the joint motion since the last reading [rad], computed
+    from the joint velocity.
     """
     tip = h.tip[finger]
     at = ENCODER + finger
@@ -474,8 +474,8 @@ def _measure_free_torque(
 ) -> None:
     """Measure the friction of a joint as the maximum torque during free motion.
 
-    Readings from the last `frame_age_max` seconds are excluded. During this time, the tip may
-    already be in contact although no frame shows the contact.
+    Readings from the last `frame_age_max` seconds are excluded, because the frames may not yet show
+    a contact that has already begun.
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt

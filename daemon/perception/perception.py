@@ -39,7 +39,7 @@ class Perception:
         sensors: Mapping[int, TactileSensor],
         models: tuple[FingerModel, FingerModel],
     ) -> None:
-        """Create the perception; ``sensors`` maps finger indices to sensors."""
+        """Create the perception stage; ``sensors`` maps finger indices to sensors."""
         self.events: list[Event] = []  # events that the loop publishes and then removes
         self.fingers = [
             FingerPerception(sensor, models[finger], settings, self.events)
@@ -94,7 +94,7 @@ class RepeatDetector:
 
     @property
     def is_repeating(self) -> bool:
-        """True if the last two frames arrived earlier in the same order."""
+        """True if the last two frames repeat two earlier frames in the same order."""
         return self._enabled and self._repeated_count > 1
 
     @property
@@ -124,7 +124,7 @@ class FingerPerception:
     def __init__(
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
-        """Create the perception for one finger. Each tare appends an event to ``events``."""
+        """Create the perception stage for one finger. Each tare appends an event to ``events``."""
         # Some recordings specify the count at which their cells saturated.
         full = getattr(sensor, "full_count", None)
         if full is not None and full < settings.tactile.full_count:

@@ -1,9 +1,9 @@
 """Use the cells outside the tip to measure the zero shift and the noise of a sensor.
 
-An unloaded cell reads its zero offset plus noise. With a tip radius of 20 mm, about 60 % of a grid
-that is 58 mm wide lies outside the tip. The outer cells show the zero offset and the noise even
-while the tip is in contact. A second contact that loads only a few outer cells does not change the
-median reading. Readings are clipped at 0, so unloaded cells cannot show a negative zero offset.
+An unloaded cell reads its zero offset plus noise. With a tip radius of 20 mm, about 60 % of a 58 mm
+wide grid lies outside the tip. The outer cells show the zero offset and the noise even while the
+tip is in contact. A second contact that loads only a few outer cells does not change the median
+reading. Readings are clipped at 0, so unloaded cells cannot show a negative zero offset.
 `perception.frame_channels` detects a negative offset from the joint motion while the fingers close.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _RIM_DISTANCE = 2.0  # minimum distance of an unloaded cell from the tip rim, in cell pitches
-_CELL_COUNT_MIN = 50  # number of cells required to estimate the zero shift and the noise
+_CELL_COUNT_MIN = 50  # minimum number of cells for estimating the zero shift and the noise
 _AVERAGED_FRAME_COUNT = 8  # time constant of the noise average, in calls to `update`
 _CLIPPED_FRACTION = 0.25  # fraction of cells that read 0 above which the noise counts as clipped
 _CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # fraction of the variance that remains after clipping at 0
