@@ -1,9 +1,9 @@
 """Look up servo, tactile and shape backends by name, and import them on demand.
 
-Built-in backends are listed in `BUILT_IN`. A plugin is an entry point that an installed package
-defines in the group ``softfinger.servos``, ``softfinger.tactile`` or ``softfinger.shapes``. Servo
-and tactile plugins are classes, and shape plugins are functions. Plugins take the same arguments as
-the built-in backends. A plugin may define these attributes:
+`BUILT_IN` lists the built-in backends. A plugin is an entry point that an installed package defines
+in the group ``softfinger.servos``, ``softfinger.tactile`` or ``softfinger.shapes``. Servo and
+tactile plugins are classes, and shape plugins are functions. Plugins take the same arguments as the
+built-in backends. A plugin may define these attributes:
 
 - ``metal``: True (default) if the backend drives real hardware.
 - ``hand``: True if the plugin needs the simulated hand. The daemon then passes the simulated hand
@@ -37,7 +37,7 @@ class Backend(NamedTuple):
     metal: bool = True  # True for real hardware
     hand: Any = False  # True, or the class of the hand, if a simulated hand is needed
     name: str = ""  # plugin name, or empty for a built-in backend
-    source: str = ""  # plugin name, package and version for messages
+    source: str = ""  # plugin name, package and version, used in messages
     section: type[BaseModel] | None = None  # plugin's settings model
 
     def options(self, tables: Mapping[str, Any]) -> tuple[BaseModel, ...]:
@@ -79,7 +79,7 @@ BUILT_IN: dict[Kind, dict[str, Backend]] = {
 
 
 def backend(kind: Kind, name: str) -> Backend:
-    """Return the backend with this name.
+    """Return the backend called ``name``.
 
     Raises KeyError if the name is unknown, and PluginError if the plugin is unusable.
     """
@@ -129,7 +129,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
 
 
 def servo_model(name: str) -> Any:
-    """Return the `ServoModel` with this name.
+    """Return the `ServoModel` called ``name``.
 
     If the name is unknown, raises a KeyError that lists all model names.
     """

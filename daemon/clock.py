@@ -106,9 +106,9 @@ class Deadline:
 class RealClock:
     """The machine's monotonic clock.
 
-    Each sleep ends with a busy wait of ``spin`` [s]. The busy wait hides the wake-up latency of the
-    system, which is tens of microseconds. During the busy wait, the processor is not available to
-    other threads.
+    Each sleep ends with a busy wait of ``spin`` [s]. The busy wait hides the system's wake-up
+    latency of tens of microseconds. During the busy wait, the processor is not available to other
+    threads.
     """
 
     now = staticmethod(time.monotonic)
@@ -136,8 +136,8 @@ class HandClock:
 
     The clock's time changes only during a sleep. After a sleep, the time equals the sleep's
     deadline, even if the machine woke up late. If a delay is shorter than the time to the next
-    deadline, the clock catches up. If the delay is longer, the excess is added to ``behind`` and
-    does not affect the hand's time. An emulated hand must not advance past ``due``.
+    deadline, the next sleep is shorter. If the delay is longer, the excess is added to ``behind``
+    and does not affect the hand's time. An emulated hand must not advance past ``due``.
     """
 
     pauses_when_late = True

@@ -140,7 +140,7 @@ class Refused(SoftfingerError):
     """Rejected command. The reply to the client contains this exception's message."""
 
     def __init__(self, text: str, reason: Reason | str = Reason.STATE) -> None:
-        """``reason`` is a `Reason`, or any string if the client and daemon versions differ."""
+        """``reason`` is a `Reason`, or another string if the client and daemon versions differ."""
         super().__init__(text)
         self.reason = reason
 

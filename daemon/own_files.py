@@ -2,7 +2,7 @@
 
 A path from a user or from another file may refer to a device, a pipe without a writer, or a file
 that does not fit in memory. In a shared folder such as /tmp, another user may have placed a file or
-a link at the output path. Writing through such a link would overwrite its target.
+a link at the output path. Writing through a link would overwrite the target of the link.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from softfinger.kinematics.compiled.own_folder import (
     user_cache,
 )
 
-SIZE_MAX = 16 << 20  # maximum size of a file that is read at once or of an unpacked part [bytes]
+SIZE_MAX = 16 << 20  # maximum size of a file read in one piece, or of one unpacked part [bytes]
 
 _WORLD_WRITABLE = stat.S_IWOTH
 
@@ -59,7 +59,7 @@ def unpacked_size_max(file: BinaryIO) -> int:
 
 
 def runtime_folder() -> Path:
-    """Return the user's runtime folder, the default location of an emulated hand's port links.
+    """Return the user's runtime folder, which by default contains an emulated hand's port links.
 
     The folder is in XDG_RUNTIME_DIR or /run/user. If neither location is usable, the runtime folder
     is in the temporary folder and is named after the user. If another user owns a folder with that

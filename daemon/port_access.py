@@ -1,4 +1,4 @@
-"""Give advice for serial ports that cannot be opened."""
+"""Suggest remedies for serial ports that cannot be opened."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ _SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join merely 
 
 
 def port_group_remedy(path: str) -> str:
-    """Return advice for a missing port. A port outside /dev belongs to an emulated hand."""
+    """Suggest how to provide a missing port. A port outside /dev belongs to an emulated hand."""
     return "connect the adapter" if path.startswith("/dev/") else "start `softfinger emulate`"
 
 
 def serial_group() -> str:
     """Return the group that owns serial ports: ``dialout``, or ``uucp`` if only ``uucp`` exists."""
-    import grp  # Some client systems lack this module.
+    import grp  # Some client systems lack `grp`.
 
     groups = {each.gr_name for each in grp.getgrall()}
     return "uucp" if "uucp" in groups and "dialout" not in groups else "dialout"
@@ -23,7 +23,7 @@ def serial_group() -> str:
 
 def grant(path: str) -> str:
     """Return the command that gives this user access to the port."""
-    import grp  # Some client systems lack this module.
+    import grp  # Some client systems lack `grp`.
 
     try:
         status = Path(path).stat()

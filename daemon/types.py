@@ -1,7 +1,7 @@
 """Define the plain records that the pipeline stages exchange.
 
 Per-finger lists have two entries, the left finger first. For a finger that is not in the scene, the
-values stay 0 and ``valid`` is False. Values are plain floats because each tick accesses the values
+values stay 0 and ``valid`` is False. Values are plain floats because the code accesses the values
 one at a time. All quantities are in SI units. A positive joint angle closes the finger. ``t`` is
 the clock time in seconds.
 """
@@ -62,7 +62,7 @@ class Frame:
 
 @dataclass(slots=True)
 class Contact:
-    """Contact of one fingertip in the newest frame, extrapolated with later joint angles."""
+    """Contact of one fingertip, estimated from the newest frame and later joint angles."""
 
     seq: int = 0  # sequence number of the frame
     t: float = 0.0  # sample time of the frame [s]
@@ -114,13 +114,13 @@ class ObjectPose:
 
 @dataclass(slots=True)
 class Goal:
-    """Servo goals. The control law sets the goals in place, and `safety` limits them."""
+    """Servo goals. The control law modifies the goals in place, and `safety` limits the goals."""
 
     seq: int = 0
     t: float = 0.0
     valid: bool = False
     q: list[float] = field(default_factory=_pair)  # goal angle [rad]
-    current: list[float] = field(default_factory=_pair)  # limit of the absolute motor current [A]
+    current: list[float] = field(default_factory=_pair)  # limit for the absolute motor current [A]
     force: float = math.nan  # target mean tip force [N], NaN without a grip
     angle: float = math.nan  # target object angle [rad], NaN if not set
 
@@ -131,7 +131,7 @@ class ServoHeatEstimate:
 
     winding: float = 0.0  # [°C]
     winding_std: float = 0.0  # standard deviation [°C]
-    case: float = 0.0  # case temperature, not quantised like the thermometer reading [°C]
+    case: float = 0.0  # case temperature, without the thermometer's quantisation [°C]
     case_std: float = 0.0
     ambient: float = 0.0  # ambient temperature [°C]
     time_to_limit: float = 3600.0  # time until `safety.temperature_max` is reached, at most 1 h [s]
@@ -162,7 +162,7 @@ class State:
     fault_name: str = ""  # limit name in `safety.limits`
     torque: bool = False  # True if torque is on, or if the servos have not confirmed that it is off
     torque_off: bool = False  # True if the servos confirmed on this tick that torque is off
-    read_error: str = ""  # error in reading the servo bus on this tick
+    read_error: str = ""  # error while reading the servo bus on this tick
     write_error: str = ""
     reading: Reading = field(default_factory=Reading)
     contacts: list[Contact] = field(default_factory=lambda: [Contact(), Contact()])
@@ -206,7 +206,7 @@ class SensorInfo(NamedTuple):
 
 
 class HandInfo(NamedTuple):
-    """JSON texts that are constant while a daemon runs; empty if not available."""
+    """JSON texts that stay constant while a daemon runs; unavailable texts are empty."""
 
     version: str
     settings: str
