@@ -106,7 +106,7 @@ class Grip:
 
     @property
     def stopping_ratio(self) -> float:
-        """Smallest possible stop angle divided by the angle, or 0 if |angle| is not rising."""
+        """Ratio of the smallest possible stop angle to the angle, or 0 if |angle| is not rising."""
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
             return 0.0
@@ -147,7 +147,7 @@ class Grip:
         self._state.force_rate = abs(self.force.value - force_max) / duration
 
     def force_for_load(self) -> float:
-        """Return the force [N] that the load requires, with the slip margin and hidden load."""
+        """Return the force [N] required for the load, including the slip margin and hidden load."""
         law, grasp = self.slip.law, self._grasp
         load = self.slip.assumed_load
         if not law.has_shear and law.object_load == 0.0:  # Joint friction may hide a load.

@@ -153,7 +153,7 @@ def reset(s: SlipState) -> None:
 
 @inner_kernel
 def begin(s: SlipState, grasp: GraspState) -> None:
-    """Begin holding, or continue after the force or the angle has changed.
+    """Begin a hold, or continue a hold after the force or the angle has changed.
 
     If the previous hold ended without a load, the offset is set to the present residual. Otherwise,
     the load is assumed to persist, but the offset stays within the permitted range. The range

@@ -165,7 +165,7 @@ class Settled(Gripping):
 
 
 class Changing(Gripping):
-    """The force or the angle changes to a new target."""
+    """The force or the angle approaches a new target."""
 
     mode = Mode.HOLDING
 
@@ -363,7 +363,7 @@ class Control:
             goal.force = self.state.command.force
 
     def hold_goal(self, goal: Goal) -> None:
-        """Hold the goals while frames are late. Call this method instead of :meth:`step`.
+        """Set the goals while frames are late. Call this method instead of :meth:`step`.
 
         Outside a grip, the position goals stay the same. In a grip, the torque goals damp the
         joints and stop any rotation.
