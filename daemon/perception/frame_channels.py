@@ -9,7 +9,7 @@ amplitude   MODULUS + GAIN, if the gain was fitted                     2 %, fram
 A frame shows the hand at the time when the sensor scanned the cells. Each frame is therefore
 compared with the state at the scan time, which is computed from the joint history.
 `estimate.systematic` is the covariance of the errors that all frames share. The systematic
-covariance is not part of the measurement noise. It only increases the published standard
+covariance is not part of the measurement noise and only increases the published standard
 deviations.
 """
 

@@ -74,10 +74,10 @@ class Perception:
 class RepeatDetector:
     """Detector for repeated sequences of frames.
 
-    A noisy sensor never repeats a frame. At standstill, a sensor without noise may send one frame
-    repeatedly or alternate between two similar frames. The detector therefore ignores frames that
-    differ from the previous frame in fewer than four cells. The frozen-sensor check handles
-    constant frames.
+    A noisy sensor never repeats a frame. While the hand is at rest, a noise-free sensor may send
+    one frame repeatedly or alternate between two similar frames. The detector therefore ignores
+    frames that differ from the previous frame in fewer than four cells. The frozen-sensor check
+    handles constant frames.
     """
 
     def __init__(self, rate: float, fault_count: float, enabled: bool = True) -> None:

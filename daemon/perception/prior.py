@@ -11,8 +11,8 @@ CALIBRATED_ERROR = 0.05  # relative modulus error after `softfinger calibrate mo
 class Prior(NamedTuple):
     """Priors of one finger's calibration factors, each as (mean, relative standard deviation).
 
-    Remounting a sensor changes its gain by 5 to 32 % (DTIC ADP011007). A torque constant is known
-    to within 10 %.
+    Remounting a sensor changes its gain by 5 to 32 % (DTIC ADP011007). The torque constant of a
+    servo is known to within 10 %.
     """
 
     modulus: tuple[float, float] = (1.0, MODULUS_ERROR)
