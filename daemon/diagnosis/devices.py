@@ -1,8 +1,8 @@
-"""Check the hand's devices: the servos in the scene and the frames of each tactile board.
+"""Check the servos in the scene and the frames of each tactile board.
 
 The checks do not change settings. `softfinger doctor --fix` calls the `repair` functions, which
-configure adapters and servos. Torque is switched off before a servo's EEPROM is written, so the
-hand goes limp. Torque is never switched on, and the hand is never moved.
+configure adapters and servos. These functions switch torque off before they write a servo's EEPROM,
+so the hand goes limp.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ from softfinger.daemon.servos.torque import goal_address
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS, Frame
 
-_LISTEN_TIME = 0.5  # time during which frames are received [s]
+_LISTEN_TIME = 0.5  # duration of the frame rate measurement [s]
 _REST_NOISE_RATIO = 3.0  # maximum median pressure without load, as a multiple of the cell noise
 _RATE_TOLERANCE = 0.1  # tolerated relative error of the frame rate
-_POISSON_TOLERANCE = 0.02  # tolerance for Poisson's ratio, limited by the calibration accuracy
+_POISSON_TOLERANCE = 0.02  # tolerance for Poisson's ratio, set by the calibration accuracy
 
 
 def check_servos(settings: Settings) -> list[Finding]:
@@ -82,7 +82,7 @@ def check_servos(settings: Settings) -> list[Finding]:
 
 
 def _wait_for(line: ServoLine, settings: Settings) -> None:
-    """Wait up to ``servos.open_timeout`` for servos that have not replied yet, like `run`."""
+    """Wait up to ``servos.open_timeout`` for missing servos, as `softfinger run` does."""
     end = time.monotonic() + settings.servos.open_timeout
     missing = [settings.servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
     while missing:
@@ -96,9 +96,9 @@ def _try_exchange(
 ) -> list[Finding]:
     """If all servos are usable, measure how long the reads and writes of a tick take.
 
-    The writes have the same length and address as in a tick. The writes contain the current
-    register values, so nothing changes. If torque is on, or if a write could switch torque on, only
-    the reads are measured.
+    The writes use the address and length of the loop's writes. The writes contain the current
+    register values, so no register changes. Writes are omitted if torque is on, if the firmware
+    versions differ, or if a register cannot be read.
     """
     if not all(each.table and not each.errors for each in found):
         return []
@@ -156,7 +156,7 @@ def _described(servo: Examined, model: ServoModel) -> str:
 
 
 def _search(settings: Settings, model: ServoModel) -> list[Finding]:
-    """Search for servos at all baud rates of the model; explain how to use the servos found."""
+    """Search for servos at every baud rate of the model; explain how to use each servo found."""
     servos = settings.servos
     found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
     if found.old:
@@ -178,7 +178,7 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
 
 
 def _blame_power(examined: list[Examined]) -> list[Finding]:
-    """Report the most likely cause if servos are missing and the search finds no other servos."""
+    """Report the likely cause of missing servos if the search has found no other servos."""
     at = reg.PRESENT_INPUT_VOLTAGE
     volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
     problem = "no other servo replies at any baud rate"
@@ -196,7 +196,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
 
 
 def check_law(settings: Settings, finger: int) -> Finding:
-    """Compare a tip's configured contact law with the law that `calibrate law` identified."""
+    """Compare a tip's contact law in the settings with the result of `calibrate law`."""
     name, tip = f"tip {FINGERS[finger]}", settings.tip
     try:
         calibration = calibration_for(settings, finger)

@@ -1,7 +1,7 @@
 """Check the machine's scheduling, memory lock, idle states, clock and kernel cache.
 
-The problems found here only degrade the timing, so they are reported as warnings. The checks read
-the limits of this process. A daemon that is started from the same shell has the same limits.
+The daemon can run despite the problems found here, so they are reported as warnings. The checks
+read the limits of this process. A daemon that is started from the same shell has the same limits.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_fo
 _MEMORY = 1 << 30  # upper bound on the daemon's mapped memory [bytes]
 _WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
-# Minimum plausible Unix time [s]. If the time is earlier, the clock has not been set.
+# Earliest plausible Unix time [s]. A clock that shows an earlier time has not been set.
 _CLOCK_MIN = 1_700_000_000.0
 
 
@@ -49,7 +49,7 @@ def check_scheduling() -> Finding:
 
 
 def check_memory_lock(limit: int) -> Finding:
-    """Check the value of RLIMIT_MEMLOCK [bytes]; RLIM_INFINITY means unlimited."""
+    """Check that ``limit``, the value of RLIMIT_MEMLOCK [bytes], is high enough."""
     if os.geteuid() == 0:
         return Finding("pass", "memory lock", "not limited for root")
     if limit == resource.RLIM_INFINITY:
@@ -78,7 +78,7 @@ def check_idle_states(path: Path) -> Finding:
 
 
 def check_wall_clock(now: float) -> Finding:
-    """Check that the Unix time ``now`` [s] is plausible, because all messages contain the time."""
+    """Check that the Unix time ``now`` [s] is plausible, because messages contain timestamps."""
     if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
@@ -87,7 +87,7 @@ def check_wall_clock(now: float) -> Finding:
 
 
 def wake_ups() -> list[float]:
-    """Sleep in the same way as between ticks, and return the wake-up delays [s]."""
+    """Sleep as the loop does between ticks, and return the wake-up delays [s]."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UP_COUNT):

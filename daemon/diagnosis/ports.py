@@ -48,8 +48,8 @@ def check_runtime_folder() -> Finding:
 def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     """Check that a port exists, can be opened, and is not in use by another process.
 
-    The port is closed afterwards. ``key`` is the setting that names the port. ``mode_of_daemon`` is
-    the mode of a running daemon that may be using the port, or empty if no daemon is running.
+    The port is closed afterwards. ``key`` is the setting that specifies the port.
+    ``mode_of_daemon`` is the mode of the running daemon, or empty if no daemon is running.
     """
     try:
         mode = Path(path).stat()
@@ -111,7 +111,7 @@ def _is_daemon(process: int) -> bool:
 
 
 def users(path: str) -> list[tuple[int, str]]:
-    """Return (process, name) for each visible process that has the port open.
+    """Return (process ID, process name) for each visible process that has the port open.
 
     The list excludes the process that owns the other end of a pseudo-terminal.
     """
@@ -162,7 +162,7 @@ _TIMEOUT = 0.5  # timeout for a daemon's reply [s]
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
-    """Check that all addresses can be bound; if one is in use, report whether a daemon uses it."""
+    """Check that all addresses can be bound; report whether a daemon uses an occupied address."""
     found = [
         _check(settings, "stream.address", settings.stream.address),
         _check(settings, "commands.address", settings.commands.address),

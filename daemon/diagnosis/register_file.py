@@ -1,4 +1,4 @@
-"""Save the registers of the servos to a file, and restore the registers from a file.
+"""Save the servos' registers to a file, and restore them from a file.
 
 The file contains JSON with the register names from `servos.register_table.REGISTERS`:
 ``{"servos": [{"id": 1, "model": "XM430-W350", "firmware": 48, "registers": {NAME: value}}]}``.
@@ -53,7 +53,7 @@ class StoredServos(Section):
 
 
 def save_registers(settings: Settings, path: Path) -> list[Finding]:
-    """Save each replying servo's registers, except the ID and baud rate registers."""
+    """Save the registers of each servo that replies, except for ID and baud rate."""
     servos: list[StoredServo] = []
     found = []
     with open_line(settings.servos.port, settings.servos.baud) as line:

@@ -12,22 +12,22 @@ from typing import NamedTuple
 MEMORY_MAX = 128 << 20  # data segment limit [bytes]; Python and libzmq use a third of this limit
 DESCRIPTOR_COUNT = 64  # number of file descriptors in addition to one for each client
 CLIENT_COUNT_MAX = 256  # maximum number of command and stream connections combined
-STEP_CPU_TIME_MAX = 3.0  # CPU time limit of one step [s], after which the kernel ends the process
-# Limit on the elapsed time of one step [s]. On a busy machine, the process may have to wait, so the
-# elapsed time may exceed the CPU time.
+STEP_CPU_TIME_MAX = 3.0  # CPU time limit for one step [s], enforced by the kernel
+# Limit on the elapsed time of one step [s]. On a busy machine, the process waits for a processor,
+# so the elapsed time exceeds the CPU time.
 STEP_TIME_MAX = 30.0
-# Longest poll interval [s]. After a longer interval, the gateway stamps new requests with the time
-# of the previous poll.
+# Longest normal interval between two polls [s]. After a longer interval, the gateway stamps new
+# requests with the time of the previous poll.
 POLL_GAP_MAX = 0.05
 
 # Connections
 HANDSHAKE_TIMEOUT = 2.0  # s
-SOCKET_QUEUE_LENGTH = 64  # number of requests, replies or subscriptions queued in a client's socket
+SOCKET_QUEUE_LENGTH = 64  # maximum number of messages in each libzmq queue of a client
 PART_SIZE_RATIO = 4  # size limit of one message part, as a multiple of commands.max_bytes
 PART_COUNT_MAX = 16  # maximum number of parts in a request, including routing frame and envelope
 ENVELOPE_SIZE_MAX = 1024  # maximum combined size of routing frame and envelope [bytes]
 HANDSHAKES_PER_TURN = 64  # maximum number of handshakes in a step
-SUBSCRIPTION_SIZE_MAX = 1024  # maximum message size [bytes]; handshakes are longer than topics
+SUBSCRIPTION_SIZE_MAX = 1024  # maximum size of a subscription or a handshake message [bytes]
 SUBSCRIPTIONS_PER_TURN = 64
 REPEAT_INTERVAL = 0.1  # minimum time between repetitions of messages for late subscribers [s]
 KEY_CHECK_INTERVAL = 0.5  # time between checks of the key folder [s]
@@ -39,17 +39,17 @@ ANSWER_DELAY_MAX = 0.25  # maximum delay of replies after a stop [s]
 
 # Requests
 UNANSWERED_MAX = 16  # maximum number of requests that await the loop's reply
-# Requests that look like a stop are counted separately.
+# Maximum number of urgent requests (apparent stops) that await the loop's reply.
 URGENT_UNANSWERED_MAX = 32
 URGENT_SIZE_MAX = 256  # size limit of an urgent request [bytes]
-CLIENT_QUEUE_LENGTH = 64  # queued requests per client
-TOTAL_QUEUE_LENGTH = 2048  # queued requests of all clients
-TOTAL_RATE = 2000.0  # requests per second, all clients combined
+CLIENT_QUEUE_LENGTH = 64  # maximum number of queued requests per client
+TOTAL_QUEUE_LENGTH = 2048  # maximum number of queued requests, all clients combined
+TOTAL_RATE = 2000.0  # maximum number of requests per second, all clients combined
 CLIENT_RATE_MIN = 2.0  # guaranteed number of requests per second for each client
-RECOVERY_TIME = 0.05  # pause after which a client that exceeded its rate is accepted again [s]
+RECOVERY_TIME = 0.05  # pause after which a flooding client's requests are accepted again [s]
 
 # Steps
-STEP_WAIT_MAX = 0.01  # longest wait in a step [s]
+STEP_WAIT_MAX = 0.01  # maximum time that a step waits for messages [s]
 TURN_TIME = 0.004  # time limit for reading requests in a step [s]
 LINGER_TIME = 0.2  # time limit for sending queued messages after the loop has ended [s]
 
@@ -65,10 +65,10 @@ class Config(NamedTuple):
     stream: str
     commands: str
     topics: list[str]
-    queue: int  # queued messages per subscriber
+    queue: int  # maximum number of queued messages per subscriber
     max_bytes: int = 4096  # request size limit
     per_second: float = 200.0  # request rate limit per client
     ipc_mode: int = 0o600  # permissions of an ipc socket file
     keys: str = ""  # folder created by `softfinger keys`
     stream_setting: str = "stream.address"  # setting name in errors about the stream address
-    latest: str = ""  # address on which the first topic is published in single frames
+    latest: str = ""  # address on which the first topic is published in single-frame messages

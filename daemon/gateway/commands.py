@@ -1,16 +1,16 @@
 """Forward requests to the loop, within the limits in `bounds`, and forward replies to clients.
 
-The gateway does not unpack requests. Requests that look like a stop bypass the queues; each client
-may have one such request at a time. Other requests are forwarded to the loop a few at a time.
-Further requests wait in queues, and the clients are served in turn. If a client exceeds its rate
-limit, its requests are refused until the client pauses.
+The gateway does not unpack requests. Requests that look like a stop are urgent and bypass the
+queues. A client may have only one urgent request at a time. Other requests are forwarded to the
+loop a few at a time. Further requests wait in queues, and the clients are served in turn. If a
+client exceeds its rate limit, its requests are refused until the client pauses.
 
 Each request is stamped with its arrival time and the number of preceding stops. The libzmq thread
 reads ahead, so the gateway can't determine whether a request arrived before or after a stop. After
-a stop or a long gap between two polls, the gateway therefore stamps requests as if they had arrived
-earlier. The normal stamps resume when the socket has been empty and few requests have arrived.
-Replies are also delayed for a limited time. Otherwise, a client could respond to a reply with a new
-request that the gateway would refuse.
+a stop or a long gap between two polls, the gateway therefore stamps new requests as older than the
+stop or the gap. Normal stamping resumes once the socket is empty and few requests arrive. Replies
+are also delayed for a limited time. Otherwise, a client could respond to a reply with a new request
+that the gateway would refuse.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Client:
         self.last = -math.inf  # time of the last request
 
     def floods(self, per_second: float, now: float) -> bool:
-        """Count one request; return True if the client must pause because of the rate limit."""
+        """Count one request; return True if the rate limit requires the client to pause."""
         passed, self.last = now - self.last, now
         tokens = min(self._tokens + passed * per_second, per_second) - 1.0
         self._tokens = max(tokens, 0.0)
@@ -84,7 +84,7 @@ class CommandEndpoint:
         # Time of the last poll before a gap between polls. The time is infinite once all requests
         # from the gap have been read.
         self._dated = math.inf
-        self._unread_max = 0  # upper limit of the number of unread requests from the gap
+        self._unread_max = 0  # upper bound on the number of unread requests from the gap
         self._since = 0.0  # time of the last stop, gap or check for older requests
         self._arrived = 0  # number of requests since `_since`, excluding status requests
         self._replies: deque[list[bytes]] = deque()  # replies that have not been sent yet
@@ -101,7 +101,7 @@ class CommandEndpoint:
     def fence(self, stops: int) -> None:
         """Stamp requests as older than the last stop until all earlier requests are read.
 
-        Replies are delayed during this time, but at most by `bounds.ANSWER_DELAY_MAX`.
+        Meanwhile, replies are delayed by at most `bounds.ANSWER_DELAY_MAX`.
         """
         if self.stops == self._fence:
             self._held_for = 0.0

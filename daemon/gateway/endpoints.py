@@ -1,8 +1,8 @@
 """Open the client sockets, authenticate the clients and publish the stream.
 
 Without keys, all clients are accepted, but libzmq disconnects peers that do not send a ZMTP 3
-greeting. This requirement excludes web pages, because their POST requests are valid messages only
-in older protocol versions.
+greeting. The required greeting excludes web pages, because their POST requests are valid messages
+only in older protocol versions.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from softfinger.daemon.wire.local_stop import IN_USE, free_socket_path
 from softfinger.daemon.wire.loop_link import repeated
 
 NO_WAIT = int(zmq.NOBLOCK)
-_LATEST_TOPIC = 0  # index of the topic that is also published in single frames
+_LATEST_TOPIC = 0  # index of the topic that is also published in single-frame messages
 
 
 class RestartNeeded(SoftfingerError):
-    """All clients must disconnect and connect again. The message gives the reason."""
+    """All clients must disconnect and reconnect. The exception's message contains the reason."""
 
 
 class ClientSockets:
@@ -49,7 +49,7 @@ class ClientSockets:
     def open(self, kind: int, address: str, setting: str) -> zmq.Socket[Any]:
         """Open a socket and bind it, unless the address is empty.
 
-        Raises AddressError, which names the ``setting``.
+        Raises AddressError, whose message contains ``setting``.
         """
         config, is_router = self._config, kind == zmq.ROUTER
         part_size = bounds.PART_SIZE_RATIO * config.max_bytes
@@ -132,7 +132,7 @@ def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
 
 
 def read_parts(source: zmq.Socket[Any]) -> list[zmq.Frame]:
-    """Read the next message and return its parts, but at most one part more than allowed.
+    """Read the next message and return at most `bounds.PART_COUNT_MAX` + 1 of its parts.
 
     Returns an empty list if there is no message.
     """
@@ -155,7 +155,7 @@ class StreamEndpoint:
         self._topics = [name.encode() for name in config.topics]
         self._prefixes: set[bytes] = set()
         self._kept: dict[int, deque[bytes]] = {}  # each topic's last messages, for late subscribers
-        self._came_late = 0  # bit mask of topics to send again to late subscribers
+        self._came_late = 0  # bit mask of topics to be resent to late subscribers
         self._repeat_at = 0.0  # earliest time of the next repetition
 
     def read(self, now: float) -> int:

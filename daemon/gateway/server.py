@@ -1,9 +1,9 @@
 """Run the gateway process. One thread serves the loop and the clients.
 
-The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``, where FD is the
-file descriptor of the link and CONFIG is a `Config` as JSON. The process prints `READY` once its
-sockets are bound, and exits when the loop disconnects. If an error ends the process, the process
-prints the error.
+The process is started as ``python -m softfinger.daemon.gateway.server FD CONFIG``. FD is the file
+descriptor of the link, and CONFIG is a `Config` as JSON. The process prints `READY` once its
+sockets are bound, and exits when the loop disconnects. If an error occurs, the process prints the
+error and exits.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def main(words: list[str]) -> int:
     Returns 1 if the sockets could not be bound or if all clients must reconnect, otherwise 0.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # The loop's last messages still have to be sent.
+        signal.signal(number, signal.SIG_IGN)  # Stay alive to send the loop's last messages.
     channel = Channel(socket.socket(fileno=int(words[0])))
     _limit_resources()
     try:

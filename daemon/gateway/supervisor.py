@@ -80,7 +80,7 @@ class Gateway:
             start_at = time.monotonic() + _START_INTERVAL
             try:
                 self._start()
-                if self._closing.is_set():  # `close` has closed the previous channel.
+                if self._closing.is_set():  # `close` has closed only the previous channel.
                     self._channel.close()
                 self._connect()
                 error_before = ""

@@ -201,7 +201,7 @@ class Daemon:
 
 
 def hand_info(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandInfo:
-    """Return the settings, calibrations and table errors that are sent once to each subscriber."""
+    """Return the settings, calibrations and table accuracies that each subscriber receives once."""
     calibrations = [
         "" if model.calibration is None else model.calibration.model_dump_json() for model in models
     ]

@@ -32,7 +32,8 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-# Maximum age of commands that stiffen or move the hand, except ``hold`` during a grip [s].
+# Maximum age of commands that switch torque on or move the hand [s]. A higher limit applies to
+# ``hold`` during a grip.
 _START_AGE_MAX = 0.2
 
 
@@ -293,7 +294,7 @@ class Loop:
     ) -> dict[str, Any]:
         """Execute one request on the current tick.
 
-        If a task is running and the request comes from another source, the task ends.
+        A request from any other source ends a running task.
 
         Parameters
         ----------
@@ -332,7 +333,7 @@ class Loop:
             self._publisher.command(state.wall, state.t, state.seq, request, error)
 
     def _follow(self, task: Task) -> None:
-        """Execute the task's next request; if the task fails, end or restart it."""
+        """Execute the task's next request; if execution fails, end or restart the task."""
         try:
             request = task.next(self.state, self.period)
             if request is not None:
@@ -355,7 +356,8 @@ class Loop:
             self._on_event(level, kind, text)
 
     def _with_cause(self, name: str, text: str) -> str:
-        # A command may have kept the bus busy for a long time, even if the machine is idle.
+        # Ignore the duration of a tick with a command, because the command may occupy the bus for a
+        # long time.
         at_work = 0.0 if self._commanded else self._clock.host() - self._began
         return self._lateness.with_cause(name, text, at_work)
 
@@ -369,7 +371,7 @@ class Loop:
             self.state.mode = self._control.mode
 
     def _latch(self, reason: str, name: str) -> None:
-        """Latch a fault, or clear the latched fault if the texts are empty.
+        """Latch a fault, or clear the latched fault if ``reason`` is empty.
 
         Only this method changes the fault.
         """

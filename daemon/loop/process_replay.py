@@ -1,9 +1,9 @@
 """Run the installed code, tick by tick, on a recording's readings, frames and commands.
 
 The servos, sensors, clock and commands are replayed from the recording. The estimator, tables,
-filter, control and limits come from the installed code. The states are reproduced bit for bit under
-two conditions: the recording contains all inputs since the first tick, and the code and the
-settings are unchanged.
+filter, control and limits come from the installed code. The states are reproduced bit for bit if
+the code and the settings are unchanged. The recording must also contain all inputs since the first
+tick.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class ProcessReplay:
 
 
 def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
-    """Write calibrations (JSON texts) to ``folder``; return settings that refer to these files."""
+    """Write JSON calibrations to files in ``folder``; return settings that refer to the files."""
     files = ["", ""]
     for finger, text in enumerate(calibrations):
         if text:
@@ -182,7 +182,7 @@ class _Commands:
             try:
                 handler(request, 0.0)
             except Refused:
-                pass  # A refusal causes a difference between the states.
+                pass  # After a refusal, the replayed states differ from the recording.
         self.waiting = []
 
     def close(self) -> None:

@@ -1,9 +1,9 @@
 """Decide which topics to publish on each tick, and measure the actual rates.
 
 Each topic is published on every n-th tick, counted by ``seq``. The divisor n is chosen so that the
-rate is closest to the requested rate. If n is large enough, statistics are published a few ticks
-after the state, so that one tick does not publish everything. Every n-th tactile frame is
-published. `wire.publisher` sends the messages; this module does not change the state.
+rate is closest to the requested rate. If possible, statistics are published a few ticks after the
+state to distribute the load. Tactile frames are decimated in the same way. `wire.publisher` sends
+the messages; this module does not change the state.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Configure scheduling, memory and timers for a steady tick, and notify systemd.
 
 The ``[realtime]`` settings are applied once, after warm-up. Each setting is optional. If the system
-refuses a setting, a warning explains the consequence and gives the command that grants the
+refuses a setting, a warning explains the consequence and contains the command that grants the
 permission. `daemon.clock` implements the busy wait before a deadline. The `Service` class sends the
 READY, WATCHDOG and STOPPING notifications to systemd.
 """
@@ -57,7 +57,7 @@ class RealTime:
     """Real-time settings, active inside ``with RealTime(settings): loop.run()``.
 
     Create the object in the loop thread, after warm-up. A refused setting does not raise an
-    exception. ``granted`` and ``refused`` list the outcome of each setting. In virtual time, only
+    exception. Each setting is listed either in ``granted`` or in ``refused``. In virtual time, only
     the garbage collector and the thread switch interval are adjusted.
     """
 
@@ -127,9 +127,10 @@ class RealTime:
     def _schedule(self, priority: int) -> None:
         """Set SCHED_FIFO for all threads of the interpreter.
 
-        The loop thread gets ``priority``, and the other threads get one level less. Otherwise, the
-        loop would be delayed if a reader thread were preempted while holding the interpreter lock.
-        Native threads, such as ZeroMQ's, and child processes keep the normal scheduling.
+        The loop thread gets ``priority``, and the other threads get one level less. At normal
+        priority, a reader thread could be preempted while it holds the interpreter lock, and would
+        then delay the loop. Native threads, such as ZeroMQ's, and child processes are scheduled
+        normally.
         """
         undo: list[Callable[[], object]] = []
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -154,8 +155,7 @@ class RealTime:
     def _shorten_slice(self, nanoseconds: int) -> None:
         """Shorten the time slice of the interpreter's threads if SCHED_FIFO is not in use.
 
-        Since version 6.12, Linux first runs the thread whose slice ends first, so threads with
-        short slices are scheduled sooner.
+        Since version 6.12, Linux schedules threads with shorter slices sooner.
         """
         usual = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
         calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
@@ -185,9 +185,9 @@ class RealTime:
     def _lock_memory(self) -> None:
         """Lock each page in memory on first access. Warm-up has already accessed the loop's pages.
 
-        Locking all pages immediately would take almost a second, although two thirds of the pages
-        of the compiler libraries are never accessed. If locked memory is limited, only existing
-        mappings are locked, because later mappings would otherwise fail.
+        Locking all pages immediately would take almost a second. Two thirds of the compiler
+        libraries' pages are never accessed. If locked memory is limited, only existing mappings are
+        locked, because later mappings would otherwise fail.
         """
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         flags = _MCL_CURRENT | _MCL_ONFAULT
@@ -202,7 +202,7 @@ class RealTime:
             self._granted("memory locked", libc.munlockall)
 
     def _hold_latency(self) -> None:
-        """Prevent deep processor idle states as long as the device file stays open."""
+        """Prevent deep processor idle states while the device file is open."""
         try:
             descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:

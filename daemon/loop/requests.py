@@ -1,8 +1,8 @@
 """Validate requests to a running hand and execute them.
 
-The gateway has already limited the size and rate of the requests (`gateway.commands`), and
-`wire.command_server` has unpacked them. `control.modes` lists the commands allowed in each mode,
-and `control.state_machine` defines the resulting motion.
+`gateway.commands` has already limited the size and rate of the requests. `wire.command_server` has
+unpacked the requests. `control.modes` lists the commands allowed in each mode, and
+`control.state_machine` defines the resulting motion.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ def _malformed(text: str) -> Refused:
 
 
 def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
-    """Return the range of a command parameter. The range is infinite if it depends on the grip.
+    """Return the range of a command parameter.
 
-    A force must be greater than the lower bound.
+    The range is unbounded if it depends on the grip. For a force, the lower bound is excluded.
     """
     if parameter in FINGERS:
         hand, index = settings.hand, FINGERS.index(parameter)
@@ -133,7 +133,7 @@ class Lease:
 
 
 class Requests:
-    """Request executor. Only the loop thread may use it, between two stages of a tick."""
+    """Request executor. Only the loop thread may use this class, between two stages of a tick."""
 
     def __init__(
         self,
@@ -192,8 +192,7 @@ class Requests:
             If the request is rejected. The message gives the reason.
         """
         state, control = self._state, self._control
-        # A stop command is accepted in every mode and from every client, even if it has unknown
-        # fields.
+        # Accept a stop command in every mode, from every client and with unknown fields.
         if request["command"] == "stop":
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}
@@ -224,7 +223,7 @@ class Requests:
         return reply
 
     def watch_silence(self) -> None:
-        """Apply ``commands.on_silence`` when the lease of the client in control expires."""
+        """Apply ``commands.on_silence`` when the controlling client's lease expires."""
         action = self._settings.commands.on_silence
         if action == "hold" or not (silent := self._lease.lapses(self._state.t)):
             return
@@ -335,7 +334,7 @@ class Requests:
                 raise Refused(f"move: {name}: {range_text(q, low, high)}", Reason.BOUNDS)
 
     def _reconnect(self) -> None:
-        """Reconnect servos that have stopped responding. Only ``clear`` does this.
+        """Reconnect servos that have stopped responding. Only ``clear`` calls this method.
 
         Raises
         ------
@@ -348,7 +347,7 @@ class Requests:
             return
         if self._torque.pending and not state.read_error:
             # The port works, so do not reconnect. Sending packets would end the bus silence that
-            # makes the servo watchdogs stop the servos.
+            # trips the servo watchdogs.
             return
         try:
             self._torque.reconnect()
@@ -359,7 +358,7 @@ class Requests:
     def _reopen(self, name: str) -> None:
         """Reopen the sensors whose port was lost.
 
-        Sensors are reopened only by ``clear`` and ``arm``, while torque is off.
+        Only ``clear`` and ``arm`` reopen sensors, and only while torque is off.
 
         Raises
         ------

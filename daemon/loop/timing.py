@@ -1,13 +1,13 @@
 """Collect the loop's stage durations in histograms, and monitor the tick delays.
 
-A single kernel call per tick updates the histograms. The daemon publishes the quantiles of the
-histograms once per second. Each octave above 1 ns is divided into 32 bins. A quantile is reported
-as the upper edge of its bin, so it is never too small and at most 3.2 % too large. The maximum is
-exact.
+One call to a compiled function per tick updates the histograms. The daemon publishes the quantiles
+of the histograms once per second. Each octave above 1 ns is divided into 32 bins. A quantile is
+reported as the upper edge of its bin, so it is never too small and at most 3.2 % too large. The
+maximum is exact.
 
-Tick delays are measured in machine time and reported in occasional events. A fault text also
-mentions a tick delay if the delay may be the cause. While a tick is late, real hardware is
-uncontrolled, whereas a simulated hand on its own clock waits (`daemon.clock.HandClock`).
+Tick delays are measured in machine time and reported in occasional events. A fault text mentions a
+tick delay that may have caused the fault. While a tick is late, real hardware is uncontrolled. A
+simulated hand on its own clock waits (`daemon.clock.HandClock`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LATENESS_MIN = 0.05  # minimum delay that is reported [s]
 # Minimum time between reports [s]. A report also requires that the total delay has doubled since
 # the previous report.
 REPORT_INTERVAL = 60.0
-ATTRIBUTION_TIME = 0.25  # time after a late tick in which faults may be attributed to the delay [s]
+ATTRIBUTION_TIME = 0.25  # time after a late tick during which faults may be attributed to it [s]
 # Limits that a single late tick can violate.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
@@ -88,7 +88,7 @@ class Statistics:
         return int(self.counts[0].sum())
 
     def spreads(self) -> dict[str, TimeSpread]:
-        """Return quantiles and maximum for each name in `TIMES`, or zeros before the first tick."""
+        """Return the quantiles and maximum of each time, or zeros before the first tick."""
         spreads = {}
         for name, until, largest in zip(
             TIMES, self.counts.cumsum(axis=1), self.largest, strict=True

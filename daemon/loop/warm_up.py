@@ -1,9 +1,9 @@
 """Compile a scene's kernels by running each part of the pipeline once before the first tick.
 
 `loop.build` runs all parts before the loop is created, and therefore before torque can be switched
-on. On first use, `processes.compile` compiles the parts in parallel beforehand. Each part builds
-the objects that it needs, runs them on an artificial contact and discards them. Components that are
-not in the scene are skipped.
+on. Before the first use, `processes.compile` compiles the parts in parallel. Each part builds the
+objects that it needs, runs them on an artificial contact and discards them. Components that are not
+in the scene are skipped.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Part(NamedTuple):
 
 
 def parts(settings: Settings) -> list[Part]:
-    """Return the parts required by ``settings``, in an order that suits two processes.
+    """Return the parts required by ``settings``, ordered for compilation by two processes.
 
     One process compiles the estimator and the simulated sensor, because they share kernels. The
     second process compiles the contact table before the simulated hand and the filter, because both

@@ -24,7 +24,7 @@ def make_tip(settings: Settings) -> Fingertip:
 
 
 def law_problem(material: Material, limit: float) -> str:
-    """Describe the fit error of a law if the force error exceeds ``limit``, otherwise return ""."""
+    """Describe a law's fit error, or return "" if the force error is at most ``limit``."""
     found = material.worst_force_error
     if found <= limit:
         return ""
@@ -50,7 +50,7 @@ def make_material(law: MaterialSettings) -> Material:
 def make_table(
     settings: Settings, material: Material, tip: Fingertip | None = None
 ) -> ContactTable:
-    """Create the contact table for ``tip``. The default is the tip in the settings.
+    """Create the contact table for ``tip``, which defaults to the tip in the settings.
 
     Raises SettingsError if the tolerance cannot be reached with this material.
     """

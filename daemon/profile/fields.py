@@ -12,7 +12,7 @@ from softfinger.daemon.errors import PluginError
 
 __all__ = ["Section", "setting"]
 
-# Every number has a lower and an upper bound, so that a typing error cannot enter an integral.
+# Every number has a lower and an upper bound, so that most mistyped values are rejected.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
@@ -67,7 +67,7 @@ class Section(BaseModel):
 
 
 def names_backend(kind: Kind) -> AfterValidator:
-    """Return a validator for backend names. Error messages are worded like those of a Literal."""
+    """Return a validator for backend names; its error messages match those of a Literal."""
 
     def check(name: str) -> str:
         try:

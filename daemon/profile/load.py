@@ -25,7 +25,7 @@ from softfinger.daemon.profile.validation import plausibility_warnings, problems
 __all__ = ["load"]
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-# Maximum file size [bytes]. The reference profile with all keys has 21 kB.
+# Maximum file size [bytes]. The reference profile, which contains all keys, is 21 kB long.
 _FILE_SIZE_MAX = 256 << 10
 _DEPTH_MAX = 8  # maximum nesting depth of tables and arrays
 _ERROR_COUNT_MAX = 20  # maximum number of errors reported per load
@@ -161,8 +161,8 @@ def names() -> list[str]:
 def find(path: Path) -> Path:
     """Return the path of a profile. ``path`` is a file or the name of a packaged profile.
 
-    Raises SettingsError if a name without folder and suffix is neither a packaged profile nor a
-    file.
+    A name with neither folder nor suffix must match a packaged profile or a file. Raises
+    SettingsError if there is no match.
     """
     if path.suffix or path.parent != Path() or (path.exists() and not path.is_dir()):
         return path

@@ -21,7 +21,7 @@ from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 
 _WIDTH = 100  # maximum line length in sim.toml
-_NO_BOUND = 1e9  # Bounds of this magnitude only catch typing errors and are not shown.
+_NO_BOUND = 1e9  # Bounds of this magnitude catch only mistyped values and are not shown.
 _HEAD = """\
 #:schema ./schema.json
 # The built-in simulated hand, with every setting at its default. `softfinger run` without a profile
@@ -70,7 +70,7 @@ def schema_text() -> str:
 
 
 def sections() -> dict[str, type[Section]]:
-    """Return the section classes of a profile by name."""
+    """Return the section classes of a profile, keyed by name."""
     return {name: type(section) for name, section in Settings()}
 
 

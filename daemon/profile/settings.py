@@ -490,7 +490,7 @@ class ControlSettings(Section):
 
     @property
     def load_held(self) -> float:
-        """Fraction of a tip's moment that gear friction holds before the joint opens."""
+        """Fraction of the tip moment that gear friction can balance before the joint opens."""
         return 1.0 - self.driving**-2
 
 

@@ -32,7 +32,7 @@ def problems(settings: Settings) -> list[str]:
 def plausibility_warnings(settings: Settings) -> list[str]:
     """Return warnings about settings that are allowed but probably wrong, one per line.
 
-    The commands ``run``, ``doctor`` and ``config check`` report these warnings.
+    The warnings are reported by the commands ``run``, ``doctor`` and ``config check``.
     """
     grip = [warning for check in (_deep_grip, _strong_grip) for warning in check(settings)]
     return sensor_warnings(settings) + grip
@@ -129,8 +129,8 @@ def _set_forces(settings: Settings) -> list[tuple[str, float]]:
 def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
     """Yield the key, force [N] and displacement [m] of a spring tip for each configured force.
 
-    The tip is upright. The force is computed as in `Material.force_error`, by summing over strain
-    steps.
+    The tip is assumed to be upright. The force is computed as in `Material.force_error`, by summing
+    over strain steps.
     """
     if settings.tip.physics != "springs":
         return
@@ -404,7 +404,7 @@ def _forces(settings: Settings) -> Iterator[str]:
 
 
 def address_problem(address: str, lacking: str) -> str:
-    """Return the reason why binding ``address`` is not allowed, or "" if the address is allowed.
+    """Return the reason for rejecting ``address``, or "" if the address is allowed.
 
     Without keys, only this machine's addresses are allowed. ``lacking`` is the name of the setting
     that must specify keys, or "" if keys are configured.

@@ -1,4 +1,4 @@
-"""Predict when servos will overheat, and reduce the grip force to a sustainable value in time.
+"""Predict servo overheating, and reduce the grip force early enough to prevent it.
 
 The module predicts when a servo will reach ``safety.temperature_max``. If the remaining time is
 less than ``heat_warn``, `safety.limits` issues a warning. The grip force is then reduced to the
@@ -32,12 +32,12 @@ from softfinger.kinematics.hand.servo_heat import (
 
 _UPDATE_INTERVAL = 0.5  # time between thermal model updates [s]
 _AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
-# Half the thermometer's resolution [°C]. A rounded reading may reach the limit while the actual
-# temperature is lower by half the resolution.
+# Half the thermometer's resolution [°C]. A rounded reading may exceed the actual temperature by
+# half the resolution.
 _HALF_STEP = 0.5
 _TARGET_MARGIN = 3.0  # margin between the temperature limit and the target temperature [°C]
-_FRACTION_MAX = 0.97  # maximum ratio of new to old force; a smaller reduction is not worthwhile
-_FRACTION_MIN = 0.6  # minimum ratio of new to old force, because the first estimate is uncertain
+_FRACTION_MAX = 0.97  # maximum ratio of new to old force; minor reductions are skipped
+_FRACTION_MIN = 0.6  # minimum ratio of new to old force; the first estimate is uncertain
 _SETTLING_TIME = 10.0  # time between a force reduction and the next evaluation [s]
 _ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
 # Fraction of the total heat capacity in the winding, and fraction of the total thermal resistance

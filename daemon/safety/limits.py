@@ -1,7 +1,7 @@
 """Define the ``LIMITS`` table with the check and the consequence of each limit.
 
-- ``warn``: a warning is sent on ``hand/event``. It is repeated only after a second without the
-  violation.
+- ``warn``: a warning is sent on ``hand/event``. The warning is repeated only after the violation
+  has been absent for a second.
 - ``limit``: the goal is modified before it is sent; ``status`` counts the affected ticks.
 - ``fault``: torque is turned off until ``clear``. ``clear`` is refused while the cause persists.
 
@@ -30,33 +30,33 @@ from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardwa
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 from softfinger.kinematics.hand.geometry import tip_position
 
-_NOISE_RATIO = 1.5  # messages mention noise that exceeds ``tactile.noise`` by this factor
+_NOISE_RATIO = 1.5  # messages mention noise above this multiple of ``tactile.noise``
 _WARNING_FRACTION = 0.9  # fraction of a fault limit above which a warning is issued
 # Minimum ratio of current to position error [A/rad]. The position loops of all servos exceed this
 # ratio.
 _CURRENT_PER_ERROR = 2.0
-_STANDSTILL_SPEED = 0.05  # maximum speed of a joint at standstill [rad/s]
+_STANDSTILL_SPEED = 0.05  # speed below which a joint counts as stationary [rad/s]
 # Smallest relative increase in commanded force that is checked. The tips must measure at least this
 # fraction of the increase.
 _FORCE_RISE_MIN = 0.2
-_RESPONSE_TIME = 0.3  # time within which the measured force must respond [s]
+_RESPONSE_TIME = 0.3  # time within which the measured force must respond to an increase [s]
 _STEP_TOLERANCE = 0.02  # tolerance added to the largest step possible at maximum velocity [rad]
 _DRIFT_MAX = 0.1  # allowed difference between the angle and the integrated velocity [rad]
-_DRIFT_TIME = 0.1  # time window of the drift check [s], which allows for velocity lag
+_DRIFT_TIME = 0.1  # time window of the drift check [s]; the window allows for velocity lag
 # The drift window restarts if the interval between readings exceeds both this time [s] and three
 # ticks.
 _LATE_TIME = 0.02
 _FAILURE_TIME = 0.72  # time constant for averaging the fraction of failed readings [s]
-_FAILED_FRACTION_MAX = 0.75  # maximum failed fraction, reached after 1 s without a valid reading
+_FAILED_FRACTION_MAX = 0.75  # maximum fraction of failed readings, reached after 1 s of failures
 _GAP_TIME = 0.1  # interval between readings above which position steps are not checked [s]
 
 
 class JointMotion:
     """Check of joint angles against the measured velocities and the maximum velocity.
 
-    An encoder may jump, freeze while the joint rotates, or drift while the joint is at standstill.
-    The angles of a faulty encoder are inconsistent with the measured velocity. If an encoder is
-    faulty, the bit of its finger is set in ``jumped``.
+    An encoder may jump, freeze while the joint rotates, or drift while the joint is stationary. The
+    angles of a faulty encoder are inconsistent with the measured velocity. If an encoder is faulty,
+    the bit of its finger is set in ``jumped``.
     """
 
     def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:
@@ -120,7 +120,7 @@ class View:
         self._t = math.nan  # time of the previous state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
         self._torque = False  # True if torque was on when the latest reading was requested
-        servos = settings.servos  # In current mode, `pull` is limited by the stiffness.
+        servos = settings.servos  # In current mode, the stiffness limits `pull`.
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
             self.pull = min(self.pull, 0.5 * servos.stiffness)
@@ -203,7 +203,7 @@ class Limit:
     keys: tuple[str, ...] = ()  # settings that define the limit
     needs: Literal["", "servos", "sensors"] = ""
     check: Check | None = None
-    lasts: float | str = 0.0  # minimum duration of a violation [s], or the name of a setting
+    lasts: float | str = 0.0  # minimum duration of a violation [s], or the setting that contains it
     fraction: float = 1.0  # fraction of the bound at which a violation is reported
     in_turn: bool = False  # True if the check takes turns with others, one check per tick
     gripping: bool = False  # True if the limit applies only while gripping
@@ -360,8 +360,8 @@ def _joint_jump(view: View, _: State, __: float) -> str:
 
 
 _POSITION_ERROR_MIN = 0.05  # position error above which a current is expected [rad]
-_EXPECTED_CURRENT_MIN = 0.04  # minimum expected current for the check [A]
-_CURRENT_FRACTION_MIN = 0.25  # minimum fraction of the expected current
+_EXPECTED_CURRENT_MIN = 0.04  # expected current above which the current is checked [A]
+_CURRENT_FRACTION_MIN = 0.25  # minimum measured current as a fraction of the expected current
 
 
 @Limit("joint.dead", "joint that is at least 0.05 rad from its goal, but neither moves nor draws "
@@ -651,7 +651,7 @@ _GAIN_SIGMA = 1.5  # number of prior standard deviations above which a gain erro
 
 
 def _gain_fault(view: View, finger: int) -> str:
-    """Describe an unusually large error of a sensor's gain; return "" if the gain is plausible."""
+    """Describe a sensor's implausible gain error; return "" if the gain is plausible."""
     grasp = view.grasp
     off, unsure = grasp.gain_change[finger], grasp.gain_std[finger]
     if not abs(off) - unsure > _GAIN_SIGMA * grasp.gain_prior_std[finger]:

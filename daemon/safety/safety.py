@@ -1,8 +1,8 @@
 """Check every state, limit every goal, and send the goals to the servos.
 
 Goals reach the bus only through `Safety.write`, which applies the goal limits. The
-`safety.limits.LIMITS` table defines the checks. This module schedules the checks, reports each
-warning once, and raises a fault only after a violation has lasted long enough.
+`safety.limits.LIMITS` table defines the checks. This module schedules the checks and reports each
+warning once. A violation must last long enough before it raises a fault.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from softfinger.daemon.types import Goal, State
 _REPEAT_TIME = 1.0  # time without a violation after which a warning may be repeated [s]
 _HYSTERESIS = 0.95  # fraction of the bound below which a reported warning clears
 
-BUS = "servos.bus"  # name of the limit for errors of the servo backend
-TORQUE_OFF = "torque.off"  # name of the limit for servos that have not confirmed torque off
+BUS = "servos.bus"  # name of the limit under which servo backend errors are reported
+TORQUE_OFF = "torque.off"  # name of the limit that reports unconfirmed torque off
 
 
 class Breach(NamedTuple):
@@ -42,7 +42,7 @@ class _Watch:
         self.check = check
         lasts = limit.lasts
         self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
-        self.since = math.inf  # start of the violation [s], or inf without a violation
+        self.since = math.inf  # start time of the violation [s], or inf if there is none
         self.reported = False
         self._ended = -math.inf
 
@@ -98,7 +98,7 @@ class Safety:
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
         self._found: dict[_Watch, str] = {}  # current violations of fault limits
-        self.must_hold = False  # True if the goal of a grip must be held because frames are late
+        self.must_hold = False  # True if a grip's goal must not change because frames are late
         self.warnings: list[Breach] = []  # new warnings, which the loop reports and removes
         self.limited: Counter[str] = Counter()  # number of ticks with a modified goal, per limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
@@ -140,7 +140,7 @@ class Safety:
         return None
 
     def cause(self, state: State, gripping: bool = False) -> str:
-        """Return the first fault that would block a command in ``state``, or "" without a fault.
+        """Return the first fault that would block a command in ``state``, or "" if there is none.
 
         If ``gripping`` is True, the limits that apply during a grip are checked in every mode. The
         state is not modified.

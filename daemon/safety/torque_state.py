@@ -1,10 +1,10 @@
-"""Track the torque state. Torque counts as on when requested, but as off only when confirmed.
+"""Track the torque state.
 
+A torque-on request sets the state to on, but only a confirmation by the servos sets it to off.
 The torque-off request is repeated on every tick until the servo registers confirm that torque is
 off. If the confirmation does not arrive within half the watchdog time, the daemon keeps the bus
-silent until the watchdogs stop the motors. If the bus were not silent, a servo that receives read
-requests but no write requests would keep driving its motor. After the silence, the daemon requests
-torque off again.
+silent. The silence trips the watchdogs, which stop the motors. A servo that still received read
+requests would keep driving its motor. After the silence, the daemon requests torque off again.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from softfinger.daemon.types import Reading, State
 # Duration of repeated torque-off attempts, as a fraction of the watchdog time. After the attempts,
 # the bus is kept silent.
 _TRY_FRACTION = 0.5
-_TRY_TIME_UNGUARDED = 0.05  # duration of the attempts if servos.watchdog is 0 [s]
+_TRY_TIME_UNGUARDED = 0.05  # duration of the torque-off attempts if servos.watchdog is 0 [s]
 _CLOSING_TRY_COUNT = 15  # number of torque-off attempts at shutdown
 
 
@@ -52,13 +52,13 @@ class TorqueState:
         # A servo's watchdog counts whole units of time and may trip one unit late.
         units = math.ceil(watchdog / WATCHDOG_UNIT - 1e-9) + 1 if watchdog else 0
         self._silence = units * WATCHDOG_UNIT
-        self._tried_since = math.inf  # start of the current series of attempts [s]
+        self._tried_since = math.inf  # start time of the present series of torque-off attempts [s]
         self._silent_until = -math.inf
         self._first = math.inf  # time of the first request to turn torque off [s]
         self._reported = False
         self._port_gone = False  # True if the port is lost and the daemon cannot send anything
-        self._last_try = -1  # sequence number of the tick with the last attempt
-        self._unused = Reading()  # buffer for readings that are discarded
+        self._last_try = -1  # sequence number of the tick of the last torque-off attempt
+        self._unused = Reading()  # buffer for discarded readings
 
     @property
     def pending(self) -> bool:

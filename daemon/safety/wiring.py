@@ -1,4 +1,4 @@
-"""Detect swapped servo IDs, which send each finger's commands to the other finger.
+"""Detect swapped servo IDs, which direct each finger's commands to the other finger.
 
 Joint angles and currents remain consistent, because each servo reports its own values. Only the
 tactile sensors show the error. A tip in contact tilts by about the angle through which its finger
@@ -19,8 +19,8 @@ _STANDING_MAX = 0.02  # maximum motion of the stationary joint [rad]
 _CLOSING_MIN = 0.05  # minimum difference between the two joints' closing motions [rad]
 _TILT_SIGMA = 2.0  # number of tilt standard deviations added to the tilt threshold
 _FORCE_RISE_MIN = 1.0  # minimum tip force increase [N]
-# Settling time after a touch [s]. While late frames show the closing motion before the touch, the
-# joint has already stopped. Frames may be 0.1 s old (`safety.frame_age_fault`), and the joint stops
+# Settling time after a touch [s]. Late frames may still show the closing motion although the joint
+# has already stopped. Frames may be 0.1 s old (`safety.frame_age_fault`), and the joint stops
 # within 0.05 s.
 _SETTLING_TIME = 0.15
 _WRONG_ROTATION = math.radians(4.0)  # minimum rotation opposite to the command [rad]
@@ -36,8 +36,8 @@ class WiringWatch:
         self._touching = -1  # index of the only finger that touches the object, or -1
         self._since = 0.0  # time at which the contact with one finger began [s]
         self._q = [0.0, 0.0]  # joint angles after the touch [rad]
-        self._tilt = math.nan  # tilt after the touch [rad]
-        self._force = 0.0  # force after the touch [N]
+        self._tilt = math.nan  # tip tilt after the touch [rad]
+        self._force = 0.0  # tip force after the touch [N]
         self._turn = math.nan  # object angle at the start of a rotation [rad]
         self._goal = math.nan  # commanded object angle [rad]
         self._sense = 0.0  # direction of the commanded rotation
@@ -59,7 +59,7 @@ class WiringWatch:
     def _check_approach(self, state: State) -> None:
         left, right = (each.valid and each.contact for each in state.contacts)
         if not (left or right):
-            return  # A light contact may be lost for a few frames, so its reference is kept.
+            return  # A light contact may be lost for a few frames, so keep the reference values.
         finger = -1 if left and right else 0 if left else 1
         if finger != self._touching or finger < 0:
             self._touching, self._since, self._tilt = finger, state.t, math.nan

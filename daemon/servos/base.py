@@ -44,13 +44,13 @@ class Servos(Protocol):
 
     - *current-based position* (5): the servo controls its position and limits the motor current to
       ± ``goal.current``.
-    - *current* (0): the daemon computes the position loop once per tick from the newest reading.
-      The loop uses ``servos.stiffness`` and ``servos.damping``, and limits the current to
-      ± ``goal.current``. Without readings, the current stays constant until the servo's bus
+    - *current* (0): the daemon controls the position once per tick, using the newest reading. The
+      control law uses the gains ``servos.stiffness`` and ``servos.damping``, and limits the current
+      to ± ``goal.current``. Without readings, the current stays constant until the servo's bus
       watchdog stops the servo.
     - *position* (3): the servo controls its position without a current limit, and ignores
-      ``goal.current``. The joint is held as soon as torque is on. Position mode is suitable for
-      moving but not for grasping.
+      ``goal.current``. The servo holds the joint as soon as torque is on. Position mode is suitable
+      for moving but not for grasping.
 
     ``connect`` checks the servos, but never switches torque on. ``read`` and ``write`` are called
     once per tick. A failed exchange sets ``valid`` to False and increments a counter. `read` and
@@ -117,7 +117,7 @@ class JointPlant(Protocol):
         """
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
-        """Set a servo's position gains and PWM limit until the next call.
+        """Set a servo's position gains and PWM limit, which apply until the next call.
 
         Parameters
         ----------

@@ -167,7 +167,7 @@ def check_servo(
 
 
 def other_model(number: int, model: ServoModel) -> tuple[str, str]:
-    """Describe a servo whose model differs from the settings; return the problem and the fix."""
+    """Return the problem and the fix for a servo whose model differs from the settings."""
     if reg.by_number(number) is not None:
         return f"is an {reg.name_of(number)}, expected an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
@@ -185,7 +185,7 @@ def check_registers(
     finger: int,
     status: Status,
 ) -> list[Finding]:
-    """Return a finding for each wrong register whose requirement has this ``status``."""
+    """Return the findings with this ``status`` for registers that contain wrong values."""
     found = []
     for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
         wrong = row.wrong_in(table)
@@ -312,9 +312,10 @@ def check_position(
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
-    """Compare a USB adapter's latency timer with the reply timeout; return None without a timer.
+    """Compare an adapter's latency timer with the reply timeout; return None if it has no timer.
 
-    The adapter delays a reply until the timer expires. A timer of 16 ms limits reads to 60 Hz.
+    The adapter delays a reply until the timer expires. A timer of 16 ms limits the read rate to 60
+    Hz.
     """
     place = latency_file(path, *sysfs)
     if place is None:

@@ -1,6 +1,6 @@
 """Define the control table for Dynamixel X servos: addresses, units, modes and models.
 
-The data come from the manufacturer's manuals. `servos.joint` converts joint counts to rad, rad/s
+The data come from the manufacturer's manuals. `servos.joint` converts register counts to rad, rad/s
 and A. The client and the emulated servos share this table and the packet CRC. This module does not
 communicate with servos.
 """
@@ -124,7 +124,7 @@ def hardware_error_names(status: int) -> str:
 
 # --- models --------------------------------------------------------------------------------------
 
-_SPECIFIC_HEAT = 0.9  # approximate specific heat of plastic, aluminium and steel [J/(g K)]
+_SPECIFIC_HEAT = 0.9  # approximate mean specific heat of plastic, aluminium and steel [J/(g K)]
 _CONVECTION = 10.0  # convection coefficient of a small body in still air [W/(m² K)]
 SAG: Final = 0.35  # resistance of the simulated power supply and its cable [Ω]
 
@@ -137,7 +137,7 @@ class ServoModel:
     number: int
     firmware: int  # firmware version that the emulated servo reports
     highest_baud: int  # index into BAUD_RATES
-    current_unit: float  # current per count [A], or 0 without a current sensor
+    current_unit: float  # current per count [A], or 0 if there is no current sensor
     current_limit: int  # default and upper bound
     velocity_limit: int  # default
     velocity_max: int  # upper bound of the velocity limit
@@ -155,7 +155,7 @@ class ServoModel:
     modes: tuple[int, ...] = tuple(MODE_NAMES)
     pwm_slope: int | None = None  # default of register 62, or None if the model lacks this register
     is_x330: bool = False  # True for the X330 series, whose indirect addresses moved in firmware 53
-    gear_loss: float = 0.0  # published fraction of the torque that gear friction consumes, or 0
+    gear_loss: float = 0.0  # published fraction of torque lost to gear friction, or 0
 
     @property
     def senses_current(self) -> bool:
@@ -169,12 +169,12 @@ class ServoModel:
 
     @property
     def stall_current(self) -> float:
-        """Maximum current allowed by the model [A]; 1 A without a current sensor."""
+        """Maximum current allowed by the model [A]; 1 A if the model has no current sensor."""
         return self.current_limit * self.current_unit if self.senses_current else 1.0
 
     @property
     def torque_constant(self) -> float:
-        """Torque constant at the shaft [N·m/A]; 0 without a current sensor."""
+        """Torque constant at the shaft [N·m/A]; 0 if the model has no current sensor."""
         torque, current, _ = self.stall
         return torque / current if self.senses_current else 0.0
 
@@ -227,11 +227,11 @@ _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MO
 # and the control table on the model's page in the ROBOTIS e-Manual,
 # emanual.robotis.com/docs/en/dxl/x/NAME/ or …/mx/NAME-2/. The model numbers of the XD430 come from
 # control_table/dynamixel.model in dynamixel-sdk. For XH430-V, XH540-V270, XM540-W150, MX-64 and
-# MX-106, the velocity limit is the no-load speed, because the manual's limits apply to firmware
+# MX-106, the velocity limit is the no-load speed. The manual's velocity limits apply to firmware
 # before version 42. For the XW430-T200, the e-Manual lists 6.9 N·m at 4.9 A, which is the stall
-# torque of the XW540-T140. The row of the XW430-T200 therefore contains the data of the XH430-W210,
-# with the stall torque multiplied by the gear ratio 200 : 213. For the XW430-T333, scaling by the
-# gear ratio gives 3.2 N·m. The e-Manual lists 3.1 N·m at 1.3 A.
+# torque of the XW540-T140. The row of the XW430-T200 therefore contains the data of the XH430-W210.
+# Only the stall torque is scaled, by the ratio of the gear reductions, 200 : 213. For the
+# XW430-T333, scaling by the gear ratio gives 3.2 N·m. The e-Manual lists 3.1 N·m at 1.3 A.
 _430 = 82, (28.5, 46.5, 34.0)  # mass [g], size [mm]
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)

@@ -53,9 +53,9 @@ _unpack_supply = struct.Struct("<HB").unpack_from  # voltage, temperature
 _unpack_clock = struct.Struct("<H").unpack_from
 _HEALTH_INTERVAL = 0.25  # s
 _CHECK_INTERVAL = 0.01  # s
-_CHECK_FRACTION = 0.05  # maximum fraction of the line capacity that checks may use
+_CHECK_FRACTION = 0.05  # maximum fraction of the line capacity used by checks
 _RECENT_TIME = 0.035  # maximum age of a recent goal [s]
-_FROZEN_TIME = 0.1  # maximum time for which a servo's 1 ms clock may stand still [s]
+_FROZEN_TIME = 0.1  # maximum time for which a servo's 1 ms clock may stop [s]
 _VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a missing reply
 _CHECK_TIMEOUT = 0.2  # reply timeout during the checks [s]; `clear` blocks the loop for this time
 # Reply timeout for an emulated hand [s]. The hand's clock pauses while the machine is late.
@@ -305,7 +305,7 @@ class DynamixelServos:
         Raises
         ------
         ServoError
-            If switching on failed or could not be verified. Torque may be on.
+            If torque could not be switched on or verified. Torque may be on.
         """
         if self._torque is None:
             raise ServoError("servos: not connected")

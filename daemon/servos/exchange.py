@@ -1,4 +1,4 @@
-"""Choose and perform the group reads of a tick, and measure the duration of exchanges.
+"""Choose and perform the group reads of a tick, and measure how long exchanges take.
 
 The daemon and `doctor` share this code, so `doctor` tests the exchanges that the daemon uses.
 """
@@ -29,12 +29,12 @@ HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 # A late reply could be mistaken for the reply to the next request. After a missing reply, each of
 # the next requests therefore has a different length, which identifies the reply.
-LENGTH_COUNT = 11  # number of versions of each span; a version adds zero to ten preceding bytes
+LENGTH_COUNT = 11  # number of variants of each span, with zero to ten extra bytes at the start
 
 EXCHANGE_COUNT = 50  # number of exchanges that `doctor` times
 _TIMED_REPLY_TIMEOUT = 0.1  # minimum reply timeout for timed exchanges [s]
-_CONNECT_READ_COUNT = 9  # number of reads in `connect`; the fastest gives the minimum reply time
-_REPLY_FRACTION_MAX = 0.8  # maximum duration of a reply as a fraction of a tick
+_CONNECT_READ_COUNT = 9  # number of reads in `connect`; the fastest sets the minimum reply time
+_REPLY_FRACTION_MAX = 0.8  # maximum duration of a reply as a fraction of the tick period
 # Fraction of failed exchanges above which a warning is issued, and fraction above which the check
 # fails.
 _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2
@@ -111,9 +111,9 @@ def time_exchanges(
 ) -> ExchangeTimes:
     """Measure the duration of ``count`` exchanges with the reads and writes of a tick.
 
-    The exchanges follow each other without pauses. A read has to wait until the preceding write has
-    been transmitted, so the duration of a read includes both transmissions. If ``write`` is None,
-    only reads are timed. The reply timeout is at least 0.1 s.
+    There are no pauses between exchanges. A read waits until the preceding write has been
+    transmitted, so the read's duration includes both transmissions. If ``write`` is None, only
+    reads are timed. The reply timeout is at least 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0

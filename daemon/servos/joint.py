@@ -46,8 +46,9 @@ def current_toward(
 class JointScale:
     """Conversion between register counts and rad, rad/s and A.
 
-    q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and similarly for velocity. Currents
-    are motor currents, without the gear ratio. A positive current closes the joint.
+    A joint angle is direction · (counts − zero) · 2π / 4096 / gear_ratio. Velocities are converted
+    similarly. Currents are motor currents and do not depend on the gear ratio. A positive current
+    closes the joint.
     """
 
     direction: int  # +1 if the counts increase when the joint closes, otherwise -1
@@ -146,7 +147,7 @@ def pack_goal(mode: int, current: int, position: int) -> bytes:
 
 
 def goal_in(mode: int, table: bytes, start: int) -> bytes:
-    """Return the bytes of a servo's goal. ``table`` contains the registers from ``start`` on."""
+    """Return a servo's goal bytes. ``table`` contains the registers from address ``start`` on."""
     current = table[reg.GOAL_CURRENT - start : reg.GOAL_CURRENT - start + _CURRENT.size]
     position = table[reg.GOAL_POSITION - start : reg.GOAL_POSITION - start + _POSITION.size]
     if mode == reg.POSITION_MODE:

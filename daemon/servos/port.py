@@ -31,7 +31,7 @@ _SYSFS = Path("/sys/class/tty")
 
 
 def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
-    """Return the kernel file of a USB adapter's latency timer [ms], or None without a timer."""
+    """Return the kernel file of an adapter's latency timer [ms], or None if it has no timer."""
     place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     return place if place.exists() else None
 
@@ -43,7 +43,7 @@ class PortLost(ServoError):
 class SerialPort(PortHandler):  # type: ignore[misc]
     """An exclusive serial port for one thread.
 
-    The timeout of a reply is ``reply_timeout`` seconds, or more if the transmission takes longer.
+    The reply timeout is ``reply_timeout`` seconds, or more if the transmission takes longer.
     ``received`` contains bytes that have not been decoded yet. ``deadline`` is the time at which
     the current exchange times out [s, time.monotonic()].
     """
@@ -90,8 +90,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         """Send a packet; return True if it was completely sent.
 
         ``reply`` is the expected length of the reply. If a reply is expected, older input is
-        discarded before sending. The deadline of the reply is at most ``until`` [s,
-        time.monotonic()].
+        discarded before sending. The reply deadline is ``until`` [s, time.monotonic()] or earlier.
         """
         remaining = packet
         try:

@@ -14,7 +14,7 @@ All other SDK functions are used unchanged.
   alerts are lost, and the joint appears to be at position 0.
 - ``broadcastPing`` always waits for 253 servos, which takes 0.8 s at 1 Mbaud.
 - ``PortHandler`` measures deadlines with the wall clock and adds 34 ms. A missing servo therefore
-  causes a delay of 35 ms, and adjusting the system clock changes the deadline. ``PortHandler`` also
+  causes a delay of 35 ms. Adjusting the system clock changes the deadline. ``PortHandler`` also
   opens ports that are in use by another process.
 """
 
@@ -97,9 +97,9 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     ) -> tuple[list[int], int, int]:
         """Read a register span; return (data, result code, error byte).
 
-        If the servo replies with an error, the data are 0. Replies of the wrong length are skipped.
-        Such a reply belongs to an earlier action instruction, because the SDK does not wait for
-        replies to action instructions.
+        If the servo replies with an error, the data are 0. A reply of the wrong length belongs to
+        an earlier action instruction and is skipped. The SDK does not wait for replies to action
+        instructions.
         """
         if dxl_id >= BROADCAST_ID:
             return [], int(COMM_NOT_AVAILABLE), 0
@@ -118,7 +118,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 return [0] * length, result, packet[8]
 
     def rxPacket(self, port: SerialPort, fast_option: bool = False) -> tuple[Any, int]:
-        """Return the next status packet with byte stuffing removed, and the result code.
+        """Return the next status packet without byte stuffing, and the result code.
 
         The reply to a fast read has no byte stuffing and comes from the broadcast ID. If a packet
         is corrupted, the wait ends immediately, because the servo does not send the packet again.
@@ -312,7 +312,7 @@ class ServoLine:
         return None
 
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
-        """Write bytes of equal length to each servo, without replies and without verification.
+        """Write values of equal length to the servos, without replies or verification.
 
         The method uses a sync write, which works at every status return level.
         """

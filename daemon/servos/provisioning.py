@@ -60,14 +60,14 @@ class FoundServo:
         return self.describe(str(self.baud))
 
     def describe(self, rates: str) -> str:
-        """Describe a servo and the baud rates at which the servo replies, in one line of text."""
+        """Describe in one line a servo and the baud rates at which it replies."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
 
 @dataclass(frozen=True, slots=True)
 class Garbled:
-    """ID whose replies are corrupted because several servos share the ID or the line is faulty."""
+    """ID with corrupted replies; either several servos share the ID, or the line is faulty."""
 
     id: int
     baud: int
@@ -190,13 +190,12 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 
     A servo that replies with the ID of a missing servo at another baud rate counts as the missing
     servo. If exactly one servo is missing and exactly one servo is unassigned, the unassigned servo
-    counts as the missing servo. In both cases, only servos of the configured model are considered.
-    Servos with corrupted replies are not changed.
+    counts as the missing servo. Servos of another model or with corrupted replies are not assigned.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
-    # Every baud rate gets a reply from an emulator that does not simulate line timing.
+    # An emulator that does not simulate line timing replies at every baud rate.
     anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
@@ -207,8 +206,8 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
         and not (each.id in anywhere and each.baud != servos.baud)
         and (each.id, each.baud) not in bad
     ]
-    # A servo with a finger's configured ID and baud rate belongs to that finger, even if the scene
-    # does not contain the finger.
+    # A servo with a finger's configured ID and baud rate belongs to that finger. The scene need not
+    # contain the finger.
     others = {each for each in strangers if each.baud == servos.baud and each.id in servos.ids}
     fit = [each for each in strangers if each.number == model.number and each not in others]
     missing = [servo_id for servo_id in ids if servo_id not in home]
@@ -370,7 +369,7 @@ def _reboot_if_needed(
 ) -> None:
     """Reboot a servo that has a hardware error or has lost a turn.
 
-    The servo's limits must be corrected first.
+    The caller must correct the servo's limits before the reboot.
     """
     servo_id = settings.servos.ids[finger]
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)

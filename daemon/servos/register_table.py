@@ -1,16 +1,15 @@
 """List the servo registers that affect the hand, with their required values.
 
-:func:`required_registers` returns the table in the order of the e-Manual's control table. A servo
-keeps its EEPROM values permanently, and its RAM values until a reboot or a power failure. EEPROM
-and RAM may therefore contain values from another program. `connect` checks the EEPROM, and only
-`softfinger doctor --fix` writes the EEPROM. `arm` writes the RAM registers that are marked
-``armed``.
+:func:`required_registers` returns the table in the order of the e-Manual's control table. EEPROM
+values are permanent. RAM values persist until a reboot or a power failure. EEPROM and RAM may
+therefore contain values from another program. `connect` checks the EEPROM, and only `softfinger
+doctor --fix` writes the EEPROM. `arm` writes the RAM registers that are marked ``armed``.
 
-Registers that do not affect goal tracking, limits or bus replies in the hand's operating modes are
-omitted. A search finds the ID and baud rate. The registers for moving threshold, LED and external
-ports have no effect on the motion. Velocity gains and goal velocity apply only to velocity mode.
-`servos.torque` writes goal current, goal position, bus watchdog and indirect addresses on each
-`arm`.
+The table omits registers that do not affect goal tracking, limits or bus replies in the hand's
+operating modes. ID and baud rate are also omitted, because a search finds them. The registers for
+moving threshold, LED and external ports have no effect on the motion. Velocity gains and goal
+velocity apply only to velocity mode. `servos.torque` writes goal current, goal position, bus
+watchdog and indirect addresses on each `arm`.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class Register(NamedTuple):
     signed: bool = False
 
     def value_in(self, table: bytes, start: int = 0) -> int:
-        """Return the register's value. ``table`` contains the registers from ``start`` on."""
+        """Return the register's value in ``table``, which begins at address ``start``."""
         at = self.address - start
         return int.from_bytes(table[at : at + self.size], "little", signed=self.signed)
 
@@ -91,7 +90,7 @@ _AT: Final = {register.address: register for register in REGISTERS}
 
 
 class Requirement(NamedTuple):
-    """Required value of a register. Other values are reported as findings with this ``status``."""
+    """Required value of a register. A wrong value results in a finding with this ``status``."""
 
     register: Register
     holds: Callable[[int], bool]
@@ -125,7 +124,7 @@ def _exactly(
 
 
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
-    """Return the requirement for a shutdown limit of the servo. ``high`` is the factory value."""
+    """Require a shutdown limit between ``low`` and the factory value ``high``."""
     register = _AT[address]
     expected = f"{low}" if low == high else f"{low} to {high}"
     return Requirement(
@@ -282,7 +281,7 @@ def _current_limit(model: ServoModel, current_max: float) -> Requirement:
 
 
 def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iterable[Requirement]:
-    """Yield the requirements for the position limits. Servos silently reject goals outside them."""
+    """Yield the position limit requirements. Servos silently reject goals outside the limits."""
     ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
     first, last = sorted(scale.position_counts(q) for q in ends)
     needed = f"the joint requires {first} to {last}"

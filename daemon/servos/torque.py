@@ -26,14 +26,15 @@ _GOAL_BYTES = (
     *range(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 2),
     *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
-_PACKET_COUNT = 2  # number of copies of each torque-off packet; servos do not reply to the packet
-# Time limit for switching on, as a multiple of the reply timeout. Switching on blocks the loop.
+_PACKET_COUNT = 2  # number of times each torque-off packet is sent; servos do not confirm it
+# Time limit for switching torque on, as a multiple of the reply timeout. Switching torque on blocks
+# the loop.
 _ON_TIMEOUTS = 50
-_MOTION_MAX = 8  # allowed motion of a limp joint before torque is on, in counts (0.7°)
+_MOTION_MAX = 8  # maximum motion of a limp joint before torque is on [counts], equal to 0.7°
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
-    """Return the address for writing goals. Two goals require an indirect data address."""
+    """Return the address to which goals are written. Two goals require an indirect data address."""
     if mode == reg.CURRENT_MODE:
         return reg.GOAL_CURRENT
     if mode == reg.POSITION_MODE:
@@ -66,7 +67,7 @@ class Torque:
         self._mode = reg.MODE_NUMBERS[servos.mode]
         ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
         self._ticks = min(ticks, reg.WATCHDOG_MAX)
-        self._not_after = math.inf  # deadline for switching on, in time.monotonic() [s]
+        self._not_after = math.inf  # deadline for switching torque on [s, time.monotonic()]
         ids = list(self._joints)
         self._offs = [
             GroupWrite(line.port, reg.TORQUE_ENABLE, 1, each) for each in (ids, *([i] for i in ids))
@@ -81,19 +82,19 @@ class Torque:
         Raises
         ------
         ServoError
-            If switching on failed or could not be verified. Torque may be on.
+            If torque could not be switched on or verified. Torque may be on.
         """
         self._not_after = time.monotonic() + _ON_TIMEOUTS * self._line.port.reply_timeout
         self._refuse_hardware_errors()
-        # After a watchdog stop, goals are read-only until 0 is written to the watchdog.
+        # After a watchdog stop, goals are read-only until 0 is written to the watchdog register.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
         self._write_registers()
         goals = self._choose_goals()
         if self._mode != reg.POSITION_MODE:
             self._store_all(reg.GOAL_CURRENT, bytes(2), "goal current")
         self.may_be_on = True
-        # The watchdog must already be running when torque is switched on, so that it stops servos
-        # whose state cannot be verified.
+        # Start the watchdog before torque is switched on, so that it also stops servos in an
+        # unverified state.
         if self._ticks:
             self._store_all(reg.BUS_WATCHDOG, bytes((self._ticks,)), "watchdog armed")
         positions = self._aim_here()
