@@ -88,8 +88,8 @@ class Run:
 def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
     """Find the loading branch of a test, and the displacement at which the curve begins.
 
-    Rubber softens in its first cycles (Mullins, 1948). Therefore, the last cycle that reaches the
-    full depth is used. The branch ends when d comes within 0.5 % of its maximum, so a hold is
+    Rubber softens in its first cycles (Mullins, 1948). The fit therefore uses the last cycle that
+    reaches the full depth. The branch ends when d comes within 0.5 % of its maximum, so a hold is
     excluded.
 
     Parameters

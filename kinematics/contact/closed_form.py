@@ -29,7 +29,7 @@ __all__ = ["ClosedForms", "Fingertip", "closed_forms"]
 
 HALF_PI = math.pi / 2
 RADIUS_MAX = 1.0  # maximum radius [m]; larger values were probably given in millimetres
-POISSON = (0.45, 0.4995)  # range of Poisson's ratio covered by the solid tip data
+POISSON = (0.45, 0.4995)  # range of Poisson's ratio in the data for solid tips
 
 
 Physics = Literal["springs", "solid", "measured"]

@@ -76,12 +76,12 @@ class TipCurves:
 
     @property
     def root(self) -> float:
-        """Maximum t of the curves."""
+        """Maximum t for which the curves are valid."""
         return math.sqrt(self.deepest / self.radius)
 
     @property
     def square(self) -> float:
-        """Maximum q of the curves."""
+        """Maximum q for which the curves are valid."""
         return math.sin(self.tilt) ** 2
 
     def at(self, curve: Curve, d: ArrayLike, theta: ArrayLike) -> FloatArray:

@@ -1,7 +1,7 @@
 """Fast contact detection and outlier rejection in a frame.
 
-The kernels require only the readings and the noise level, but not a fit. If a single cell reads far
-more than its neighbours, it is masked as an outlier.
+The kernels use only the readings and the noise level. They do not require a fit. If a single cell
+reads far more than its neighbours, it is masked as an outlier.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PEAK_LEVEL, PATCH_LEVEL = 3.0, 4.9
 OUTLIERS_MAX = 6  # maximum number of outliers excluded from a frame
 # Factor on the detection threshold during a contact. A factor below 1 adds hysteresis.
 _HYSTERESIS = 0.5
-_NOISE_RATIO = 1.75  # minimum ratio of measured to configured noise in a noisy frame
+_NOISE_RATIO = 1.75  # minimum ratio of measured noise to configured noise in a noisy frame
 _SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviations
 
 

@@ -1,7 +1,7 @@
 """Kernels for the initial contact estimate from the sum, centroid and extent of a frame.
 
-The pressure moments over the footprint are compared with the model's moments, tabulated over d. The
-force or the extent determines d, and the centroid determines the tilt.
+The pressure moments over the footprint are compared with the model's moments, which are tabulated
+as a function of d. The force or the extent determines d, and the centroid determines the tilt.
 """
 
 from __future__ import annotations

@@ -130,10 +130,10 @@ def holding_moment_arms(
     T is the mean shear force. The moment equilibrium of the object requires T W = N slide + ∂U1/∂θ1
     + ∂U2/∂θ2. Faces with a ``taper`` α [rad] push the object out. The shear force is therefore T −
     N tan(α/2) at the left tip and T + N tan(α/2) at the right tip. F is the mean contact force of
-    both tips. In the moment arms τ/F [m], a modulus that both tips share therefore cancels. N is
-    the mean of the normal forces N1 and N2 [N]. N1 and N2 differ if the object rubs against its
-    surroundings. ``data1`` and ``data2`` are the contact table arrays. All results are zero unless
-    both tips are in contact.
+    both tips. A modulus that is common to both tips therefore cancels in the moment arms τ/F [m]. N
+    is the mean of the normal forces N1 and N2 [N]. N1 and N2 differ if the object rubs against its
+    surroundings. ``data1`` and ``data2`` are the arrays of the contact tables. All results are zero
+    unless both tips are in contact.
     """
     d1, d2 = d
     theta1, theta2 = theta
