@@ -145,7 +145,7 @@ class Body:
         self.lines = number[mesh.base].T  # base nodes from the centre to the rim
 
     def _geometry(self) -> FloatArray:
-        """Set weights and linear functions; return the shape gradients (e, q, 27, 3)."""
+        """Set weights and linear functions; return the shape-function gradients (e, q, 27, 3)."""
         points, gauss = GAUSS
         value, slope = quadratic(points)
 

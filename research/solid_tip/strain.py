@@ -178,8 +178,8 @@ class Strain:
         rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
         first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
         shear, harmonics = through(self.sines, shears), through(self.sines, bases)
-        # At small tilts, the higher harmonics are very small. Dividing them by sin^m θ would leave
-        # only mesh errors.
+        # At small tilts, the higher harmonics are very small. Division by sin^m θ would leave only
+        # mesh errors.
         least = len(self.sines) > 1
         higher = through(self.sines[least:], bases[least:])
 

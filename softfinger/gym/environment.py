@@ -35,7 +35,7 @@ __all__ = ["Images", "SoftFingerEnv"]
 Observation = dict[str, NDArray[Any]]
 
 FORCE = 6.0  # target grip force [N]
-REACH = 0.02  # maximum joint goal change per step [rad]
+REACH = 0.02  # maximum change in a joint goal per step [rad]
 FORCES = 1.0, 12.0  # grip forces for actions of −1 and 1 [N]
 ANGLE = 0.25  # object angle for an action of 1 [rad]
 WHITE = 50e3  # pressure shown as white (255) in images [Pa]

@@ -25,7 +25,7 @@ Image = NDArray[np.uint8]
 _SIDE, _MAP = 400, 150  # width of the scene and side length of a pressure map [pixels]
 HEIGHT, WIDTH = 2 * _MAP, _SIDE + _MAP
 _SCALE = 2100.0  # scale of the picture [pixels/m]
-_LOWEST = -0.012  # y of the scene's lower edge [m]
+_LOWEST = -0.012  # y coordinate of the lower edge of the scene [m]
 _THINNEST = 1.6  # pixels
 _BACKGROUND = 24
 
