@@ -1,5 +1,5 @@
 """Contact mechanics of soft hemispherical fingertips and the planar two-fingered hand.
 
-The modules contain only mathematics, in SI units, and do not use clocks, threads or settings. The
-only files that the modules access are the solid-tip data and the cache of compiled kernels.
+The modules contain only mathematics, in SI units, and do not use clocks, threads or settings. They
+access no files except the solid-tip data and the cache of compiled kernels.
 """

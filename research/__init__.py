@@ -1,1 +1,1 @@
-"""Programs that compute the package's data files; run the programs from the source tree."""
+"""Programs that compute the package's data files; run them from the source tree."""

@@ -1,7 +1,7 @@
 """Real-time control of two rotational fingers with soft hemispherical tips.
 
-This module exports the public API. Each name is imported on first access. Therefore, client
-programs that use only `Hand` or `AsyncHand` do not load Numba or the control loop.
+This module exports the public API. Each name is imported when it is first accessed. Client programs
+that use only `Hand` or `AsyncHand` therefore do not load Numba or the control loop.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ __all__ = [
     "to_columns",
 ]
 
-# Public names of each module. For type checkers, the imports above declare the same names.
+# Public names of each module. The imports above declare the same names for type checkers.
 _PUBLIC = {
     "daemon.client.asynchronous": "AsyncHand AsyncSubscription",
     "daemon.client.command_client": "NoAnswer",

@@ -5,16 +5,16 @@
 pressure under each tip. :class:`MujocoHand` simulates the hand of a profile. The daemon uses
 :class:`MujocoHand` if ``servos.backend = "mujoco"``.
 
-The simulated hand uses the same contact law (`simulation.physics.tip`). In 3D, the shear is a
-vector in the plane of the face. The component along the tilt is ζ = d_t. The square of the
-component across the tilt is used as the variance v, because U contains ρ(ζ² + v). The forces f are
-computed for the end of the step (docs/mujoco.md). The forces are linearly implicit in d, θ and both
-shears, whose Jacobian rows are R:
+The package's planar simulated hand uses the same contact law (`simulation.physics.tip`). In 3D, the
+shear is a vector in the plane of the face. The component along the tilt is ζ = d_t. The square of
+the component across the tilt is used as the variance v, because U contains ρ(ζ² + v). The forces f
+are computed for the end of the step (docs/mujoco.md). The forces are linearly implicit in d, θ and
+both shears. R contains the Jacobians of these four variables as rows:
 
     (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
 
-K and D are the contact law's stiffness and damping, and h is the time step. a is the acceleration
-that all other forces caused in the last step. At rest, f equals the contact law's force.
+K and D are the contact law's stiffness and damping, and h is the time step. The acceleration a is
+due to all other forces in the last step. At rest, f equals the contact law's force.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ Work = tuple[FloatArray, FloatArray, FloatArray]
 
 _ROWS = 4  # number of rows per tip: d, θ, and the shears along and across the tilt
 _GAP_MAX = 0.005  # maximum gap that can close within the next step [m]
-_VALUE_MIN = 1e-9  # smallest nonzero contact depth [m], friction force [N] and sin θ
+_VALUE_MIN = 1e-9  # negligible contact depth [m], friction force [N] and sin θ
 _SHEAR = 2  # row index of the shear along the tilt
 _UNSUPPORTED = (
     "tip_relaxation",
@@ -66,7 +66,8 @@ _UNSUPPORTED = (
     "joint_load_friction",
     "joint_stribeck",
 )
-# Impedance of joint friction. With MuJoCo's default of 0.9, the joints creep at several mrad/s.
+# Impedance of joint friction. With MuJoCo's default impedance of 0.9, the joints creep at several
+# mrad/s.
 _IMPEDANCE = 0.9999
 
 
@@ -128,9 +129,9 @@ def press(
 ) -> None:  # fmt: skip
     """Evaluate all tips; store the rows R [4n, nv], the force along each row, and B in ``work``.
 
-    ``geometry`` [n, 10] contains d, centre, axis and foremost point of each tip. ``jacobians``
-    [n, 4, 3, nv] contains each tip's position and rotation Jacobians, and then those of the touched
-    geom. ``dt`` [s] is the time since the last call.
+    ``geometry`` [n, 10] contains d, centre, axis and foremost point of each tip. ``jacobians`` [n,
+    4, 3, nv] contains the position and rotation Jacobians of each tip, followed by those of the
+    touched geom. ``dt`` [s] is the time since the last call.
     """
     p, data, rates = parameters[0], tables[0], np.zeros(_ROWS)
     rows, force, implicit = work
@@ -215,10 +216,10 @@ def solve(
 class SoftTips:
     """Context manager that turns spheres in a MuJoCo model into soft tips.
 
-    The active context uses MuJoCo's global callbacks ``mjcb_passive`` and ``mjcb_sensor``. Only one
-    model at a time can therefore have soft tips. A user sensor named ``TIP_pressure`` with
-    ``needstage="vel"`` receives the cell pressures [Pa]. The pressures are updated ``tactile.rate``
-    times per second.
+    An active context uses MuJoCo's global callbacks ``mjcb_passive`` and ``mjcb_sensor``.
+    Therefore, only one model at a time can have soft tips. A user sensor named ``TIP_pressure``
+    with ``needstage="vel"`` receives the cell pressures [Pa]. The pressures are updated
+    ``tactile.rate`` times per second.
 
     Parameters
     ----------
@@ -428,7 +429,7 @@ class MujocoHand(SimulatedHand):
                 set_currents(plant.array, data.ctrl)
                 data.qfrc_applied[2:] = plant.goals.load
                 mujoco.mj_step2(self.model, data)
-                mujoco.mj_step1(self.model, data)  # Update the contacts for `feel`.
+                mujoco.mj_step1(self.model, data)  # Compute the contacts that `feel` reads.
                 state.position[:], state.velocity[:] = data.qpos, data.qvel
                 state.current[:] = data.act
                 self._done = plant.step_count = self._done + 1

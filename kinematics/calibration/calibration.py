@@ -40,17 +40,18 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD_RESPONSE = 0.2  # Cells below this fraction of the median response are dead.
+DEAD_RESPONSE = 0.2  # A cell is dead if its response is below this fraction of the median.
 _EXPONENTS = (0.3, 3.0)
-_UNREST_SIGMA = 8.0  # Cells above this multiple of the median noise are unsteady.
-# A tare fails if at least this many cells are unsteady. Fewer unsteady cells may merely be faulty.
+_UNREST_SIGMA = 8.0  # A cell is unsteady if its noise exceeds this multiple of the median.
+# A tare fails if at least this many cells are unsteady. A smaller number of unsteady cells may be
+# due to faulty cells.
 _UNREST_CELL_COUNT = 4
-_TILT_MIN = math.radians(3.0)  # minimum range of the tilts for determining the rotation
+_TILT_MIN = math.radians(3.0)  # minimum range of tilts from which the rotation is determined
 _UPRIGHT_ERROR = math.radians(0.5)
 _PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, as a multiple of the noise
 _LAG_MAX = 8  # maximum lag of the noise correlation, in cells
-_SIGNIFICANT_SIGMA = 4.0  # Results above this number of standard errors are significant.
-# Clipping at 0 does not affect zero offsets above this number of noise standard deviations.
+_SIGNIFICANT_SIGMA = 4.0  # A result is significant if it exceeds this number of standard errors.
+# If a zero offset exceeds this number of noise standard deviations, clipping at 0 is negligible.
 _CLIPPED_SIGMA = 4.0
 _HOLD_RATIO_MIN = 2.0  # minimum hold time, as a multiple of the longest time constant
 _ITERATIONS = 25  # number of iterations that alternate between F∞ and the strengths
@@ -66,8 +67,8 @@ class Tare:
 
     ``zero`` and ``noise`` are the mean and the standard deviation of the unloaded counts, both
     float64 [rows, cols]. Element [k, m] of ``correlation`` is the noise correlation of two cells
-    that are k rows and m columns apart. The array is empty if no correlation is significant.
-    ``drift`` [counts] is the standard deviation of the drift that all cells share. ``excess``
+    that are k rows and m columns apart. ``correlation`` is empty if no correlation is significant.
+    ``drift`` [counts] is the standard deviation of a drift that is common to all cells. ``excess``
     [counts] is the mean of max(reading − zero, 0).
     """
 
@@ -116,7 +117,7 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     shape = rows + _LAG_MAX, cols + _LAG_MAX
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
-    # Average the correlation over both signs of one lag, that is, over both diagonal directions.
+    # Average the correlation over both diagonal directions, i.e. over both signs of the column lag.
     both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAG_MAX, :_LAG_MAX]
     pairs = (n - 1.0) * np.outer(rows - np.arange(_LAG_MAX), cols - np.arange(_LAG_MAX))
     if rows < _LAG_MAX or cols < _LAG_MAX or not both[0, 0] > 0.0:
@@ -153,7 +154,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
     Each gain is the least-squares fit of a cell's readings to the mean of all working cells. Cells
     with less than a fifth of the median response are considered dead. Raises CalibrationError if
-    the frames show no pressure.
+    the frames do not contain any pressure.
     """
     if not loads:
         raise CalibrationError("equilibrate: expected at least one uniform pressure")
@@ -283,10 +284,10 @@ def _power(
 
 
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
-    """Set mean readings [rows, cols] below 4 σ to 0; ``frames`` is the number of averaged frames.
+    """Set mean readings [rows, cols] below 4 σ to 0; ``frames`` is the number of frames averaged.
 
-    Clipped noise has a positive mean. Summed over all cells, clipped noise may be as large as the
-    force of a contact.
+    Clipped noise has a positive mean. Summed over all cells, this mean may be as large as the force
+    of a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)
@@ -320,8 +321,8 @@ def without_clipping(means: FloatArray, zero: FloatArray, noise: float) -> Float
 class Centre:
     """Result of `fit_centre`: the tip centre in sensor axes [m] and the rotation [rad].
 
-    ``rotation`` is None if no press was tilted. ``residual`` [m] is the change in the last
-    iteration. ``std`` [m] is the standard deviation of each coordinate of the centre.
+    ``rotation`` is None if no press was tilted. ``residual`` [m] is the change in the centre during
+    the last iteration. ``std`` [m] is the standard deviation of each coordinate of the centre.
     """
 
     centre: tuple[float, float]
@@ -339,7 +340,7 @@ def fit_centre(
     noise: float,
     active: NDArray[np.bool_] | None = None,
 ) -> Centre:
-    """Determine tip centre and sensor rotation from presses at known tilts ``theta`` [n] [rad].
+    """Determine the tip centre and sensor rotation from presses at known tilts ``theta`` [n] [rad].
 
     The tilts are in the finger's plane. The fit uses all cells of the ``frames`` [n, rows, cols]
     [Pa]. The modulus of a spring tip need not be known. Raises CalibrationError if a frame does not
@@ -364,7 +365,7 @@ def fit_centre(
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
     # Add the uncertainty of the upright orientation. An orientation error shifts the centroid by
-    # the moment arm times the error.
+    # the product of moment arm and error.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
     std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
     return Centre(found.centre, found.rotation if tilted else None, residual, std)
@@ -375,7 +376,7 @@ class Modulus:
     """Result of `fit_modulus` for the model F(d − d₀, θ).
 
     ``modulus`` is E [Pa], and ``offset`` is d₀ [m]. ``errors`` [n] are the relative force errors.
-    ``trend`` contains the value of E from each load.
+    ``trend`` contains the value of E at each load.
     """
 
     modulus: float
@@ -420,18 +421,18 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
 class Relaxation:
     """Result of `fit_relaxation`: F = c F∞ (1 + Σ r_i (1 − h_i/F∞)), ḣ_i = (F∞ − h_i)/τ_i.
 
-    The strengths are r_i. ``residual`` is the rms relative error of F during the hold, and
-    ``elastic`` is the error of a fit without relaxation.
+    The strengths are r_i. ``residual`` is the rms relative error of F during the hold. ``elastic``
+    is the same error for a fit without relaxation.
     """
 
     strengths: tuple[float, ...]
     residual: float
     elastic: float
-    model: FloatArray  # F [N]: measured during the press, fitted during the hold
+    model: FloatArray  # F [N], measured during the press and fitted during the hold
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
-    """Integrate ḣ = (F∞ − h)/τ from h = 0; F∞ is ``lasting``, interpolated linearly in ``t``."""
+    """Integrate ḣ = (F∞ − h)/τ from h = 0; ``lasting`` contains F∞ at the times ``t``."""
     out = np.zeros_like(lasting)
     for k in range(1, t.size):
         step = (t[k] - t[k - 1]) / time
@@ -442,7 +443,7 @@ def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
 
 
 def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
-    """Fit non-negative relaxation strengths to the force during a press and the hold after it.
+    """Fit non-negative relaxation strengths to the force during a press and the subsequent hold.
 
     F∞ is constant during the hold. During the press, F∞ is computed from F and the strengths. The
     fit therefore updates F∞ and the strengths alternately.

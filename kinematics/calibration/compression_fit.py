@@ -1,8 +1,8 @@
 """Fit a tip's material law to displacement and force from a testing machine.
 
 The machine presses a platen onto the tip along the platen's normal. The tip sticks to the platen,
-so the measured force is ∂U/∂d. In each run, the zero offsets of d and F are unknown. The toe of the
-curve, in which an uneven surface makes first contact, is also unknown.
+so the measured force is ∂U/∂d. The zero offsets of d and F are unknown in each run. The toe of the
+curve, where an uneven surface makes first contact, is also unknown.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ FloatArray = NDArray[np.float64]
 
 _UNIT = Material.constant(1.0)
 _SLACK = 0.02  # maximum reversal of d due to encoder noise, relative to the range of d
-_TURNS = 5  # minimum number of rows per reversal of d; fewer rows mean a wrong row order
-_DEEP = 0.9  # minimum peak of a full-depth branch, as a fraction of the range of d
+_TURNS = 5  # minimum number of rows per reversal of d; fewer rows indicate a wrong row order
+_DEEP = 0.9  # minimum peak of d in a full-depth branch, as a fraction of the range of d
 TOE = 0.1  # half width of the toe around the first contact, as a fraction of the depth
 # Points above this fraction of the maximum force are used to extrapolate to zero force.
 _STEEP = 0.2
-_POWER = 0.55  # F to this power is nearly linear in d, for springs and for solid rubber
+_POWER = 0.55  # exponent p for which F^p is nearly linear in d, for springs and for solid rubber
 _FEWEST = 6  # minimum number of fitted rows per run
 _LOADED = 20.0  # minimum force range of a run, as a multiple of the noise
 # Minimum noise due to rounding and interpolation, as a fraction of the maximum force.
@@ -40,11 +40,11 @@ _ROUNDS = 60
 _CLIP = 0.02  # maximum change in the zero offset of d per iteration, as a fraction of the depth
 _STEP = 1e-8  # step for numerical derivatives [m]
 _TOLERANCE = 1e-7  # relative tolerance of the tables
-_EDGE = 1.0 - 1e-4  # usable fraction of a table's range; the derivative step needs the rest
+_EDGE = 1.0 - 1e-4  # usable fraction of a table's range, with a margin for the derivative step
 _TOO_DEEP = "the run exceeds the depth or tilt range of the model's data"
 _NO_BEGINNING = "no zero offset of d fits the run: the run must include the onset of contact"
-# Coefficients c_2, c_3 of three material laws with c_1 = 1. The force for σ = c_1 ε + c_2 ε² + c_3
-# ε³ is a linear combination of the forces for these laws.
+# Coefficients (c_2, c_3) of three material laws with c_1 = 1. The force for σ = c_1 ε + c_2 ε² +
+# c_3 ε³ is a linear combination of the forces for these laws.
 _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
 
 
@@ -76,7 +76,7 @@ class Run:
 
     @property
     def before(self) -> NDArray[np.bool_]:
-        """Mask of the rows before the contact."""
+        """Mask of the rows before first contact."""
         return self.d < self.begin - self.toe
 
     @property
@@ -88,9 +88,9 @@ class Run:
 def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
     """Find the loading branch of a test, and the displacement at which the curve begins.
 
-    Rubber softens in its first cycles (Mullins, 1948). The last cycle that reaches the full depth
-    is therefore used. The branch ends when d is within 0.5 % of its maximum, and thus excludes a
-    hold.
+    Rubber softens in its first cycles (Mullins, 1948). The fit therefore uses the last cycle that
+    reaches the full depth. The branch ends when d comes within 0.5 % of its maximum, so a hold is
+    excluded.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _turning_points(d: FloatArray, slack: float) -> list[int]:
 
 
 def _begin(d: FloatArray, force: FloatArray) -> float:
-    """Extrapolate the steep part of the curve to zero force; return the d at that point.
+    """Extrapolate the steep part of the curve to zero force; return d at zero force.
 
     A line is fitted to a power of the force that is nearly linear in d.
     """
@@ -206,7 +206,7 @@ class CompressionFit:
 
     If k > 1, ``factors`` [k] [Pa] are the coefficients of the powers 1 to k of the strain. If k =
     1, the single factor multiplies the shape ``law``. ``std`` is the maximum relative standard
-    deviation of the force for d above a quarter of its maximum. For k = 1, ``std`` is also the
+    deviation of the force where d exceeds a quarter of its maximum. For k = 1, ``std`` is also the
     relative standard deviation of the modulus. Each row of ``zeros`` contains a run's zero offsets
     of d [m] and F [N], and their standard deviations. ``residual`` [N] is the rms residual.
     ``chi2`` is the squared ratio of ``residual`` to the scatter about a smooth curve. ``score`` is
@@ -323,8 +323,8 @@ def compare_laws(
     """Fit spring and solid rubber models to runs; return the fits (best first) and notes.
 
     Springs are fitted with a constant and with a strain-dependent modulus. If ``material`` is
-    nonlinear, springs are also fitted with the shape of its law. The Poisson's ratio of solid
-    rubber is not fitted, because F(d) does not determine it.
+    nonlinear, springs are also fitted with the shape of the material's law. Poisson's ratio of
+    solid rubber is not fitted, because F(d) does not determine this ratio.
     """
     springs, solid = Fingertip(radius), Fingertip(radius, "solid", poisson)
     tried: list[tuple[str, Fingertip, Material | None]] = [("springs", springs, _UNIT)]
@@ -364,7 +364,7 @@ def _tables(tip: Fingertip, law: Material | None) -> list[ContactTable]:
 def _shapes(
     tables: Sequence[ContactTable], d: FloatArray, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the normal forces for the powers of the strain, and their ∂/∂d, both [n, k]."""
+    """Return the normal force for each power of the strain, and its ∂/∂d, both [n, k]."""
     touching, depth = d > 0.0, np.maximum(d, _STEP)
 
     def forces(at: FloatArray) -> FloatArray:

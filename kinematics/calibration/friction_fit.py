@@ -24,12 +24,12 @@ _REST_SPEED = 0.02
 # Minimum rotation at break-away [rad]. The value is three encoder counts, or ten times the elastic
 # deflection of the gears.
 _BREAK_AWAY_DISTANCE = 5e-3
-# Maximum goal velocity at break-away [rad/s], and number of steps over which it is averaged. The
-# limit keeps the inertial torque small.
+# Maximum goal velocity at break-away [rad/s], and number of steps over which the velocity is
+# averaged. The limit keeps the inertial torque small.
 _BREAK_AWAY_RATE = 0.1, 20
 _MOTION_TIME_MIN = 0.5  # minimum motion time in each direction [s]
 _CORRELATION_TIME = 0.2  # correlation time of the residuals [s]
-_BREAK_AWAY_COUNT_MIN = 3  # minimum number of break-aways for a mean
+_BREAK_AWAY_COUNT_MIN = 3  # minimum number of break-aways to average
 # Prior mean and standard deviation of the viscous friction [N·m·s/rad]. Values identified for
 # similar servos range from 0.015 to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
 _VISCOUS_PRIOR = 0.02, 0.02
@@ -62,9 +62,9 @@ def fit_friction(
         torque = F sign(q̇) + b q̇ + J q̈ + c0 + c1 q + c2 q²
 
     where F is the Coulomb friction and b ≥ 0 is the viscous friction. The polynomial in q models
-    the torques that do not depend on the direction of motion: weight, cables and the current
-    offset. The break-away friction is the maximum torque while the joint starts from standstill to
-    follow a slowly moving goal.
+    the torques that do not depend on the direction of motion. These torques are due to weight,
+    cables and the current offset. The break-away friction is the maximum torque when a joint at
+    standstill starts to follow a slowly moving goal.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def fit_friction(
 
 
 def duration_error(seconds: float) -> str:
-    """Return the error message for a recording whose duration ``seconds`` is too long."""
+    """Return the error message for a recording that is too long, with a duration of ``seconds``."""
     return f"found {seconds:.0f} s of data, expected at most {DURATION_MAX:g} s"
 
 
@@ -169,7 +169,7 @@ def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatA
     """Return the torque and its standard deviation for each slow start from standstill, [n, 2].
 
     The goal and the torque increase in whole counts. The break-away torque is therefore between the
-    highest torque and the torque one step earlier.
+    maximum torque and the torque one step earlier.
     """
     found = []
     speed, steps = _BREAK_AWAY_RATE

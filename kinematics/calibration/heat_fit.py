@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
 
-_PRIOR_STD = (0.4, 0.4, 3.0)  # prior σ of rise and time (relative) and of ambient [°C]
+_PRIOR_STD = (0.4, 0.4, 3.0)  # prior σ of rise and time (relative), and of ambient temperature [°C]
 # Standard deviation of a reading [°C], including the rounding to whole degrees.
 _READING_ERROR = 0.4
 _STEP = 1.0  # s
@@ -74,7 +74,7 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
 
     def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
         case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
-        # Equal readings share one rounding error, so all equal readings together have the weight of
+        # Equal readings share one rounding error, so a group of equal readings has the weight of
         # one reading.
         weight = np.sqrt(warmed / grid.size) / _READING_ERROR
         return np.concatenate([(case - readings) * weight, (x - prior) / _PRIOR_STD])

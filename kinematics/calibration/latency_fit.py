@@ -1,4 +1,4 @@
-"""Measure the latency of tactile frames: the delay between joint motion and the measured d."""
+"""Measure the latency of tactile frames, i.e. the delay of the measured d after joint motion."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
 _RAMP_MARGIN = 0.2  # time added to both ends of a ramp [s]
 _CLOSING_MIN = 8e-4  # minimum closing distance in a ramp [m]; equal to seven encoder counts
 _FRAME_COUNT_MIN = 8  # minimum number of frames
-_TIME_ERROR = 1e-3  # standard deviation of the times of ticks, readings and frames [s]
+_TIME_ERROR = 1e-3  # standard deviation of the time stamps of ticks, readings and frames [s]
 # Apparent widening of a growing footprint; see `perception.frame_channels`.
 _WIDENING, _SPREAD_MAX = 1.4, 0.1
 _ITERATIONS = 3  # number of iterations that alternately estimate the first contact and the delay
@@ -43,14 +43,14 @@ def fit_latency(
     latency: float,
     response: float = 0.0,
 ) -> LatencyFit:
-    """Fit the frame delay to the ramps of a grip, in which the force rises or falls.
+    """Fit the frame delay to the parts (ramps) of a grip in which the force rises or falls.
 
     The model for ramp k is
 
         d(t) = scale · closing(t − delay) + offset_k
 
-    Cells with a response time measure the closing with a first-order lag. A growing footprint
-    appears too wide, and the fit corrects d accordingly.
+    Cells with a response time measure the closing with a first-order lag. With such a lag, a
+    growing footprint appears too wide, and the fit corrects d for this effect.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def fit_latency(
         shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # At standstill, the encoder error is constant, and half of this error shifts the ramp.
+    # At standstill, the encoder error is constant. Half of the error shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))
@@ -115,7 +115,7 @@ def _fit(
     scale_error: float,
     latency: float,
 ) -> tuple[LatencyFit, float]:
-    """Fit d to the filtered closing; also return the offset of d [m]."""
+    """Fit d to the filtered closing; return the fit and the offset of d [m]."""
 
     def solve(delay: float) -> tuple[FloatArray, FloatArray]:
         at = data.t - delay
@@ -154,7 +154,7 @@ def _too_little(widest: float) -> str:
 
 
 def _filtered_closing(closing: FloatArray, response: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``closing`` as measured by cells with a first-order lag, and its spread [m²]."""
+    """Return the exponentially weighted mean [m] and variance [m²] of ``closing``."""
     if response == 0.0:
         return closing, np.zeros_like(closing)
     share = -math.expm1(-_STEP / response)
@@ -181,7 +181,7 @@ def _ramps(
     """Return a mask [n, ramps] of the frames in each ramp, and the maximum closing [m]."""
     window = np.ones(2 * round(_RAMP_MARGIN / _STEP) + 1)
     near = np.convolve(np.abs(rate) > _CLOSING_SPEED_MIN, window, "same") > 0.5
-    # Number of the ramp at each time of the grid, or 0 outside ramps.
+    # Index of the ramp at each time of the grid, or 0 outside the ramps.
     number = np.cumsum(near & ~np.append(False, near[:-1])) * near
     index = np.clip(np.searchsorted(grid, t), 0, grid.size - 1)
     widths = {

@@ -139,7 +139,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
 
 
 def _excess_error(misses: FloatArray, noise: FloatArray, smallest: float) -> float:
-    """Return the weighted standard deviation by which the residuals exceed their noise."""
+    """Return the weighted standard deviation of the residuals in excess of their noise."""
     weight = 1.0 / (noise**2 + smallest**2)
     return math.sqrt(max(float(weight @ (misses**2 - noise**2)) / float(weight.sum()), 0.0))
 
@@ -161,7 +161,7 @@ def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
 
 
 def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], float]:
-    """Return the tip centre [m] from upright presses and the rotation [rad] from tilted presses."""
+    """Estimate tip centre [m] from upright presses, and rotation [rad] from tilted presses."""
     x, y = sums[1:3] / sums[0]
     weight = np.where(np.abs(theta) < _UPRIGHT_TILT, sums[0], 0.0)
     weight /= weight.sum()

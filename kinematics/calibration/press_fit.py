@@ -22,14 +22,14 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _UNIT_MATERIAL = Material.constant(1.0)
 _STEP = 1e-5  # step for numerical derivatives [m]
-_PLACE_STEP = 2e-4  # position step [m]; large, because rim cells change by whole sample points
+_PLACE_STEP = 2e-4  # position step [m]; large, because rim cells gain or lose whole sample points
 _ROTATION_STEP = 1e-4  # rad
 _ROTATION_STARTS = 8  # number of initial rotations to try
 _GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
 _POISSON_TOLERANCE = 4e-3  # tolerance of ν
 # Presses whose d [m] and θ [rad] differ by less than this count as repetitions.
 _REPEATED_D, _REPEATED_THETA = 5e-5, 0.009
-_DRIFT_MIN = 0.02  # minimum significant drift of E, given the accuracy of presses and tables
+_DRIFT_MIN = 0.02  # smallest significant drift of E, limited by the errors of presses and tables
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,9 @@ class Presses:
 class Trend:
     """Modulus E [n] [Pa] of each press at d [n] [m], and the drift of E with d.
 
-    A line is fitted to E. ``drift`` is the relative change of the line from the minimum to the
-    maximum d. ``std`` is the standard deviation of ``drift``, based on the scatter about the line.
+    A line is fitted to E as a function of d. ``drift`` is the relative change of the line from the
+    minimum to the maximum d. ``std`` is the standard deviation of ``drift``, based on the scatter
+    about the line.
     """
 
     d: FloatArray
@@ -100,7 +101,7 @@ def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
 
 
 def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | None:
-    """Compare first presses with their repetitions; return the mean relative excess force.
+    """Compare first presses with repetitions; return the mean relative excess of the first force.
 
     Filled rubber softens over its first cycles (Mullins, 1948), so one fit cannot describe both
     first and repeated presses. The mean is taken over the poses (``d`` [n] [m], ``theta`` [n]
@@ -121,9 +122,9 @@ class TipFit:
     [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the mean
     squared residual per cell divided by the noise variance. ``d_error`` [m] and ``theta_error``
     [rad] are the estimator's rms errors for this tip. ``force_error`` is the relative rms
-    difference between the estimated force and the frame sum. The errors include only frames with a
-    valid estimate; ``valid`` is the fraction of such frames. ``trend`` contains the value of E from
-    each press.
+    difference between the estimated force and the frame sum. These errors include only frames with
+    a valid estimate. ``valid`` is the fraction of such frames. ``trend`` contains the value of E
+    for each press.
     """
 
     tip: Fingertip
@@ -175,11 +176,12 @@ def compare_tips(
     active: NDArray[np.bool_],
     material: Material = _UNIT_MATERIAL,
 ) -> list[TipFit]:
-    """Fit spring and solid models of the tip; return the fits, best first.
+    """Fit spring and solid models of the tip; return the fits in order of quality, best first.
 
     Springs are fitted with a constant modulus. If ``material`` is nonlinear, springs are also
-    fitted with its law. For solid rubber, ν is a free parameter. Both base types are fitted with a
-    frictionless face. The better base type is then also fitted with a sticking face.
+    fitted with the law of ``material``. For solid rubber, ν is a free parameter. Both base types
+    are fitted with a frictionless face. The better base type is then also fitted with a sticking
+    face.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
     if not material.is_linear:

@@ -1,25 +1,25 @@
 """Compile and cache kernels with Numba, using its private interfaces.
 
-Only this module uses Numba's private interfaces. With Numba versions that have not been tested,
-`plain` replaces this module.
+No other module uses these interfaces. For Numba versions that have not been tested, `plain`
+replaces this module.
 
 `KernelCompiler` runs only the passes that kernels need. The compiler omits the passes for closures,
-`with` statements and parallel loops. The compiler does not prune constant branches, because LLVM
-prunes them anyway. Type annotations are not stored, because they would fill the cache. The compiler
-caches the result types of operations and the sizes of LLVM types. Without the cache, Numba would
-search dozens of candidates for each operation, and LLVM would parse a module for each size.
+`with` statements and parallel loops. It does not prune constant branches, because LLVM prunes them
+anyway. It does not store type annotations, because they would fill the cache. The compiler caches
+the result types of operations and the sizes of LLVM types. Without the cache, Numba would search
+dozens of candidates for each operation, and LLVM would parse a module for each size.
 
 A `BitcodeKernel` is compiled to LLVM bitcode but not to machine code. Only other kernels can call a
-`BitcodeKernel`. By default, Numba compiles each function that a kernel calls as if Python might
-call it, too. Numba then optimises the function together with its callees, compiles it to machine
-code, adds two wrappers and caches the result. The callers link the bitcode and repeat the
-optimisation and compilation. Stopping at bitcode reduces the compile time by a third and the cache
-size by three quarters.
+`BitcodeKernel`. By default, Numba assumes that Python may also call each function that a kernel
+calls. Numba then optimises the function together with its callees, compiles it to machine code,
+adds two wrappers and caches the result. The callers link the bitcode and repeat the optimisation
+and compilation. Stopping at bitcode reduces the compile time by a third and the cache size by three
+quarters.
 
-`KernelCache` stores the machine code of a kernel but not its bitcode. A caller of the stored kernel
-needs the bitcode, so Numba compiles the stored kernel again for the caller. Normally, Numba imports
-all its implementations of Python and NumPy functions before it loads a stored kernel. `KernelCache`
-skips this import, which takes a third of a second and 50 MB.
+`KernelCache` stores the machine code of a kernel but not its bitcode. A caller needs the bitcode,
+so Numba compiles the stored kernel again when it compiles a caller. Normally, Numba imports all its
+implementations of Python and NumPy functions before it loads a stored kernel. `KernelCache` skips
+this import, which would require a third of a second and 50 MB.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _with_cached_lookups(flags: Any) -> Iterator[None]:
                 return None
             _SIGNATURES[key] = found, function._impl_keys[found.args]
         found, body = _SIGNATURES[key]
-        function._impl_keys[found.args] = body  # Numba looks up the body in `_impl_keys`.
+        function._impl_keys[found.args] = body  # Numba uses `_impl_keys` to look up the body.
         return found
 
     def size(context: Any, kind: Any) -> int:
@@ -178,7 +178,7 @@ class _Bitcode(JITCodeLibrary):
     """Code library that is linked into its callers and never compiled to machine code."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        # Do what Numba's own libraries do, but skip functions that are only declared here.
+        # Do the same as Numba's own libraries, but skip functions that are only declared here.
         ll_module.data_layout = self._codegen._data_layout
         for function in ll_module.functions:
             if not function.is_declaration:
@@ -235,7 +235,7 @@ class KernelFolder:
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> KernelFolder | None:
-        """Return the locator, or None if no folder is available; kernels are then not stored."""
+        """Return the locator, or None if no folder is available and kernels cannot be stored."""
         return None if kernel_folder() is None else cls(function, file)
 
     def get_cache_path(self) -> str:
@@ -275,7 +275,7 @@ class _MachineCode(CompileResultCacheImpl):
 
 
 class _Files:
-    """Cache storage with one file per overload, instead of Numba's index and data files."""
+    """Cache storage with one file per overload, which replaces Numba's index and data files."""
 
     def __init__(self, folder: OwnFolder, name: str, stamp: str) -> None:
         self._folder, self._name, self._stamp = folder, name, stamp
@@ -325,7 +325,7 @@ def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     try:
         dispatcher._cache = KernelCache(function)
     except RuntimeError:
-        pass  # Without a folder, kernels are not stored. `kernel_folder` has issued a warning.
+        pass  # Kernels are not stored. `kernel_folder` has already issued a warning.
     called = inner(function, options).dispatcher  # Callers need bitcode, which is not cached.
     dispatcher.get_call_template = called.get_call_template
     dispatcher.get_overload = called.get_overload

@@ -3,8 +3,8 @@
 A kernel is a pure function of arrays, records and scalars. A function decorated with ``kernel`` can
 be called from Python. When the function is first called, Numba compiles it together with all
 functions that it calls. Numba stores the code in the folder that `compiled.kernel_folder` selects.
-Functions decorated with ``inner_kernel``, ``fast_inner_kernel`` or ``inlined_kernel`` can be called
-only from other kernels, but compile in a fraction of the time.
+Only other kernels can call functions decorated with ``inner_kernel``, ``fast_inner_kernel`` or
+``inlined_kernel``. Such functions compile in a fraction of the time that a kernel requires.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # Minor versions of Numba whose private interfaces were tested with `compiler`.
 TESTED_NUMBA = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
-# index(k) converts k to an unsigned index. Negative indices count from the end, so Numba tests the
+# index(k) converts k to an unsigned index. A negative index counts from the end, so Numba tests the
 # sign of each signed index. The test prevents vectorisation. Do not mix signed and unsigned
 # integers in a sum.
 index: Callable[[int], int] = cast(Any, np.uint64)
@@ -38,7 +38,7 @@ class JitDisabled(SoftfingerError):
 
 
 def _chosen_compiler() -> tuple[ModuleType, str]:
-    """Return the compiler module and a reason, which is empty unless the module is `plain`."""
+    """Return the compiler module and the reason for using `plain`, or "" if it is not used."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         raise JitDisabled(
             "NUMBA_DISABLE_JIT is set, but the kernels must be compiled; unset this variable"
@@ -61,8 +61,8 @@ _compiler, why_plain = _chosen_compiler()
 def kernel(function: Function) -> Function:
     """Compile ``function`` with Numba, using an on-disk cache and IEEE arithmetic.
 
-    The kernel keeps the GIL. If the GIL were released, the control loop might wait a whole switch
-    interval to reacquire it.
+    The kernel keeps the GIL. If a kernel released the GIL, the control loop might have to wait for
+    a whole switch interval to reacquire it.
     """
     return cast(Function, _compiler.compiled(function, _OPTIONS))
 

@@ -2,9 +2,9 @@
 
 The folder name is a digest of all sources that may affect a kernel. The digest also includes the
 processor and the versions of Python, Numba, llvmlite and NumPy. Outdated kernels are therefore
-never loaded. The files are unpickled and executed, so the folder is used only if no other user can
-modify it. Each file begins with a digest of its content. If a file is corrupted, its kernel is
-compiled again.
+never loaded. The program unpickles and executes the files, so it uses the folder only if no other
+user can modify it. Each file begins with a digest of its content. If a file is corrupted, its
+kernel is compiled again.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 ROOT = Path(__file__).resolve().parents[2]  # directory of the `softfinger` package
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-# Number of other cache folders to keep, for example those of other checkouts or the previous
-# release.
+# Number of other cache folders to keep, for example from other checkouts or the previous release.
 _FOLDERS_MAX = 4
 _RECENT = 600.0  # minimum age of a removed folder [s]; newer folders may be in use
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
@@ -146,7 +145,7 @@ def mark(folder: OwnFolder, part: str) -> None:
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove other cache folders, except for the newest ones and those used recently."""
+    """Remove other cache folders, except the newest ones and those used recently."""
     oldest = time.time() - _RECENT
     others = [
         each

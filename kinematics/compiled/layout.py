@@ -46,7 +46,7 @@ class Records(Protocol, Generic[Each]):
 
 
 class _Slotted(type):
-    """Metaclass that allows only fields as attributes, so that a misspelt name raises an error."""
+    """Metaclass that rejects all attributes except fields, so that misspelt names raise errors."""
 
     def __new__(meta, name: str, bases: tuple[type, ...], names: dict[str, Any]) -> _Slotted:
         return super().__new__(meta, name, bases, {"__slots__": (), **names})
@@ -86,7 +86,7 @@ class Record(metaclass=_Slotted):
 
 
 class _Views(dict[str, Any]):
-    """Cached views of a record's fields. Creating a view takes ten times as long as using it."""
+    """Cached views of a record's fields, because creating a view takes ten times as long as use."""
 
     def __init__(self, kind: type[Record], one: Any) -> None:
         self._kind = kind
@@ -103,7 +103,7 @@ class _Views(dict[str, Any]):
 
 
 class _Many(list[Any]):
-    """Views of the records in an array field; ``array`` is the array that kernels take."""
+    """Views of the records in an array field; ``array`` is passed to kernels."""
 
     def __init__(self, kind: type[Record], array: Any) -> None:
         super().__init__(kind(array[k : k + 1]) for k in range(len(array)))

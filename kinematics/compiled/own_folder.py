@@ -1,8 +1,8 @@
 """Check that only the current user can modify a folder, and write files atomically.
 
-A user who can write to a parent folder can replace the folder, even after the check. All parent
-folders are therefore checked, too. The folder is opened once, and files are read through its
-descriptor. The owner of each file is also checked.
+A user who can write to a parent folder can replace the folder, even after the check. The check
+therefore includes all parent folders. The folder is opened once, and files are read through its
+descriptor. The check also includes the owner of each file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _PLAIN: int = NO_FOLLOW | getattr(os, "O_BINARY", 0)
 
 
 def user_cache() -> Path:
-    """Return this program's cache directory. Raises RuntimeError if there is no home directory."""
+    """Return the program's cache directory. Raises RuntimeError if there is no home directory."""
     base = os.environ.get("XDG_CACHE_HOME")
     return Path(base) / "softfinger" if base else Path.home() / ".cache" / "softfinger"
 
@@ -30,7 +30,7 @@ def fault(path: Path, found: os.stat_result) -> str:
     """Return the reason why other users can modify ``path``, or "" if they cannot modify it.
 
     ``found`` is the stat result for the path. The owner must be this user or root. Folders with the
-    sticky bit, such as /tmp, are allowed, because only an entry's owner can replace the entry.
+    sticky bit, such as /tmp, are allowed, because only the owner of an entry can replace it.
     """
     if not HAS_OWNERS:
         return ""

@@ -1,7 +1,7 @@
 """Replacement for `compiler` that works with any Numba version, using only public interfaces.
 
 Kernels compiled by either module return identical results. With this module, the first start takes
-twice as long. Later starts import Numba's implementations of Python and NumPy functions. Numba
+twice as long. Each later start imports Numba's implementations of Python and NumPy functions. Numba
 stores the kernels in the same folder, but without a digest of the content.
 """
 

@@ -1,9 +1,9 @@
-"""Exact formulas for the contact of a soft hemispherical tip, of constant modulus, with a plane.
+"""Exact formulas for contact between a plane and a soft hemispherical tip of constant modulus.
 
 The module defines the fingertip's geometry and computes force, energy and partial derivatives. The
-tip is a hemisphere of radius a on a rigid base. An independent spring, normal to the base, stands
-on every point of the base. The object's face is displaced by d along the face's normal, which is
-tilted by θ from the base normal. With h = a − d:
+tip is a hemisphere of radius a on a rigid base. The tip consists of independent springs that are
+normal to the base, one at every point. The object's face is displaced by d along the face's normal,
+which is tilted by θ from the base normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
@@ -29,7 +29,7 @@ __all__ = ["ClosedForms", "Fingertip", "closed_forms"]
 
 HALF_PI = math.pi / 2
 RADIUS_MAX = 1.0  # maximum radius [m]; larger values were probably given in millimetres
-POISSON = (0.45, 0.4995)  # range of Poisson's ratio covered by the solid tip data
+POISSON = (0.45, 0.4995)  # range of Poisson's ratio in the data for solid tips
 
 
 Physics = Literal["springs", "solid", "measured"]
@@ -95,9 +95,10 @@ class Fingertip:
         object.__setattr__(self, "radius", radius)
 
     def theta_limit(self, d: ArrayLike) -> FloatArray:
-        """Return the maximum |θ| [rad] at d [m]: asin((a − d)/a), π/2 for d ≤ 0, 0 for d ≥ a.
+        """Return the maximum |θ| [rad] at d [m].
 
-        The result is a scalar or an array, like ``d``.
+        The result is asin((a − d)/a), or π/2 for d ≤ 0 and 0 for d ≥ a. It is a scalar or an array,
+        like ``d``.
         """
         h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
         # At the limit, cos θ is the footprint radius divided by a. Unlike asin(h/a), this form is
@@ -144,8 +145,8 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 
     ``d`` [m] and ``theta`` [rad] are broadcast. The results are zero for d ≤ 0 and NaN for NaN
-    input. The formulas are valid up to the limit on θ. Beyond the limit, the function still
-    evaluates the same formulas.
+    input. The formulas are valid up to the limit on θ, but the function also evaluates them beyond
+    the limit.
     """
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)

@@ -4,11 +4,12 @@ The table of a spring tip stores ratios. Each quantity is divided by its closed 
 at zero strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, the
 ratios are exactly 1 and the table has no coefficients.
 
-The coordinates are the height h = (a − d)/a, and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The
-footprint radius is ρ. In these coordinates, the ratios are analytic up to the edges of the domain.
-The coordinate y is even in θ. The value of y is 1 at θ = 0 and 0 at the limit on θ. The peak strain
-is 1 − u. The domain has 16 slabs per octave of h. Each slab is divided into as many pieces of y as
-the tolerance requires. The domain ends at h = 1/8, because the ratios diverge as log h for h → 0.
+The first coordinate is the height h = (a − d)/a. The second is y = u/h with u = √(1 − ρ²/(a² cos²
+θ)), where ρ is the footprint radius. In these coordinates, the ratios are analytic up to the edges
+of the domain. The coordinate y is even in θ. The value of y is 1 at θ = 0 and 0 at the limit on θ.
+The peak strain is 1 − u. The domain has 16 slabs per octave of h. Each slab is divided into as many
+pieces of y as the tolerance requires. The domain ends at h = 1/8, because the ratios diverge as log
+h for h → 0.
 
 The kernels accept the record of any tip. Solid and measured tips are evaluated by `solid_lookup`.
 """
@@ -39,7 +40,7 @@ from softfinger.kinematics.contact.table_record import (
 
 H_END = 0.5**OCTAVES  # h at the end of the domain
 _H_MIN = H_END * (1.0 + 2.0**-52)  # smallest number above H_END
-_END = H_END * (1.0 - 1e-12)  # limit of h at the end of the domain, with a margin for rounding
+_END = H_END * (1.0 - 1e-12)  # h at which the domain ends, with a margin for rounding
 
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
@@ -49,10 +50,10 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bit pattern of the smallest numb
 
 @inlined_kernel
 def _slab(h: float) -> tuple[int, float]:
-    """Return the slab index of h, and the position of h in the slab, from −1 to 1.
+    """Return the slab index of h, and the position of h within the slab (−1 to 1).
 
-    h must be in (H_END, 1]. The index and the position are computed from the bits of h. The
-    exponent determines the octave. The mantissa determines the slab and the position. Each slab
+    The height h must be in (H_END, 1]. The index and the position are computed from the bits of h.
+    The exponent determines the octave. The mantissa determines the slab and the position. Each slab
     includes its upper end but not its lower end.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
@@ -85,7 +86,7 @@ def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
     gap = c * c - d * table.inverse_radius * (1.0 + h)
     if not (gap >= 0.0 and abs(theta) <= HALF_PI):
         limit = math.atan2(h, math.sqrt(d * table.inverse_radius * (1.0 + h)))
-        # Because of rounding, a point exactly at the limit may reach this branch.
+        # Due to rounding, a point exactly at the limit may reach this branch.
         inside = inside and abs(theta) <= limit * (1.0 + 1e-12)
         angle = min(max(theta, -limit), limit)
         s = math.sin(angle)

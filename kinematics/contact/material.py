@@ -1,7 +1,7 @@
 """Stress-strain laws of tip materials.
 
-A law σ(ε) is a single polynomial for strains ε from 0 to 1. σ(0) is 0, and the slope is positive
-everywhere. The law is smooth and monotonic, so numerical integration converges quickly.
+A law σ(ε) is a single polynomial for strains ε from 0 to 1. The stress σ(0) is 0, and the slope is
+positive everywhere. The law is smooth and monotonic, so numerical integration converges quickly.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["Material"]
 
 
 # Measured tangent modulus [Pa] of the polyurethane tip versus strain, from Table I of the paper.
-# The paper also gives the maximum modulus, 0.304 MPa, at strains above 100 %.
+# The paper also lists the maximum modulus, 0.304 MPa, which occurs at strains above 100 %.
 TABLE_I_STRAIN = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 TABLE_I_MODULUS = (0.135e6, 0.149e6, 0.182e6, 0.201e6, 0.207e6, 0.255e6)
 TABLE_I_MAXIMUM = 0.304e6
@@ -83,9 +83,9 @@ class Material:
     def table_i(cls) -> Material:
         """Return a smooth law for the polyurethane measured in Table I of the paper.
 
-        The paper gives slopes of the stress-strain curve ('Young's modulus, which corresponds to
-        the slope'). The slopes are used as the tangent modulus dσ/dε. The modulus is 0.135 MPa at
-        zero strain, and 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at strains of 20 to 100 %. The
+        The paper lists slopes of the stress-strain curve ('Young's modulus, which corresponds to
+        the slope'). These slopes are used as the tangent modulus dσ/dε. At strains of 0, 20, 40,
+        60, 80 and 100 %, the modulus is 0.135, 0.149, 0.182, 0.201, 0.207 and 0.255 MPa. The
         modulus is interpolated by the lowest-degree polynomial with zero slope at zero strain. The
         zero slope is required because the paper calls the first value the smallest. The
         interpolating polynomial increases on [0, 1]. The largest modulus in the paper, 0.304 MPa,
@@ -126,16 +126,16 @@ class Material:
 
     @property
     def fit_error(self) -> float:
-        """Maximum difference between the law and the fitted points [Pa]; 0 without points."""
+        """Maximum difference between the law and the fitted points [Pa], or 0 without points."""
         return 0.0 if self.misfits is None else float(self.misfits[1].max())
 
     def force_error(self, ratio: ArrayLike) -> FloatArray:
-        """Return the relative force error that the misfit of the law causes for an upright tip.
+        """Return the relative force error of an upright tip due to the misfit of the law.
 
         The force is F = 2π h² ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d. The force error is
         the same integral over the misfits, divided by F. The misfits are interpolated linearly,
         starting from 0 at zero strain. ``ratio`` is d/a in (0, 1]. The result is a number or an
-        array, like ``ratio``.
+        array of the shape of ``ratio``.
         """
         ratios = np.asarray(ratio, np.float64)
         if self.misfits is None:
@@ -164,19 +164,20 @@ class Material:
         return len(self.coefficients)
 
     def stress(self, strain: ArrayLike) -> FloatArray:
-        """Return the stress σ(ε) [Pa]: 0 for ε ≤ 0, linear for ε > 1, NaN for NaN."""
+        """Return the stress σ(ε) [Pa]; 0 for ε ≤ 0, linear for ε > 1, NaN for NaN input."""
         return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:
-        """Return the energy density w(ε) = ∫₀^ε σ [J/m³]; 0 for ε ≤ 0, NaN for NaN."""
+        """Return the energy density w(ε) = ∫₀^ε σ [J/m³]; 0 for ε ≤ 0, NaN for NaN input."""
         return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:
-        """Return expansions of the law, divided by E₀, for `quadrature`: float64 [7, order].
+        """Return expansions of the law divided by E₀, float64 [7, order], which `quadrature` uses.
 
-        Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. With X_1
-        = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε, the rows are S_1, W_1, T_1, S_2, S_2′, T_2 and
-        T_2′. All expansions are polynomials, so there is no cancellation at small strain.
+        Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. For each
+        function X, let X_1 = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε. The rows are S_1, W_1, T_1,
+        S_2, S_2′, T_2 and T_2′. All expansions are polynomials, so there is no cancellation at
+        small strain.
         """
         unit = [value / self.coefficients[0] for value in self.coefficients]
         secant = unit[1:] or [Fraction(0)]
@@ -192,9 +193,10 @@ class Material:
 
 
 def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
-    """Evaluate ``law`` at ``strain``: 0 below 0, and a Taylor series up to ``order`` above 1.
+    """Evaluate ``law`` at ``strain``, with a Taylor series up to ``order`` above strain 1.
 
-    The result has the shape of ``strain``; for a number it is a NumPy scalar.
+    The result is 0 for negative strains. It has the shape of ``strain``, or is a NumPy scalar if
+    ``strain`` is a number.
     """
     x = np.asarray(strain, dtype=np.float64)
     u = np.clip(x, 0.0, 1.0)

@@ -19,7 +19,7 @@ __all__ = ["MaterialError"]
 
 
 MIN_POINTS = 4
-_DEGREES = range(11)  # polynomial degrees of the modulus, in the order in which they are tried
+_DEGREES = range(11)  # polynomial degrees of the modulus, in the order of trial
 _NEGLIGIBLE_MISFIT = 1e-9  # negligible misfit, relative to the maximum stress
 # A lower degree is accepted if its misfit is at most this multiple of the smallest misfit.
 _MISFIT_RATIO_MAX = 1.5
@@ -34,7 +34,7 @@ class MaterialError(SoftfingerError, ValueError):
 
 
 def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the points up to strain 1, without the origin. Raises MaterialError if invalid."""
+    """Return the points up to strain 1, excluding the origin. Raises MaterialError if invalid."""
     x = np.asarray(strain, dtype=np.float64)
     y = np.asarray(stress, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape:
@@ -107,10 +107,10 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
 
 
 def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Extend the points to strain 1 using their slope at the end."""
+    """Extend the points to strain 1 using the slope at the last points."""
     if x[-1] > 0.95:
         return x, y
-    # Fit a parabola to the last third of the points. Limit its final slope to between 0.5 and 2
+    # Fit a parabola to the last third of the points. Clamp the parabola's final slope to 0.5 to 2
     # times the mean slope of the last quarter.
     last = max(3, x.size // 3)
     back = x[-last:] - x[-1]

@@ -6,15 +6,15 @@ plane, and the object's face cuts the spherical cap, so
     F = ∬ σ(ε) dx dy,   U = ∬ z w(ε) dx dy,   ε = (n·P − h)/(z cos θ),   P = (x, y, z) on the cap.
 
 The coordinates are t = n·P and the angle φ about the normal n. With lengths divided by a, dx dy = z
-dt dφ. The integrals give the ratio of each quantity to its closed form for a constant modulus E₀.
+dt dφ. The integrals yield the ratio of each quantity to its closed form for a constant modulus E₀.
 The ratio is 1 plus a term for the nonlinearity of the material. This form avoids cancellation as d
 → 0.
 
 The integral over φ is exact. The substitution ε dφ = (t − h)/(p cos θ) dχ with p = √(t² − sin² θ)
-makes ε linear in cos χ. A polynomial law therefore needs few nodes. The integral over t is
-evaluated in y = √(t − sin θ). As a function of y, the integrand is analytic except for poles at and
-near y = 0. The range is divided into pieces of at most one octave. The number of pieces grows
-logarithmically as the face approaches the rim.
+makes ε linear in cos χ. For a polynomial law, a few nodes are therefore sufficient. The integral
+over t is evaluated in y = √(t − sin θ). As a function of y, the integrand is analytic except for
+poles at and near y = 0. The range is divided into pieces of at most one octave. The number of
+pieces grows logarithmically as the face approaches the rim.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ def _ratios(
     The integrals run over v from 0 to 1. The variables t and y are related by t = sin θ + y².
 
     ``gauss`` [2, n] contains points and weights on [0, 1]. ``circle`` [2, m] contains cos χ and
-    sin² χ at equidistant angles. ``polynomials`` contains the expansions of the law. delta = d/a is
-    in (0, 1]. To keep full precision, h = 1 − delta is a separate argument. s = |sin θ| ≤ h, and c
-    = cos θ.
+    sin² χ at equidistant angles. ``polynomials`` contains the expansions of the law. The ratio
+    delta = d/a is in (0, 1]. To keep full precision, h = 1 − delta is a separate argument. The last
+    two arguments are s = |sin θ| ≤ h and c = cos θ.
     """
     # For h near 1, compute h − s from h² − s² = c² − ρ² to avoid cancellation.
     gap = h - s if h < 0.5 else (c * c - delta * (1.0 + h)) / (h + s)
@@ -95,7 +95,7 @@ def _ratios(
     if gap > 0.0:
         y0 = math.sqrt(gap)
     else:
-        # To within rounding, θ is at its limit.
+        # Except for rounding, θ is at its limit.
         s = h
         c = math.sqrt(delta * (1.0 + h))
     y1 = math.sqrt(c * c / (1.0 + s))
@@ -105,8 +105,8 @@ def _ratios(
     count = circle.shape[1]
     share = 1.0 / count
     nodes = gauss.shape[1]
-    # The integrand has poles at y² = −2 sin θ and, if y0 is not 0, at y = 0. For h = 0, the
-    # integrand has no poles.
+    # The integrand has poles at y² = −2 sin θ and, if y0 is not 0, at y = 0. If h is 0, there are
+    # no poles.
     start = max(2.0 * y0, _PIECE_MIN * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0

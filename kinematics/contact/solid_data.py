@@ -13,9 +13,10 @@ energy is U = E a³ t⁵ g(t, sin² θ). The partials of U are the force along t
     p(r, φ) = F/a² B_0(r) + N/a² Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r).
 
 Without friction, F = N cos θ. A sticking face holds each point of the tip at the position where the
-point first touched it. The plane moves straight along its normal. N = ∂U/∂d still holds. ∂U/∂θ is
-the derivative of the energy of straight presses with respect to tilt. A shear force T = −N sin θ
-cos θ q_0 pulls the tip up the slope, so that F = N cos θ (1 − sin² θ q_0).
+point first touched it. The plane moves straight along its normal. The relation N = ∂U/∂d still
+holds. To obtain ∂U/∂θ, the energy of straight presses is differentiated with respect to tilt. A
+shear force T = −N sin θ cos θ q_0 pulls the tip up the slope. The base force is then F = N cos θ (1
+− sin² θ q_0).
 
 A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T) to the base pressure. The
 shear force T is assumed to act at a height of one radius a above the base. Its moment about the
@@ -56,8 +57,8 @@ class SolidData:
     edges: FloatArray  # ring edges, r/a [rings + 1]
     modes: FloatArray  # B averaged over each ring [k, rings]
     shear: FloatArray  # B_T [rings]
-    error: float  # relative deviation of N from the results of other meshes
-    pressure_error: float  # rms deviation of the base pressure from the results of other meshes
+    error: float  # relative difference in N between this and other meshes
+    pressure_error: float  # rms difference in base pressure between this and other meshes
 
 
 @lru_cache(maxsize=8)

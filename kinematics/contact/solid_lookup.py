@@ -1,9 +1,8 @@
 """Contact tables for solid and measured tips, and the lookup kernels for these tables.
 
 All six outputs are derived from the energy U = E a³ t⁵ g (see `solid_data`). The function g(t, sin²
-θ) is a polynomial in t = √(d/a) and sin² θ. The outputs are therefore consistent with each other to
-within rounding. For a sticking face, a second polynomial q_0 describes the reduction of the base
-force.
+θ) is a polynomial in t = √(d/a) and sin² θ. All outputs are therefore consistent to within
+rounding. For a sticking face, a second polynomial q_0 describes the reduction of the base force.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from softfinger.kinematics.contact.table_record import (
 )
 from softfinger.kinematics.contact.tip_curves import TipCurves
 
-ENERGY, STICK = range(2)  # pieces of the table: g with its partials, and q_0 with its partials
+ENERGY, STICK = range(2)  # pieces of the table: g and its partials, q_0 and its partials
 
 
 def solid_table(tip: Fingertip, material: Material) -> Table:
@@ -49,7 +48,7 @@ def solid_table(tip: Fingertip, material: Material) -> Table:
 
 
 def _measured_table(law: TipCurves) -> Table:
-    """Return the table of measured curves, for a modulus of 1 Pa."""
+    """Return the table that represents measured curves, for a modulus of 1 Pa."""
     energy = with_partials(law.energy(), law.root, law.square)
     table = _table(law.radius, law.root, law.square, energy)
     table.modulus = 1.0
@@ -72,7 +71,7 @@ def _table(radius: float, root: float, square: float, energy: FloatArray) -> Tab
 def normal_force(table: Table, t: float, square: float) -> Lanes:
     """Return the normal force N, the energy U and their partials.
 
-    The values are N/a² [Pa], ∂/∂d and ∂/∂sin² θ of N/a², U/a³ [Pa], and ∂/∂sin² θ of U/a³.
+    The values are N/a² [Pa] with its ∂/∂d and ∂/∂sin² θ, and U/a³ [Pa] with its ∂/∂sin² θ.
     """
     place = t * table.by_root - 1.0, square * table.by_square - 1.0
     g, g_t, g_tt, g_s, g_ts = lanes(table, ENERGY, *place)
@@ -84,7 +83,7 @@ def normal_force(table: Table, t: float, square: float) -> Lanes:
 
 @inlined_kernel
 def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
-    """Return F/(N cos θ) = 1 − sin² θ q_0 and its partials in t and sin² θ."""
+    """Return F/(N cos θ) = 1 − sin² θ q_0 and its partials with respect to t and sin² θ."""
     if not table.sticks:
         return 1.0, 0.0, 0.0
     x = t * table.by_root - 1.0

@@ -79,12 +79,12 @@ class Certificate(NamedTuple):
     theta: float
 
 
-# tuple.__new__ creates a ContactForces of plain floats four times as fast as the constructor.
+# For plain floats, tuple.__new__ creates a ContactForces four times as fast as the constructor.
 _numbers: Any = tuple.__new__
 
-_EDGE_FACTOR = 1.0 - 1e-12  # factor that keeps edge points inside the domain despite rounding
+_EDGE_FACTOR = 1.0 - 1e-12  # moves points at the edge into the domain despite rounding
 
-_LAW_ERROR = 0.05  # `build` warns if the law's misfit causes a larger relative force error.
+_LAW_ERROR = 0.05  # relative force error due to the law above which `build` warns
 
 
 class ContactTable:
@@ -215,7 +215,7 @@ class ContactTable:
         return numbers
 
     def _warn(self, d: FloatArray, theta: FloatArray) -> None:
-        """Issue a RuntimeWarning about points outside the domain. NaN causes no warning."""
+        """Issue a RuntimeWarning if points are outside the domain. NaN does not cause a warning."""
         within = np.empty(d.size, dtype=np.bool_)
         lookups(self.data, d * _EDGE_FACTOR, theta * _EDGE_FACTOR, np.empty((6, d.size)), within)
         outside = np.flatnonzero(~(within | np.isnan(d) | np.isnan(theta)))

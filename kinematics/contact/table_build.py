@@ -3,7 +3,7 @@
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
 higher coefficients, and rounding. The bound assumes that the reference integrals have only rounding
-errors, and that the higher coefficients continue to decrease. The assumptions hold for all
+errors, and that the higher coefficients continue to decrease. Both assumptions hold for all
 supported laws, because each law is a single polynomial. Pieces are halved until the bound is within
 the tolerance.
 """
@@ -39,9 +39,9 @@ from softfinger.kinematics.contact.table_record import (
 
 # Rounding error of the closed forms and of the final products in the kernel.
 _ROUNDING = 16.0 * np.finfo(float).eps
-# Bound on the relative rounding error of a piece. An error analysis of seven laws of degree 7 to 11
-# yields at most 3.5e-13 for any piece. The largest part arises in y², because the terms of cos² θ −
-# ρ² cancel near the limit on θ.
+# Bound on the relative rounding error of a piece. For seven laws with degrees from 7 to 11, an
+# error analysis found at most 3.5e-13 in any piece. The largest part is due to y², because the
+# terms of cos² θ − ρ² cancel near the limit on θ.
 _PIECE_ROUNDING = 1e-12
 # Number of additional Chebyshev coefficients in h and y that are computed but not stored.
 _EXTRA_V, _EXTRA_U = 4, 6
@@ -130,8 +130,8 @@ def _bound(values: FloatArray, lost: FloatArray, h: FloatArray, y: FloatArray) -
     ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` contains the Chebyshev
     coefficients of the difference between ratios and table. The difference is at most the sum of
     the magnitudes of the coefficients. Higher coefficients are not computed. Each coefficient is
-    less than half of its predecessor, because the ratios are analytic well beyond the piece. In
-    each direction, the higher coefficients therefore contribute less than twice the last two
+    less than half the previous coefficient, because the ratios are analytic well beyond the piece.
+    In each direction, the higher coefficients therefore contribute less than twice the last two
     coefficients.
     """
     everywhere = _dense_nodes(len(h)) @ _terms(values) @ _dense_nodes(len(y)).T

@@ -8,7 +8,7 @@ With t = √(d/a) and q = sin² θ, each curve is a polynomial Σ c_ij t^i q^j:
     extent   mean squared radius of the frame [m²]
 
 The lowest power of t in ``push`` is 3. The energy U = ∫ N dd therefore has the same polynomial form
-as for a solid tip.
+as that of a solid tip.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class TipCurves:
     """Measured curves of one tip on its sensor; the module docstring defines the curves.
 
     The curves are valid up to ``deepest`` [m] and ``tilt`` [rad]. ``centre`` [m] and ``rotation``
-    [rad] locate the tip on the sensor, as in `SensorGrid`. ``presses`` is the number of presses
-    used. Four sums over the cell forces describe a frame: the force [N], the first moments in x and
-    y [N·m] and the second moment [N·m²]. A cell force is pressure times area. ``rest`` contains the
-    sums of an unloaded tip, and ``noise`` [4][4] is the covariance of one frame's sums.
+    [rad] locate the tip on the sensor, as in `SensorGrid`. ``presses`` is the number of presses in
+    the fit. Four sums over the cell forces describe a frame: the force [N], the first moments in x
+    and y [N·m] and the second moment [N·m²]. A cell force is pressure times area. ``rest`` contains
+    the sums for an unloaded tip, and ``noise`` [4][4] is the covariance of one frame's sums.
     ``force_error`` is the relative residual of ``push`` and ``shown``. ``lever_error`` [m] is the
     residual of the frame centroid. Raises ValueError if the curves are invalid.
     """
@@ -76,16 +76,16 @@ class TipCurves:
 
     @property
     def root(self) -> float:
-        """Maximum t of the curves."""
+        """Maximum t for which the curves are valid."""
         return math.sqrt(self.deepest / self.radius)
 
     @property
     def square(self) -> float:
-        """Maximum q of the curves."""
+        """Maximum q for which the curves are valid."""
         return math.sin(self.tilt) ** 2
 
     def at(self, curve: Curve, d: ArrayLike, theta: ArrayLike) -> FloatArray:
-        """Evaluate one of the curves at d [m] and θ [rad], which are broadcast."""
+        """Evaluate one of the curves; d [m] and θ [rad] are broadcast."""
         t, q = np.sqrt(np.asarray(d) / self.radius), np.sin(theta) ** 2
         return np.asarray(_value(*np.broadcast_arrays(t, q), np.array(curve)))
 

@@ -1,7 +1,7 @@
 """Fast contact detection and outlier rejection in a frame.
 
-The kernels use only the readings and the noise level, without a fit. If a single cell reads far
-more than its neighbours, it is masked as an outlier.
+The kernels use only the readings and the noise level. They do not require a fit. If a single cell
+reads far more than its neighbours, it is masked as an outlier.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from softfinger.kinematics.estimation.state import (
 )
 from softfinger.kinematics.sensing.footprint import Grid, line_span, set_around, set_face, steps
 
-# Thresholds of the activity test, in noise standard deviations. The second threshold is raised for
-# common errors and correlated noise.
+# Thresholds of the activity test, in noise standard deviations. Common errors and correlated noise
+# raise the second threshold.
 PEAK_LEVEL, PATCH_LEVEL = 3.0, 4.9
 OUTLIERS_MAX = 6  # maximum number of outliers excluded from a frame
-# Factor on the detection threshold during a contact. A factor below 1 prevents toggling.
+# Factor on the detection threshold during a contact. A factor below 1 adds hysteresis.
 _HYSTERESIS = 0.5
-_NOISE_RATIO = 1.75  # minimum ratio of measured to configured noise in a noisy frame
+_NOISE_RATIO = 1.75  # minimum ratio of measured noise to configured noise in a noisy frame
 _SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviations
 
 
@@ -35,7 +35,7 @@ _SUSPECT_PEAK = 4.0  # minimum peak of a noisy frame, in noise standard deviatio
 def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
     """Return the sum, the sum of squares and the maximum of the readings.
 
-    The maximum is at least 0. A reading that is not finite makes the sum non-finite.
+    The maximum is at least 0. If a reading is not finite, the sum is not finite.
     """
     total = 0.0
     energy = 0.0
@@ -53,7 +53,7 @@ def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
 
 @inner_kernel
 def next_above(frame: FloatArray, height: FloatArray, start: int, last: int, level: float) -> int:
-    """Return the first cell from ``start`` on that reads at least ``level``, or ``last``."""
+    """Return the first cell from ``start`` onwards that reads at least ``level``, else ``last``."""
     while start < last and not (frame[start] >= level and height[start] >= 0.0):
         start += 1
     return start
@@ -86,14 +86,15 @@ def neighbourhood(frame: FloatArray, height: FloatArray, grid: Grid, at: int) ->
 def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> None:
     """Test the frame for contact and store the result in ``state.signal``.
 
-    A contact is detected at a cell that meets two conditions. The cell must read at least
-    `PEAK_LEVEL` · noise. The weighted sum of the cell's neighbours must exceed ``patch_level``
-    standard deviations. A single outlier is therefore not detected as a contact.
+    To detect a contact, at least one cell must meet two conditions. The cell reads at least
+    `PEAK_LEVEL` · noise. The weighted sum of the cell's neighbours exceeds ``patch_level`` standard
+    deviations. A single outlier is therefore not detected as a contact.
 
     White noise in a cell is independent of the noise in its neighbours. For 788 cells and
     thresholds of 3 and 4.9, the false alarm rate is 788 · 1.35e-3 · 4.8e-7 = 5.1e-7 per frame. In a
-    simulation, 99.98 % of contacts with d = 0.2 mm were detected. The noise was 0.2 % of the
-    modulus. The 150 000 frames covered all azimuths, tilts up to 30° and positions between cells.
+    simulation, 99.98 % of the contacts with d = 0.2 mm were detected. The simulated noise was 0.2 %
+    of the modulus. The 150 000 frames included all azimuths, tilts up to 30° and positions between
+    cells.
     """
     signal = state.signal
     grid = state.grid
@@ -124,7 +125,7 @@ def is_noisy(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bo
     """Return True if the readings of a frame without contact scatter more than the noise explains.
 
     Only readings above a central value are used, because readings may be clipped at 0. The central
-    value is the mean, or 0 if more than a quarter of the cells read 0. With half of 788 readings
+    value is the mean, or 0 if more than a quarter of the cells read 0. If half of 788 readings are
     above the central value, the noise estimate has a standard deviation of 4 %.
     """
     signal = state.signal
@@ -149,9 +150,9 @@ def shows_pattern(state: EstimatorState, frame: FloatArray, cells: Cells) -> boo
 
     A solid tip spreads much of its pressure over the base. The sum over all cells therefore detects
     a weaker contact than the neighbourhood of one cell does. The pattern has unit norm and zero
-    mean. Because of the zero mean, a common zero offset or noise clipped at 0 is not detected as a
-    contact. The threshold is ``patch_level`` times the noise's standard deviation. If the last
-    frame contained a contact, the threshold is halved.
+    mean. Because of the zero mean, neither a common zero offset nor noise clipped at 0 is detected
+    as a contact. The threshold is ``patch_level`` times the standard deviation of the noise. If the
+    last frame contained a contact, the threshold is halved.
     """
     projection = 0.0
     for k in range(frame.shape[0]):
@@ -197,10 +198,11 @@ def presses_outside(
 
 @inner_kernel
 def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
-    """Return True if the largest reading exceeds its neighbours by too much to be a contact.
+    """Return True if the largest reading exceeds its neighbours by more than a contact can cause.
 
-    A contact about as wide as a cell causes readings of at most ``signal.narrow_contact_max``. In a
-    wider contact, each cell reads less than twice the mean of its neighbours.
+    A contact that is about as wide as a cell causes readings of at most
+    ``signal.narrow_contact_max``. In a wider contact, each cell reads less than twice the mean of
+    its neighbours.
     """
     rows = state.grid.rows
     cols = state.grid.cols

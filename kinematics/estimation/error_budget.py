@@ -1,6 +1,6 @@
 """Propagate errors other than white cell noise into the covariance of an estimate.
 
-White noise of variance σ² gives the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit.
+White noise of variance σ² results in the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit.
 Errors other than white noise are propagated linearly:
 
     shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                        (`set_shared_errors`)
@@ -12,17 +12,17 @@ Errors other than white noise are propagated linearly:
                        C = (JᵀJ)⁻¹ JᵀRJ (JᵀJ)⁻¹, at zero tilt         (`widen_covariance`)
     smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement                 (`undetected_misfit`)
 
-Each pattern q describes an error that is the same in every frame. The errors of the zero offset are
-a shift of all cells and slopes in x and y. The other errors are the tip position in x and y, the
+Each pattern q describes an error that is the same in every frame. The zero offset has three errors:
+a shift of all cells and slopes in x and y. The other errors affect the tip position in x and y, the
 pitch, and the modulus or gain. ``size`` is the standard deviation of an error. The patterns for tip
 position and pitch are computed from pressure differences between neighbouring cells.
 
 R is the noise correlation that `calibrate` measures as a function of the distance between cells.
-The factors by which R widens the covariance are tabulated over d. W² contains the fractions of a
-smooth error's energy that appear in d, in the gain and in the tilts. The fractions are small,
-because the errors of real cells are nearly as symmetric as the pressure distribution. The r_k are
-the residuals. For independent noise, the products of neighbouring residuals average to zero. A
-misfit that is smooth over the footprint contributes fully to the sum of the products.
+The factors by which R widens the covariance are tabulated as a function of d. W² contains the
+fractions of a smooth error's energy that appear in d, in the gain and in the tilts. The fractions
+are small, because the errors of real cells are nearly as symmetric as the pressure distribution.
+The r_k are the residuals. For independent noise, the products of neighbouring residuals average to
+zero. A misfit that is smooth over the footprint contributes fully to the sum of the products.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ __all__ = ["Uncertainty"]
 
 _NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 _NEIGHBOURS[2, 2] = 0.0
-_NOISE_PEAK = 4.5  # maximum reading that noise alone causes, in standard deviations
+_NOISE_PEAK = 4.5  # maximum reading due to noise alone, in standard deviations
 _CELL_COUNT_MIN = 48.0  # minimum number of cells for separating smooth and rough misfits
 # Fractions of a smooth error's energy that change d (and the gain), each tilt, and the residuals.
 # Curve errors, hysteresis and crosstalk are nearly as symmetric as the pressure distribution.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_IN_RESIDUALS = 0.15, 0.06, 0.2
 # Relative tilt error of the solid model, divided by d/a. The model was compared with frames from
-# independent finite-element models, for tilts up to 20° and displacements up to 7 mm. The error was
-# 4 % for a bonded tip, and negligible for a tip that lies on its sensor.
+# independent finite-element models, for tilts up to 20° and displacements up to 7 mm. The relative
+# tilt error was 4 % for a bonded tip, and negligible for a tip that lies on its sensor.
 _SOLID_TILT_ERROR = 0.1
 # Threshold for the sum of products of neighbouring residuals, in noise standard deviations.
 _PRODUCT_SIGMA = 6.0
@@ -128,8 +128,8 @@ def set_budget(
 ) -> None:
     """Set the error budget, and raise the threshold of the activity test above the common errors.
 
-    The material's ``fit_error`` [Pa] is the largest difference between the material law and the
-    fitted points. The error budget treats ``fit_error`` as a zero shift of the pressed cells.
+    The material's ``fit_error`` [Pa] is the maximum difference between the material law and the
+    fitted points. The error budget treats ``fit_error`` as a zero shift of the cells in contact.
     ``pattern`` [rows, cols] is used to detect contacts of a solid tip.
     """
     budget, options = state.budget, state.options
@@ -180,7 +180,8 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
     kernel = np.zeros(shape)
     kernel[: rho.shape[0], : rho.shape[1]] = rho
     kernel = np.roll(kernel, (-(rho.shape[0] // 2), -(rho.shape[1] // 2)), (0, 1))
-    # The spectrum of a measured correlation may be negative at some frequencies; clip it at zero.
+    # The spectrum of a measured correlation may be negative at some frequencies, so clip it at
+    # zero.
     power = np.maximum(np.fft.fft2(kernel).real, 0.0)
     waves = np.fft.fft2(fields, shape, axes=(0, 1))
     return np.asarray(np.einsum("xyi,xy,xyj->ij", waves.conj(), power, waves).real / power.size)
@@ -249,7 +250,7 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
 
     The result is 0 if noise explains the misfit. ``beyond`` [Pa²] is the excess of the total misfit
     over its expected value. If the footprint has too few cells to separate the smooth part, the
-    whole excess is returned.
+    result is the whole excess.
     """
     fit = state.fit
     variance = state.signal.variance

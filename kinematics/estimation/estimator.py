@@ -90,8 +90,8 @@ class ContactEstimate:
     example, causes a smooth residual.
 
     An estimate without a contact is valid. Its d and tilts are 0, and its ``d_std`` is the smallest
-    detectable d. A displacement of the tip on the sensor cannot be detected from a single frame.
-    With a fixed gain, a wrong modulus cannot be detected from a single frame.
+    detectable d. A single frame does not reveal a displacement of the tip on the sensor. If the
+    gain is fixed, a single frame does not reveal a wrong modulus either.
     """
 
     contact: bool = False
@@ -192,9 +192,9 @@ _RESULTS = (
     "rejected_count", "contact", "has_second_contact", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
-_TOLERANCE = 16.0  # The iteration stops below this squared ratio of the step to the noise floor.
+_TOLERANCE = 16.0  # squared ratio of step to noise floor at which the iteration stops
 # Minimum number of model points per tip radius, for linear and for nonlinear material laws. For
-# tilts up to 25° and a noise of 0.2 % of the modulus, the bias is at most a quarter of the noise
+# tilts up to 25° and noise of 0.2 % of the modulus, the bias is at most a quarter of the noise
 # floor. Within 4° of the domain limit, the bias is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum values of d/a and sin θ in a spring fit
@@ -209,10 +209,10 @@ def cell_centres(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return height, x and y of the cells as flat arrays.
 
-    The height is √(a² − x² − y²) at the cell centre. If this centre lies outside the rim, the point
-    of the cell that is nearest to the tip centre is used instead. The height of unused cells is −∞.
-    Unused cells are outside the mask ``active`` [rows, cols] or farther than ``radius`` [m] from
-    the tip centre.
+    The height is √(a² − x² − y²) at the cell centre. If the cell centre lies outside the rim, the
+    cell's point closest to the tip centre is used instead. The height of unused cells is −∞. Unused
+    cells are outside the mask ``active`` [rows, cols] or farther than ``radius`` [m] from the tip
+    centre.
     """
     a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
     x, y = np.meshgrid(*axes(grid))
@@ -229,10 +229,10 @@ def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> ND
     """Return a mask [rows, cols] of the cells inside a solid tip's rim.
 
     At the rim of a bonded base, the stress is singular, and its computed value depends on the mesh.
-    Compared with independent finite-element models, the model has an rms error of 3 % with the rim
-    cells and 0.6 % without them. If a base that lies on the sensor is tilted, the model predicts
-    tension at the rim. Real rubber lifts off there. The mask also allows for the uncertainty of the
-    tip position.
+    Compared with independent finite-element models, the rms error is 3 %. Without the rim cells,
+    the rms error is 0.6 %. If a base that lies on the sensor is tilted, the model predicts tension
+    at the rim. Real rubber lifts off there. The mask also allows for the uncertainty of the tip
+    position.
     """
     margin = max(_RIM_WIDTH[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
     x, y = (
@@ -254,20 +254,20 @@ class ContactEstimator:
     free_gain
         If True, also estimate the gain, the ratio of measured to modelled pressure. If False, the
         gain is 1. The default is True for springs and False for solid tips. The shape of a solid
-        tip's frame hardly depends on d, so d can only be determined from the force.
+        tip's frame hardly depends on d, so only the force can determine d.
     active
         Mask of working cells, bool [rows, cols]; None uses all cells.
     readings
         Range and resolution of the readings.
     known
-        Other uncertainties of the sensor. The uncertainties and the material's ``fit_error`` widen
-        the covariance and make the contact detection less sensitive.
+        Other uncertainties of the sensor. These uncertainties and the material's ``fit_error``
+        widen the covariance and make the contact detection less sensitive.
 
     Attributes
     ----------
     saturation
-        Reading at which a cell saturates, as in `Readings`. Update this value when the zero offset
-        subtracted from the readings changes.
+        Reading at which a cell saturates, as in `Readings`. Update this value whenever the zero
+        offset that is subtracted from the readings changes.
 
     Raises
     ------
@@ -316,7 +316,8 @@ class ContactEstimator:
         state = self.state = EstimatorState()
         options = self._options = state.options
         self.noise = noise
-        # Counts are rounded, so the floor is half a count below the smallest count sent.
+        # Counts are rounded, so the floor is half a count below the smallest count that the board
+        # sends.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.patch_level = _TOLERANCE, PATCH_LEVEL
@@ -414,8 +415,7 @@ class ContactEstimator:
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
         """Estimate the contact from this frame alone, and return a new result.
 
-        Earlier frames do not affect the result. See :meth:`update` for the arguments and
-        exceptions.
+        See :meth:`update` for the arguments and exceptions.
         """
         estimate = self.state.estimate
         before, seq, last = self._estimate.copy(), self._seq, self._last
@@ -491,7 +491,7 @@ class ContactEstimator:
 
 
 def _with_data_errors(known: Uncertainty, tip: Fingertip, free_gain: bool) -> Uncertainty:
-    """Add the data errors of a solid tip, found by independent finite-element analysis.
+    """Add the data errors of a solid tip, determined by independent finite-element analyses.
 
     The pressure error is included only if the gain is free. The pressure error is as symmetric as
     the pressure itself. With a fixed gain, a symmetric error hardly affects d.

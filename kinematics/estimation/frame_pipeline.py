@@ -1,7 +1,7 @@
 """Process one pressure frame in the estimator's only compiled entry point.
 
-The steps are the activity test, the outlier rejection, and a maximum-likelihood fit. The fit starts
-from the last estimate, or from an initial estimate based on the frame alone.
+The steps are an activity test, outlier rejection and a maximum-likelihood fit. The fit starts from
+the last estimate, or from an initial estimate based on the frame alone.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from softfinger.kinematics.estimation.state import (
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-# Signal level in noise standard deviations. If a solid tip's signal exceeds the level but lacks the
-# contact pattern, the frame is faulty.
+# Signal level in noise standard deviations. A solid tip's frame is faulty if its signal exceeds
+# this level but lacks the contact pattern.
 _STRONG_SIGNAL = 6.0
 # Increase in the detection threshold if noise is clipped at 0. Clipping raises the sums over
-# neighbourhoods, and the increase restores the false alarm rate.
+# neighbourhoods. The higher threshold restores the false alarm rate.
 CLIPPED_LEVEL_INCREASE = 0.5
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # valid range of the gain for a contact of the configured tip
 D_MAX = 0.75  # maximum valid d, relative to the radius
 R_SQUARED_MIN = 0.8  # a valid estimate explains at least this fraction of the squared pressure
-# Maximum relative error of d that a smooth misfit may cause. The limit allows for the curved face
-# of a disc, because the covariance includes the resulting error. If the gain is far from 1, a
-# smooth misfit indicates a different tip. The covariance does not cover a different tip, so a
-# smaller limit applies.
+# Maximum relative error of d that a smooth misfit may cause. The limit permits the curved face of a
+# disc, because the covariance includes the resulting error. If the gain is far from 1, a smooth
+# misfit indicates a different tip. The covariance does not cover a different tip, so a smaller
+# limit applies.
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
-# The sensor needs a tare if more than ABOVE_FRACTION of the cells under the tip read high. A high
-# reading exceeds both ABOVE_NOISE · noise and ABOVE_PEAK · peak. A solid tip loads all cells, but
-# 5 % of the cells read less than 0.32 of the peak.
+# The sensor needs a tare if more than ABOVE_FRACTION of the cells under the tip read high. A
+# reading is high if it exceeds both ABOVE_NOISE · noise and ABOVE_PEAK · peak. A solid tip loads
+# all cells, but 5 % of the cells read less than 0.32 of the peak.
 ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among the cells above half the peak
 ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for linear error propagation
@@ -172,7 +172,7 @@ def _set_results(state: EstimatorState) -> None:
 def _fault_in_readings(
     state: EstimatorState, frame: FloatArray, height: FloatArray, reason: Invalid
 ) -> Invalid:
-    """Return the fault in the readings that made the estimate fail, or else ``reason``."""
+    """Return the fault in the readings that caused the failure; by default, return ``reason``."""
     signal = state.signal
     level = max(ABOVE_NOISE * signal.noise, ABOVE_PEAK * signal.peak)
     above = pressed = full = 0
@@ -188,7 +188,7 @@ def _fault_in_readings(
 
 @inner_kernel
 def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Estimate the contact in a frame; return why the estimate is invalid, or ``NONE``."""
+    """Estimate the contact in a frame; return the reason for an invalid estimate, or ``NONE``."""
     fit = state.fit
     reason = _fit_frame(state, model, frame, cells)
     _set_results(state)
@@ -216,8 +216,8 @@ def _reset_results(state: EstimatorState, scale: float, step: float, saturation:
     signal.saturation = saturation * scale
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
-    # A contact no wider than a cell causes a strain of at most about pitch²/2a². The maximum
-    # reading allows for a gain of up to 3.
+    # A contact that is no wider than a cell causes a strain of at most about pitch²/(2a²). The
+    # maximum reading allows for a gain of up to 3.
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate
@@ -255,8 +255,8 @@ def estimate_frame(
     rejected = without_outliers(state, frame, cells.height)
     strong = False
     if state.options.is_solid and signal.is_finite:
-        # Every contact of a solid tip matches the pattern. A strong signal without the pattern is
-        # therefore not a contact. A small common zero offset does not count as a signal.
+        # Every contact of a solid tip matches the contact pattern. A strong signal without the
+        # pattern is therefore not a contact. A small common zero offset does not count as a signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > _STRONG_SIGNAL * signal.noise
         signal.contact = shows_pattern(state, frame, cells)
@@ -276,7 +276,7 @@ def estimate_frame(
     if not signal.is_finite:
         reason = Invalid.NOT_FINITE
     elif not signal.mean > -3.0 * signal.noise:
-        # A baseline far below zero means that the sensor needs a tare.
+        # If the baseline is far below zero, the sensor needs a tare.
         reason = Invalid.BELOW_ZERO
     elif rejected == OUTLIERS_MAX:
         reason = Invalid.OUTLIERS

@@ -35,7 +35,7 @@ from softfinger.kinematics.sensing.solid_pressure import own_shear, press_solid
 from softfinger.kinematics.sensing.springs_pressure import press_springs
 
 # If the gain is free, the covariance is multiplied by 1 + _GAIN_CURVATURE (σ_d/d)². The factor was
-# fitted to simulated frames over the operating range. The fit compared squared errors with the
+# fitted to simulated frames over the operating range. The fit compared the squared errors with the
 # linear prediction.
 _GAIN_CURVATURE = 6.0
 _ITERATIONS = 20
@@ -47,12 +47,12 @@ _LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of
 # by the product of the diagonal elements. The rounding error of a pivot is 1e-12.
 _PIVOT_MIN = 1e-11
 
-# A cell cannot read below its floor, which is 0 or the smallest count sent. Clipping at the floor
-# raises the mean reading above the true pressure. At z standard deviations above the floor, the
-# excess is E[max(z + e, 0)] − z = E[max(e − z, 0)] standard deviations with e ~ N(0, 1). The
-# product of (1 − z/CLIP_END)² and the polynomial with coefficients CLIP approximates the excess to
-# within 3e-4. Cells more than CLIP_BELOW standard deviations below the floor provide almost no
-# information.
+# A cell cannot read below its floor, which is 0 or the smallest count that the board sends.
+# Clipping at the floor raises the mean reading above the true pressure. At z standard deviations
+# above the floor, the excess is E[max(z + e, 0)] − z = E[max(e − z, 0)] standard deviations with e
+# ~ N(0, 1). The product of (1 − z/CLIP_END)² and the polynomial with coefficients CLIP approximates
+# the excess to within 3e-4. Cells more than CLIP_BELOW standard deviations below the floor provide
+# almost no information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
@@ -79,11 +79,11 @@ def press(state: EstimatorState, model: Model, cells: Cells) -> tuple[int, int]:
 
 @inner_kernel
 def free_noise(square: float, floor: float) -> float:
-    """Return a cell's noise σ [Pa]; ``square`` [Pa²] is the mean squared reading of unloaded cells.
+    """Return the noise σ [Pa] of a cell; ``square`` [Pa²] is the mean of y², the squared readings.
 
     Readings below ``floor`` [Pa] are sent as 0, so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. For
-    a floor of 0, E[y²] is half the variance. If all unloaded cells read 0, the result is slightly
-    less than a third of the floor.
+    a floor of 0, E[y²] is σ²/2. If all unloaded cells read 0, σ is slightly less than a third of
+    the floor.
     """
     if not floor > 0.0:
         return math.sqrt(2.0 * square)
@@ -231,8 +231,8 @@ def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 def solve(fit: Fit, first: int, last: int) -> bool:
     """Solve the normal equations for a range of parameters; set step, inverse and decrement.
 
-    Returns False if a pivot of the scaled matrix is too small. The frame then does not determine
-    all parameters.
+    Returns False if a pivot of the scaled matrix is too small, because the frame then does not
+    determine all parameters.
     """
     normal = fit.normal
     inverse = fit.inverse
@@ -244,7 +244,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
         scale[i] = 1.0 / math.sqrt(normal[i, i])
         for j in range(first, i + 1):
             inverse[i, j] = inverse[j, i] = normal[i, j] * scale[i] * scale[j]
-    # The sweep operator, applied to each diagonal element, replaces the matrix by its negative
+    # Applying the sweep operator to each diagonal element replaces the matrix by its negative
     # inverse.
     for k in range(first, last):
         pivot = inverse[k, k]
@@ -350,7 +350,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
         y = contact[SHEAR_Y] + own * contact[TILT_Y]
         estimate.shear_x = along * x - across * y
         estimate.shear_y = across * x + along * y
-    # Clamp the result, because noise may push the fit beyond the limits of the model.
+    # Clamp the result, because noise may move the fit beyond the limits of the model.
     within = min(1.0, options.sine_max / max(math.sqrt(square), 1e-9))
     contact[DEPTH] = min(d, options.deepest)
     contact[TILT_X] *= within
@@ -373,7 +373,7 @@ def fit(
 ) -> bool:
     """Run the Gauss-Newton method; ``state.estimate`` contains the guess and receives the result.
 
-    The iteration stops if the predicted decrement is at most ``tolerance`` · variance.
+    The iteration stops when the predicted decrement is at most ``tolerance`` · variance.
     ``tolerance`` is the squared ratio of the step to the noise floor. Returns False if the
     iteration does not converge, or if the frame does not determine a contact within the limits of
     the model.
@@ -391,7 +391,7 @@ def fit(
     for iteration in range(_ITERATIONS):
         cost = linearise(state, model, frame, cells)
         if solved and not cost <= before + variance and halvings < _HALVINGS_MAX:
-            # The cost has increased, so halve the step.
+            # Halve the step, because the cost has increased.
             for i in range(PARAMETERS):
                 fit.contact[i] = 0.5 * (fit.contact[i] + fit.previous[i])
             halvings += 1

@@ -1,7 +1,7 @@
 """Estimate a contact using the measured curves of a tip.
 
-The sum of the frame gives the force, the force gives d, and the centroid gives the tilt. The method
-does not need a model of the pressure distribution and takes about 0.1 ms.
+The sum of the frame determines the force, and the force determines d. The centroid determines the
+tilt. The method does not need a model of the pressure distribution and takes about 0.1 ms.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from softfinger.kinematics.estimation.frame_pipeline import ABOVE_FRACTION, ABOV
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_CONTACT_SIGMA = 5.0  # contact threshold for the sum of readings, in standard deviations
+_CONTACT_SIGMA = 5.0  # contact threshold of the sum of readings, in the sum's standard deviations
 _EXTRAPOLATION_MAX = 1.02  # extrapolation limit, relative to the measured depth and tilt
 _EXTENT_ERROR_MAX = 0.08  # maximum relative difference between the measured and the expected extent
-_ITERATIONS_MAX = 20  # maximum number of iterations that solve for d and θ alternately
+_ITERATIONS_MAX = 20  # maximum number of iterations, which alternate between d and θ
 _TOLERANCE = 1e-7  # convergence tolerance, relative to the range
 
 
@@ -33,7 +33,7 @@ def sum_weights(
     radius: float,
     active: NDArray[np.bool_],
 ) -> FloatArray:
-    """Return the weights [4, cells] of the frame sums.
+    """Return the weights [4, cells] of the cells in the four frame sums.
 
     The weights are the cell area, and the area times x, y and r². Cells that are not ``active`` or
     not under the tip have zero weights. The x and y axes are the finger axes.
@@ -73,8 +73,8 @@ class MeasuredEstimator:
     active
         Mask of working cells, bool [rows, cols]; None uses all cells.
     known
-        Sensor uncertainties. For gain, centre and rotation, only changes since the measurement of
-        the curves count.
+        Sensor uncertainties. For gain, centre and rotation, only changes after the curves were
+        measured count.
 
     Raises
     ------
@@ -83,8 +83,8 @@ class MeasuredEstimator:
 
     Notes
     -----
-    A ``valid`` estimate is within the measured range of the curves. The extent of the frame is
-    within 8 % of the value expected for the force.
+    A ``valid`` estimate is within the measured range of the curves. The frame's extent differs by
+    less than 8 % from the value expected for the force.
     """
 
     saturation: float | None = None  # Saturated cells are treated like all other cells.
@@ -112,7 +112,8 @@ class MeasuredEstimator:
         self._weights = sum_weights(grid, tip.radius, alive)
         self._used = self._weights[0] > 0.0
         self._zero_sums, self._noise = np.array(law.rest), np.array(law.noise)
-        # Sums due to a common shift of all cells; moment [N·m] due to a slope of the zero offset.
+        # Sums due to a common shift of all cells, and moment [N·m] due to a slope of the zero
+        # offset.
         self._shift = known.baseline * self._weights.sum(axis=1)
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
         sum_std = math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
@@ -168,7 +169,7 @@ class MeasuredEstimator:
         self._seq = None
 
     def _root_of(self, force: float, q: float, t: float) -> float:
-        """Solve the curve ``shown`` for a given ``force`` by Newton's method, starting at ``t``."""
+        """Find t by Newton's method, such that the curve ``shown`` equals ``force``."""
         for _ in range(24):
             value, by_t, _ = _curve(self._law.shown, t, q)
             before = t
@@ -178,7 +179,7 @@ class MeasuredEstimator:
         return t
 
     def _contact(self, sums: FloatArray, result: ContactEstimate) -> Invalid:
-        """Compute the contact; check that the frame and the curves cover it."""
+        """Compute the contact; check the range of the curves and the extent of the frame."""
         force, along, across, square = sums.tolist()
         moment = math.hypot(along, across)
         s_max = _EXTRAPOLATION_MAX * self._tilt_sine_max
@@ -199,9 +200,9 @@ class MeasuredEstimator:
         n = s * direction
         inverse, errors = self._errors(t, n)
         std = math.sqrt(direction @ errors[1:, 1:] @ direction)
-        # The tilt range of the calibration presses serves as a prior, which matters if the centroid
-        # barely determines the tilt. As in a Kalman update, the prior pulls the tilt towards 0. The
-        # resulting error is common to all frames.
+        # Use the tilt range of the calibration presses as a prior. The prior matters if the
+        # centroid barely determines the tilt. As in a Kalman update, the prior pulls the tilt
+        # towards 0. The resulting error is common to all frames.
         prior = self._tilt_sine_max**2 * np.eye(2)
         pull = errors[:, 1:] @ np.linalg.inv(errors[1:, 1:] + prior)
         n -= pull[1:] @ n
@@ -234,7 +235,7 @@ class MeasuredEstimator:
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         moment, moment_q = shown * lever, shown_q * lever + shown * lever_q
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        partials = np.zeros((3, 3))  # ∂(sum, both moments)/∂(d, n_x, n_y)
+        partials = np.zeros((3, 3))  # ∂(sum, x moment, y moment)/∂(d, n_x, n_y)
         partials[0] = shown_t * per_d, *(2.0 * shown_q * n)
         partials[1:, 0] = (shown_t * lever + shown * lever_t) * per_d * n
         partials[1:, 1:] = moment * np.eye(2) + 2.0 * moment_q * np.outer(n, n)

@@ -1,7 +1,7 @@
 """Kernels for the initial contact estimate from the sum, centroid and extent of a frame.
 
-The pressure moments over the footprint are compared with the model's moments, tabulated over d. The
-force or the extent determines d, and the centroid determines the tilt.
+The pressure moments over the footprint are compared with the model's moments, which are tabulated
+as a function of d. The force or the extent determines d, and the centroid determines the tilt.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from softfinger.kinematics.estimation.state import (
 from softfinger.kinematics.sensing.footprint import axes, set_around, set_face
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-# Margin around the footprint, in cell diagonals. The widened footprint includes the centres of all
-# cells that touch the footprint, even after a small motion.
+# Margin around the footprint, in cell diagonals. This margin includes the centres of all cells that
+# touch the footprint, even after a small motion.
 _MARGIN = 0.75
 _BLUR_MARGIN = 2.0  # additional margin around the footprint, in standard deviations of the blur
-# Tilt at which the centroid's moment arm is computed [rad]. The arm is nearly independent of the
+# Tilt at which the centroid's moment arm is computed [rad]. The moment arm is nearly independent of
 # tilt.
 _TILT = 0.2
 _WEAK_PEAK = 15.0  # maximum peak for using neighbourhood sums, in noise standard deviations
@@ -78,7 +78,7 @@ def _inverse(values: FloatArray, value: float) -> float:
 
 @inner_kernel
 def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Estimate the contact from one frame, first from strong cells, then twice from moments."""
+    """Estimate the contact from one frame: first from strong cells, then twice from the moments."""
     m = state.moments
     signal = state.signal
     guess = state.estimate.guess
@@ -99,7 +99,7 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
         if not m.total > 0.0:
             at = signal.row * state.grid.cols + signal.col
             m.x, m.y, m.number = cells.x[at], cells.y[at], 1.0
-        # In a weak contact, about three quarters of the cells exceed the threshold.
+        # In a weak contact, about three quarters of the pressed cells exceed the threshold.
         _set_from_area(state, 1.3 * m.number if weak else m.number)
         _refine(state, frame, cells)
         _refine(state, frame, cells)
@@ -147,8 +147,8 @@ def _select_inside(cells: Cells, u: float, v: float, w: float) -> None:
 def _select_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
     """Select the cells of a weak contact, whose pressures are only a few times the noise.
 
-    Single noisy cells would distort the moments. Therefore a cell must read at least twice the
-    noise, and the sum of its neighbours must be significant.
+    Single noisy cells would distort the moments. A selected cell must therefore read at least twice
+    the noise, and the sum of its neighbours must be significant.
     """
     level = 2.0 * state.signal.noise
     patch = state.options.patch_level * state.signal.noise
@@ -163,7 +163,7 @@ def _select_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None
 
 @inner_kernel
 def _set_from_area(state: EstimatorState, number: float) -> None:
-    """Set the guess for a contact that covers ``number`` cells around the centroid."""
+    """Set the guess for a contact with an area of ``number`` cells around the centroid."""
     grid = state.grid
     a = grid.radius
     # The footprint area is π ρ² cos θ with ρ² = 2 a d − d².
@@ -185,7 +185,7 @@ def _set_normal(state: EstimatorState, arm: float) -> None:
 
 @inner_kernel
 def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Refine the guess from the moments over the widened footprint of the last guess."""
+    """Refine the guess, using the moments over the widened footprint of the last guess."""
     guess = state.estimate.guess
     grid = state.grid
     face = state.around

@@ -101,7 +101,7 @@ class Moments(Record):
     number: float  # number of cells
     # Moments of the model at the depths deepest · (k/(START_POINTS − 1))².
     force: Depths  # Σ p for an upright tip [Pa]
-    extent: Depths  # trace of the pressure's covariance for an upright tip [m²]
+    extent: Depths  # trace of the spatial covariance of the pressure for an upright tip [m²]
     centroid_arm: Depths  # centroid divided by the sine of the tilt [m]
 
 
@@ -137,7 +137,7 @@ class Budget(Record):
     slope: float  # standard deviation of the zero-offset slope, measured at the rim [Pa]
     smooth: float  # relative pressure error
     rotation: float  # rotation of the sensor [rad]
-    tilt_error: float  # relative tilt error of a solid tip per d/a
+    tilt_error: float  # relative tilt error of a solid tip, divided by d/a
     row_correlation: float  # correlation of neighbouring cells in a row
     cells_per_sample: float  # Σρ², the number of cells per independent noise sample
     has_common_errors: bool  # True if there are errors other than correlated noise

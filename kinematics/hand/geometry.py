@@ -4,11 +4,12 @@ The origin of the hand plane is midway between the pivots. The x axis points fro
 the right pivot, and the y axis points away from the palm. The pivots are at (∓B, 0), and positive
 joint angles q close the fingers. The tip centres are
 
-    O1 = (−B + L sin q1 + e cos q1,  L cos q1 − e sin q1)       O2 is its mirror image
+    O1 = (−B + L sin q1 + e cos q1,  L cos q1 − e sin q1)       O2 is the mirror image of O1
 
 where L is the finger length and e the finger offset (towards the object at q = 0). The object has
-centre G, width W and angle φ. The vector n = (cos φ, sin φ) points from its left face to its right
-face, and t = (−sin φ, cos φ) is perpendicular to n. For tips of radius a, the contact variables are
+centre G, width W and angle φ. The vector n = (cos φ, sin φ) points from the left to the right face
+of the object, and t = (−sin φ, cos φ) is perpendicular to n. For tips of radius a, the contact
+variables are
 
     d1 = a + W/2 + (O1 − G)·n     θ1 = φ + q1     s1 = (O1 − G)·t
     d2 = a + W/2 − (O2 − G)·n     θ2 = φ − q2     s2 = (O2 − G)·t
@@ -56,7 +57,7 @@ def tip_velocity(q: float, side: float, length: float, offset: float) -> tuple[f
 
 @dataclass(frozen=True)
 class ContactVariables:
-    """Contact variables d [m], θ [rad] and s [m] of both tips, each of shape (2,), left first."""
+    """Contact variables d [m], θ [rad] and s [m], as arrays (2,) with the left tip first."""
 
     d: FloatArray
     theta: FloatArray
@@ -87,7 +88,7 @@ class HandGeometry:
 
     @property
     def reach(self) -> float:
-        """Distance between a pivot and its tip centre, √(L² + e²) [m]."""
+        """Distance between a finger's pivot and tip centre, √(L² + e²) [m]."""
         return math.hypot(self.finger_length, self.finger_offset)
 
     def tips(self, q: ArrayLike) -> FloatArray:

@@ -1,10 +1,10 @@
 """Kernels for an object held by two rotational fingers: motion, holding torques and load.
 
 :mod:`hand.geometry` defines the coordinates and signs. The kernels assume that the tips roll
-without slipping and that the joints are at standstill. Because a pressure grid cannot measure
-shear, the load along the faces is estimated from the joint torques. First, the contributions of the
-normal forces and of the tips' turning moments ∂U/∂θ are subtracted from the torques. The residual
-is the shear force times its moment arm about the pivot.
+without slipping and that the joints are at standstill. A pressure grid cannot measure shear, so the
+load along the faces is estimated from the joint torques. First, the contributions of the normal
+forces and of the tips' turning moments ∂U/∂θ are subtracted from the torques. The residual is the
+shear force times its moment arm about the pivot.
 
 The object's faces may form an angle α, the taper. The taper is positive if the object is wider at
 the palm. The tilt is then θ = φ + q1 − α/2 at the left tip and θ = φ − q2 + α/2 at the right tip.
@@ -25,12 +25,12 @@ from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 FloatPair = tuple[float, float]  # (left, right)
 Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
 
-_SHEAR_STEPS = 3  # number of iterations for the shear forces; each iteration adds two digits
+_SHEAR_STEPS = 3  # number of iterations for the shear forces; each one gains two digits
 
 
 @kernel
 def total_tilt(tilt_x: float, tilt_y: float) -> float:
-    """Return the angle θ between normal and tip axis, using sin² θ = sin² tilt_x + sin² tilt_y."""
+    """Return the angle θ between face normal and tip axis: sin² θ = sin² tilt_x + sin² tilt_y."""
     return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
 
 
@@ -59,9 +59,9 @@ def held_motion(
     − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m]. The
     distance between the contacts along n is ``width`` = W cos(α/2).
 
-    In turn_i, W is at least half the tip radius, because the prediction would diverge for thinner
-    objects. In reality, inertia and the shear compliance of the tips slow the rotation of thin
-    objects.
+    In turn_i, W is clamped to at least half the tip radius, because the prediction would diverge
+    for thinner objects. In reality, inertia and the shear compliance of the tips slow the rotation
+    of thin objects.
     """
     q1, q2 = q
     d1, d2 = d
@@ -127,13 +127,13 @@ def holding_moment_arms(
 
         τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
 
-    From the moment equilibrium of the object, T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2, where T is the
-    mean shear force. Faces with a ``taper`` α [rad] push the object out. The shear force is
-    therefore T − N tan(α/2) at the left tip and T + N tan(α/2) at the right tip. F is the mean
-    contact force of both tips, so a common modulus cancels in the moment arms τ/F [m]. N is the
-    mean of the normal forces N1 and N2 [N]. N1 and N2 differ if the surroundings exert friction on
-    the object. ``data1`` and ``data2`` are the contact table arrays. All results are zero unless
-    both tips are in contact.
+    T is the mean shear force. The moment equilibrium of the object requires T W = N slide + ∂U1/∂θ1
+    + ∂U2/∂θ2. Faces with a ``taper`` α [rad] push the object out. The shear force is therefore T −
+    N tan(α/2) at the left tip and T + N tan(α/2) at the right tip. F is the mean contact force of
+    both tips. A modulus that is common to both tips therefore cancels in the moment arms τ/F [m]. N
+    is the mean of the normal forces N1 and N2 [N]. N1 and N2 differ if the object rubs against its
+    surroundings. ``data1`` and ``data2`` are the arrays of the contact tables. All results are zero
+    unless both tips are in contact.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -234,9 +234,9 @@ def load_torques(
     ``motion`` is the result of :func:`held_motion`. For parallel faces, ±v_i·n equals arm_i and
     lever_i equals W turn_i.
 
-    δ_i is the residual of τ_i at L = 0. For a load, (δ1 + δ2)/2 = moment_arm L + curvature L² holds
-    exactly. The function returns (δ1, δ2, moment_arm, curvature). All results are zero if a tip is
-    not in contact or if a load would not change the torques.
+    δ_i is the residual of τ_i at L = 0. A load causes exactly (δ1 + δ2)/2 = moment_arm L +
+    curvature L². The function returns (δ1, δ2, moment_arm, curvature). All results are zero if a
+    tip is not in contact or if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -266,8 +266,8 @@ def load_torques(
 def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
     """Solve torque = moment_arm L + curvature L² [N·m]; return L [N] and the slope ∂torque/∂L [m].
 
-    A load cannot cause a torque beyond the vertex of the parabola. The slope is at least the
-    minimum slope.
+    A load cannot cause a torque beyond the vertex of the parabola. The slope is clamped to a
+    minimum.
     """
     slope_min = _SLOPE_MIN * moment_arm
     slope = math.sqrt(

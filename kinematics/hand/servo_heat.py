@@ -27,14 +27,14 @@ FloatArray = NDArray[np.float64]
 
 WINDING, CASE, AMBIENT, HEATING = range(4)
 COPPER = 0.0039  # temperature coefficient of the winding's resistance [1/K]
-TIME_MAX = 3600.0  # maximum reported time to a limit [s]
+TIME_MAX = 3600.0  # upper bound on the computed time to a temperature limit [s]
 _ROOM_TEMPERATURE = 25.0  # °C
-_CONVECTION_DIFFERENCE = 30.0  # temperature difference to ambient for which τ_c is defined [K]
+_CONVECTION_DIFFERENCE = 30.0  # difference from ambient temperature at which τ_c is defined [K]
 _INITIAL_STD = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
 _RANDOM_WALK = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
-_STEP_STD = 0.12  # standard deviation of the case temperature when the reading changes [°C]
-_STAY_STD = 6.0  # standard deviation of a reading that stays constant for 1 s [°C]
-_COUPLING = 0.25  # error of W due to the unobservable error of τ_w, as a fraction of W − C
+_STEP_STD = 0.12  # standard deviation of the case temperature at a change in the reading [°C]
+_STAY_STD = 6.0  # standard deviation of a reading that has been constant for 1 s [°C]
+_COUPLING = 0.25  # error of W due to an error in τ_w, which is not observable; relative to W − C
 
 
 class HeatLaw(Record):
@@ -72,7 +72,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
         return
     _predict(s, square, dt)
     stepped = reading - s.reading
-    if abs(stepped) > 1.0:  # The filter missed some steps, or the sensor was replaced.
+    if abs(stepped) > 1.0:  # The filter has missed some steps, or the sensor has been replaced.
         _correct(s, reading, 1.0)
     elif stepped != 0.0:
         _correct(s, reading - 0.5 * stepped, _STEP_STD * _STEP_STD)

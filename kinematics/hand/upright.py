@@ -1,6 +1,6 @@
-"""Compute the virtual joint spring that keeps a held object upright despite sticking tips.
+"""Compute the virtual joint spring that keeps a held object upright although the tips stick to it.
 
-Two mirrored fingers hold an object of width W by its parallel faces. Each tip is displaced by d.
+Two mirrored fingers hold an object of width W at its parallel faces. Each tip is displaced by d.
 The small antisymmetric motions are the object's angle φ and the antisymmetric joint angle δ = (q1 −
 q2)/2. Together, φ and δ change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual spring k
 between the fingers subtracts kδ from the torque of joint 1 and adds kδ to the torque of joint 2.
@@ -9,10 +9,11 @@ For a normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d a
 
     T = N (φ − bδ)                                       the forces of both fingers are collinear
     W T = N ((W + 2(a − d))φ − 2ℓδ) + 2 ∂U/∂θ            moment balance of the object
-    σ = (a − d + ℓ)δ − W(φ − φ0)/2                       rolling since the tips stuck
+    σ = (a − d + ℓ)δ − W(φ − φ0)/2                       rolling after the tips first stuck
 
-where ℓ = L sin q + e cos q. The last equation integrates the stick condition over changes in d and
-q, so the result does not depend on the path. For an object whose angle is φ0 at first contact,
+where ℓ = L sin q + e cos q. The last equation is the stick condition, integrated over changes in d
+and q. The result therefore does not depend on the path. For an object whose angle is φ0 at first
+contact,
 
     φ/φ0 = W D/(W D − 4 (a − d + cd) M)
     D = 2ℓ + (1 − 2c)d − b(W − d)        M = a − d + ℓ + (1 + b)d/2
@@ -41,8 +42,8 @@ def upright_spring(
 ) -> float:
     """Return the joint spring k [N·m/rad] that keeps the object upright at joint angle ``q`` [rad].
 
-    ``d`` [m] and ``force`` [N] are averages of both tips. ``tilt_moment_ratio`` is the constant c.
-    ``lengths`` [m] are the same as in :func:`hand.grasp_state.held_motion`.
+    ``d`` [m] and ``force`` [N] are averages over both tips. ``tilt_moment_ratio`` is the constant
+    c. ``lengths`` [m] are the same as in :func:`hand.grasp_state.held_motion`.
     """
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)

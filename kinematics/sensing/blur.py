@@ -1,8 +1,8 @@
-"""Compute the sample points of cells along one axis, and the weights for the mean of a cell.
+"""Compute sample points along one axis of a grid, and the weights that average each cell's points.
 
 The elastomer over a sensor spreads pressure like a Gaussian blur. A Gaussian blur is a weighted sum
 of neighbouring points along one axis, followed by a weighted sum along the other axis. The weights
-for averaging the points of a cell therefore include the blur. Without blur, a cell averages its own
+that average the points of a cell therefore include the blur. Without blur, a cell averages its own
 points with equal weights.
 """
 
@@ -23,11 +23,11 @@ _CUTOFF = 4.5  # truncation of the Gaussian, in standard deviations
 def axis_points(
     start: float, pitch: float, number: int, count: int, blur: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the positions of points [count, cells], and the weights for the mean of a cell.
+    """Return the positions of points [count, cells], and the weights that average a cell's points.
 
-    The axis has ``number`` cells of width ``pitch``, and the first cell begins at ``start``. Cells
-    within the range of the blur are added at both ends. The mean of cell j is the sum of weights[m,
-    q] times point m of cell j + q, over all m and q.
+    The axis has ``number`` cells of width ``pitch``, and the first cell begins at ``start``. At
+    both ends, additional cells cover the range of the blur. The mean of cell j is the sum of
+    weights[m, q] times point m of cell j + q, over all m and q.
     """
     mean = np.convolve(stencil(blur * count / pitch), np.full(count, 1.0 / count))
     half = (len(mean) - count) // 2
@@ -57,9 +57,9 @@ def stencil(width: float) -> FloatArray:
     """Return the weights [2 n + 1] of neighbouring points for a blur with a ``width`` of w points.
 
     The weights are samples of the Gaussian (trapezoid rule). The error of the samples decreases as
-    exp(−2π² w²). For widths below 0.75 points, five weights match the Gaussian's moments up to the
-    fifth. The five weights are exact for polynomials up to degree five. Without blur, the only
-    weight is 1.
+    exp(−2π² w²). For widths below 0.75 points, five weights match the Gaussian's moments up to
+    order five. The five weights are therefore exact for polynomials up to degree five. Without
+    blur, the only weight is 1.
     """
     if width == 0.0:
         return np.ones(1)

@@ -1,4 +1,4 @@
-"""Kernels for the outline of the footprint on a grid of cells.
+"""Kernels that compute the outline of a tip's footprint on a grid of cells.
 
 The forward model and the estimator share the geometry in this module. Lengths are in m. Positions
 are in sensor axes, relative to the tip centre. The object's face is the plane ``n·(x, y, z) = h``
@@ -109,8 +109,7 @@ def line_span(face: Face, a: float, y: float) -> Span:
     root = math.sqrt(root)
     left = (v * q - root) / e
     right = (v * q + root) / e
-    # A root that lies below the base plane is not an edge of the footprint. The footprint then ends
-    # at the rim.
+    # If a root lies below the base plane, the footprint ends at the rim instead.
     return -edge if q < v * left else left, edge if q < v * right else right
 
 

@@ -91,8 +91,7 @@ class SensorGrid:
         pitch_x, pitch_y = self.pitches
         x = -0.5 * self.cols * pitch_x - self.centre[0]
         y = -0.5 * self.rows * pitch_y - self.centre[1]
-        # Create the record from values in field order, because setting each field takes ten times
-        # as long.
+        # Pass the values in field order, because setting fields one by one takes ten times as long.
         fields = (tip.radius, x, y, pitch_x, pitch_y, self.rows, self.cols)
         return Grid(np.array([fields], Grid.dtype))
 
@@ -118,7 +117,7 @@ class SensorGrid:
         For a spring tip, the error is at most 1e-5 of the modulus, even in cells at the outline.
         The error increases to 1e-4 for tilts above 30°, and to 1e-3 where the outline almost
         reaches the rim. For a solid tip, the accuracy is that of `solid_data`. Contacts outside the
-        range of the data are clamped.
+        range of these data are clamped to the range.
 
         Parameters
         ----------

@@ -31,7 +31,7 @@ IMAGES = 2 * MODES
 _LANES = 8
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
-# Numbers of sample points per cell side. Cells inside the rim have _INSIDE points, and cells cut by
+# Number of sample points per cell side. Cells inside the rim have _INSIDE points, and cells cut by
 # the rim have _CUT points. All cells of a sensor with blur have _BLURRED points.
 _INSIDE, _CUT, _BLURRED = 6, 24, 12
 
@@ -49,7 +49,7 @@ class Weights(Record):
     q_y: Annotated[FloatArray, MODES]
     row: Annotated[FloatArray, MODES]  # scratch
     slope: Annotated[FloatArray, MODES]
-    values: Annotated[FloatArray, 4, IMAGES]  # weights and their partials in d, n_x and n_y
+    values: Annotated[FloatArray, 4, IMAGES]  # weights, ∂/∂d, ∂/∂n_x and ∂/∂n_y
 
 
 def weights_of(tip: Fingertip, material: Material) -> Weights:
@@ -75,7 +75,7 @@ def images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
     out = np.zeros((count, cells.rows * cells.cols))
     width, height = cells.pitch_x / cells.radius, cells.pitch_y / cells.radius
     x, y = (middle / cells.radius for middle in axes(cells))
-    # Distances of each cell's nearest and farthest point from the tip centre.
+    # Distances from the tip centre to the nearest and the farthest point of each cell.
     near, far = (
         np.hypot(
             np.maximum(np.abs(x) + sign * width, 0.0),
@@ -107,7 +107,7 @@ def _blurred_images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
 
 
 def _means(tip: Fingertip, z: NDArray[np.complex128]) -> Iterator[FloatArray]:
-    """Yield each image's mean over the points x + i y [cells, points]; 0 outside the rings."""
+    """Yield the mean of each image over each cell's points x + i y [cells, points]."""
     data = solid_data(tip)
     middle = 0.5 * (data.edges[1:] + data.edges[:-1])
     r = np.abs(z)
@@ -115,7 +115,7 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> Iterator[FloatArray]:
     phase = z / np.maximum(r, 1e-12)
     powers = {m: phase**m for m in {*data.harmonics.tolist(), 1}}
     for m, mode in zip([*data.harmonics.tolist(), 1], [*data.modes, data.shear], strict=True):
-        # Modes with m > 0 vanish at the centre.
+        # Modes with m > 0 are zero at the centre.
         start = 0.0 if m else 1.5 * mode[0] - 0.5 * mode[1]
         value = np.interp(r, [0.0, *middle], [start, *mode]) * inside
         yield (value * powers[m].real).sum(axis=1)
@@ -170,10 +170,10 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def own_shear(weights: Weights, d: float, square: float) -> float:
-    """Return the shear force of straight indentation with a sticking face, over a² sin θ [Pa].
+    """Return the shear of straight indentation with a sticking face, divided by a² sin θ [Pa].
 
-    The shear force acts at height a and is already included in the modes. ``weights`` must be set
-    for this contact.
+    This shear acts at height a and is already included in the modes. ``weights`` must be set for
+    this contact.
     """
     q = weights.q[0]
     normal = weights.values[0, 0] / (1.0 - square * q)
@@ -300,7 +300,7 @@ class SolidPressure:
         out: FloatArray,
         shear: tuple[float, float] | None = None,
     ) -> None:
-        """Call :func:`render_solid`; the default ``shear`` results from straight indentation."""
+        """Call :func:`render_solid`; if ``shear`` is None, assume straight indentation."""
         whole = shear is not None
         render_solid(
             self._weights, self._pixels, contact, shear or (0.0, 0.0), whole, gain, out.reshape(-1)

@@ -1,11 +1,12 @@
 """Forward model of a spring tip on a grid of cells: pressure and its partials.
 
-A cell reads the mean over sample points that are distributed evenly over its area. The spring above
-a base point (x, y) has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ, where z = u − v x − w y;
-see `footprint`. Each sample point represents a small rectangle, and uses the mean strain of the
-rectangle. Inside the footprint, the mean strain is computed from tabulated means of 1/ℓ, x/ℓ and
-y/ℓ. If the outline cuts the rectangle, only the part with f = ℓ² − z² > 0 contributes. In a
-rectangle cut by the outline, f is approximated as linear, and its values as uniformly distributed.
+A cell's pressure is the mean over sample points that are evenly distributed over the cell. The
+spring above a base point (x, y) has the length ℓ = √(a² − x² − y²). The strain of the spring is ε =
+1 − z/ℓ with z = u − v x − w y; see `footprint`. Each sample point represents a small rectangle and
+uses the rectangle's mean strain. Inside the footprint, the mean strain is computed from tabulated
+means of 1/ℓ, x/ℓ and y/ℓ. If the outline cuts the rectangle, only the part with f = ℓ² − z² > 0
+contributes. In such a rectangle, f is approximated as linear, and the values of f as uniformly
+distributed.
 
 The point weights include the sensor's blur; see `blur`.
 """
@@ -32,7 +33,7 @@ from softfinger.kinematics.sensing.footprint import (
     steps,
 )
 
-STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its partials in d, n_x and n_y
+STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its ∂/∂d, ∂/∂n_x and ∂/∂n_y
 PLANES = 4
 POINT_X, STRAIN, SLOPE, FACTOR, POINT_STRESS = range(5)  # rows of `SpringPoints.line`
 Cells = tuple[int, int]  # half-open range
@@ -44,9 +45,9 @@ _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 class SpringPoints(NamedTuple):
     """Sample points of a grid under a tip, in the memory layout that the kernels use.
 
-    One array stores one row of points. The array contains the first point of every cell, then the
-    second point of every cell, and so on. Cells outside the grid are included if they are within
-    the range of the blur.
+    Each array stores one row of points: first the first point of every cell, then the second point
+    of every cell, and so on. Cells outside the grid are included if they are within the range of
+    the blur.
     """
 
     line: FloatArray  # [5, row]: distance from the tip centre in x [m], then scratch values
@@ -54,7 +55,7 @@ class SpringPoints(NamedTuple):
     y: FloatArray  # one value per row
     across: FloatArray  # weights along x [position, cell offset], see `blur.axis_points`
     along: FloatArray  # weights along y
-    law: FloatArray  # coefficients of the material's σ(ε), in order of increasing power
+    law: FloatArray  # coefficients of the material's σ(ε), in ascending order of power
     sums: FloatArray  # scratch, three rows of cells [3, cells]
 
 
@@ -106,13 +107,12 @@ def _set_strains(
     line = points.line
     for k in range(first, last):
         x = line[POINT_X, k]
-        # The strain ε is positive where f = ℓ² − z² > 0. Up to the rim and beyond, f is almost
-        # linear.
+        # The strain ε is positive where f = ℓ² − z² > 0. Even beyond the rim, f is almost linear.
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
-        # Approximate width of the uniform distribution of f. The exact width is 4 (big + small²/(3
-        # big)). For a linear f and an outline through the centre, the approximate width changes the
-        # mean of max(f, 0) by at most 2 %.
+        # Approximate the width of the uniform distribution of f. The exact width is 4 (big +
+        # small²/(3 big)). For a linear f and an outline through the centre, the approximate width
+        # changes the mean of max(f, 0) by at most 2 %.
         by_x = abs(size_x * (x - z * v))
         by_y = abs(size_y * (y - z * w))
         big = max(by_x, by_y)
@@ -125,7 +125,7 @@ def _set_strains(
         q = y - z * w
         away = 0.5 * max(0.5 * part - f, 0.0) / (p * p + q * q + least)
         z = max(z + away * (v * p + w * q), 0.0)
-        # Means of ε and 1/ℓ if f is uniformly distributed from 0 to ``part``.
+        # Compute the means of ε and 1/ℓ for f uniformly distributed from 0 to ``part``.
         length = math.sqrt(z * z + part)
         mean = part / (spread * (length + z) + least)
         g = points.inverse[0, row + k]
@@ -148,7 +148,7 @@ def _raise_power(line: FloatArray, first: int, last: int, coefficient: float) ->
 
 @inlined_kernel
 def _sum_points(points: SpringPoints, first: int, last: int, ahead: int, weight: float) -> None:
-    """Add the points at the index offset ``ahead`` to the sums of cells ``first`` to ``last``.
+    """Add the points that are ``ahead`` indices away to the sums of cells ``first`` to ``last``.
 
     The three sums are the stress σ, −∂σ/∂u and −x ∂σ/∂u.
     """
@@ -203,7 +203,7 @@ def _add_row(
     row: int,
     out: FloatArray,
 ) -> None:
-    """Add a line's sums to a row of cells, converting the partials to d, n_x and n_y."""
+    """Add a line's sums to a row of cells, as pressure, ∂/∂d, ∂/∂n_x and ∂/∂n_y."""
     u = face.u
     v = face.v
     w = face.w
@@ -233,7 +233,7 @@ def press_springs(
     count_y, reach = points.along.shape
     size_x = 0.5 * grid.pitch_x / count_x
     size_y = 0.5 * grid.pitch_y / count_y
-    # Widen the face, because the outline may cut a rectangle whose centre is outside the outline.
+    # Widen the footprint, because the outline may cut a rectangle whose centre is outside.
     set_around(around, face, a, math.hypot(size_x, size_y))
     low, high = extremes(around, a)
     lines = points.y.shape[0]

@@ -11,7 +11,7 @@ from lerobot_robot_softfinger.features import FULL_SCALE
 @RobotConfig.register_subclass("softfinger")
 @dataclass(kw_only=True)
 class SoftfingerConfig(RobotConfig):
-    """Settings for the connection to a running ``softfinger`` daemon, and for actions.
+    """Settings for actions and for the connection to a running ``softfinger`` daemon.
 
     If ``control`` is ``joints``, actions are joint goals. If ``control`` is ``law``, actions are
     the force and object angle for the built-in grip control law.

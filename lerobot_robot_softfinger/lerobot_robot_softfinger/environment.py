@@ -1,4 +1,4 @@
-"""Provide the simulated hand to LeRobot policies, with the robot's observations and actions."""
+"""Provide the simulated hand to LeRobot, with the same observations and actions as the robot."""
 
 from __future__ import annotations
 

@@ -41,6 +41,6 @@ def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[st
 
 
 def image(frame: TactileFrame, full_scale: float = FULL_SCALE) -> NDArray[np.uint8]:
-    """Convert a frame to an image [rows, cols, 3]; pressures ≥ ``full_scale`` [Pa] are white."""
+    """Convert a frame to an image [rows, cols, 3]; ``full_scale`` [Pa] and above is white."""
     grey = np.clip(np.rint(frame.pressure * (255.0 / full_scale)), 0.0, 255.0)
     return np.repeat(grey.astype(np.uint8)[:, :, np.newaxis], 3, axis=2)

@@ -19,8 +19,8 @@ class Softfinger(Robot):
     """LeRobot `Robot` implementation for the softfinger hand.
 
     Connecting does not switch on the torque or move the hand. The first action arms the hand. If
-    the hand is later disarmed or enters a fault state, the next action raises Refused and does not
-    arm the hand.
+    the hand is later disarmed or enters a fault state, the next action raises Refused. It does not
+    arm the hand again.
     """
 
     config_class = SoftfingerConfig
@@ -90,7 +90,7 @@ class Softfinger(Robot):
         self._hand.tare()
 
     def configure(self) -> None:
-        """Do nothing, because the daemon has its own settings."""
+        """Do nothing, because the daemon reads its own settings."""
 
     @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:

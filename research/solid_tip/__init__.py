@@ -9,8 +9,8 @@ pypardiso. Lengths are in units of the tip radius a, and stresses in units of E.
    at a time. Contact with the tilted plane is a linear complementarity problem. The problem is
    solved for all combinations of 19 depths, 9 tilts and 4 values of ν.
 2. Finite strain: upright presses use a fine mesh at three values of ν. Tilted presses use a
-   half-body mesh of 8 × 8 × 6 elements at ν = 0.475. Only the ratio of neo-Hookean to linear
-   presses on the same mesh is used, so the mesh error (0.5 to 2 % of N) cancels.
+   half-body mesh of 8 × 8 × 6 elements at ν = 0.475. The result is the ratio of neo-Hookean to
+   linear presses on the same mesh, so the mesh error of 0.5 to 2 % of N cancels.
 3. Fit: one polynomial is fitted to energies and normal forces together. A few modes per harmonic
    represent the base pressure.
 """

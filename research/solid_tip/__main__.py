@@ -25,11 +25,11 @@ Arrays = dict[str, NDArray[Any]]
 BASES = ("bonded", "lying")
 STICKING = "-sticking"
 BLOCKS = tuple(base + face for face in ("", STICKING) for base in BASES)
-HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are used for validation only
+HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν used only for validation
 
 
 def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
-    """Compute all presses of one block, mesh and ν, or load the presses from ``folder``."""
+    """Compute all presses of one block, mesh and ν, or load them from ``folder``."""
     block, rings, poisson = which
     base, sticking = block.removesuffix(STICKING), block.endswith(STICKING)
     file = folder / f"{block}-{rings}-{poisson:.6f}.npz"
@@ -46,7 +46,7 @@ def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
 
 
 def differences(tip: SolidTip, samples: fit.Samples) -> str:
-    """Describe the errors in N, U and p relative to ``samples`` for three depth ranges."""
+    """Describe the relative errors in N, U and p for three depth ranges of ``samples``."""
     areas = np.sqrt(np.diff(tip.edges**2))
     rows = []
     for d, theta, push, energy, _, base in zip(*samples, strict=True):
@@ -62,7 +62,7 @@ def differences(tip: SolidTip, samples: fit.Samples) -> str:
 
 
 def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float]:
-    """Return the maximum relative differences between two models in N and in a sensor frame."""
+    """Return the maximum relative differences in N and in a sensor frame between two models."""
     force, pressure = [], []
     for poisson in (*fit.NU, 0.49):
         tip, second = SolidTip(arrays, block, poisson), SolidTip(other, block, poisson)

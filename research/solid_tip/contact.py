@@ -1,14 +1,14 @@
-"""Solve contact of a rigid plane with the hemisphere as a linear complementarity problem.
+"""Solve contact between a rigid plane and the hemisphere as a linear complementarity problem.
 
 Without friction, each surface cell has one unknown force q ≥ 0 along the plane's normal n = (sin θ,
 0, cos θ). The same force acts on the cell's mirror image at −y. The cells move by C q, where C is
 the compliance. The plane overlaps a cell at X by δ = X·n − (a − d). Contact therefore requires q ≥
 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
 
-On a sticking face, two additional forces along the plane hold each cell at the position where the
-cell first touched the plane. With sticking, the result depends on the plane's path. The plane moves
-straight along n. The held points therefore do not move along the plane, and the tangential forces
-do no work. N = ∂U/∂d therefore holds with and without friction.
+On a sticking face, two additional forces along the plane hold each cell at its point of first
+contact. The result then depends on the plane's path. The plane moves straight along n. Stuck points
+therefore do not move along the plane, and the tangential forces do no work. The relation N = ∂U/∂d
+therefore holds with and without friction.
 """
 
 from __future__ import annotations
@@ -90,9 +90,9 @@ class TiltedPlane:
     def press(self, d: float) -> Press:
         """Solve at depth ``d``, starting from the contact cells of the last press.
 
-        With a sticking face, the result depends on the path, so increase the depth in small steps.
-        A cell that comes into contact during a step sticks at an interpolated position. Raises
-        RuntimeError if the active sets do not converge.
+        With a sticking face, the result depends on the plane's path, so increase the depth in small
+        steps. A cell that comes into contact during a step sticks at an interpolated position.
+        Raises RuntimeError if the active sets do not converge.
         """
         overlap, step = self.reach - (1 - d), len(self.axes)
         before = self.moved

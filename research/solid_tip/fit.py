@@ -188,7 +188,7 @@ class SolidTip:
         self.edges = arrays["ring_edges"].astype(float)
 
     def press(self, d: float, theta: float) -> tuple[float, float, FloatArray]:
-        """Return the normal force N, the energy U and the base pressure harmonics (H, R)."""
+        """Return the normal force N, the energy U and the harmonics of the base pressure (H, R)."""
         s = np.sqrt(d)
         x = 2 * s / self.s_max - 1
         w = 2 * (np.sin(theta) / np.sin(self.theta_max)) ** 2 - 1

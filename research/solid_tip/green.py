@@ -1,8 +1,8 @@
 """Compute the response of a hemisphere's rings and base to ring loads (Green's functions).
 
 Each ring is one element along the meridian arc. The load is a traction that is constant along the
-ring's arc and has harmonic m around the axis. The response consists of the mean displacement of
-every ring and the pressure on the base.
+ring's arc and varies as harmonic m around the axis. The response consists of the mean displacement
+of every ring and the pressure on the base.
 
 The functions are computed with finite elements of the linear elastic hemisphere, one Fourier
 harmonic at a time. A displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ). U, V and W are
@@ -49,7 +49,7 @@ def graded(last: float, widest: float, growth: float, length: float) -> FloatArr
 
 
 class Meridian:
-    """Mesh of the quarter disc with ``rings`` elements along the arc, where contact may occur."""
+    """Mesh of the quarter disc with ``rings`` elements along the arc, which may be in contact."""
 
     def __init__(self, rings: int, finer: float = 8.0, widest: float = 0.08) -> None:
         step = np.pi / 2 / rings
@@ -144,7 +144,7 @@ class Green(NamedTuple):
 
     place: FloatArray  # mean r and z of each ring [a], shape (R, 2)
     weight: FloatArray  # ∫ r ds of each ring [a²], shape (R,)
-    cells: IntArray  # even number of cells around each ring, shape (R,)
+    cells: IntArray  # number of cells around each ring (even), shape (R,)
     rings: FloatArray  # weight × mean displacement for unit traction, shape (M + 1, 3, R, 3, R)
     base_radius: FloatArray  # radii of the base nodes [a], shape (B,)
     base: FloatArray  # base pressure at these nodes for unit traction, shape (H, B, 3, R)
@@ -249,7 +249,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
 
 
 def shear_response(rings: int, poisson: float, bonded: bool) -> tuple[FloatArray, FloatArray]:
-    """Return base node radii, and harmonic 1 of the base pressure under a unit shear on the cap."""
+    """Return the base radii, and harmonic 1 of the base pressure under a unit shear on the cap."""
     mesh = Meridian(rings)
     _, _, nodal, angle = arc_loads(mesh)
     load = np.zeros(3 * len(mesh.nodes))

@@ -3,9 +3,9 @@
 The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and κ = E/(3 −
 6ν). E and ν are the small-strain values. Elements have 27 nodes. In the volumetric part, J − 1 is
 projected onto linear functions in each element (mean dilatation to first order). This projection
-avoids locking as ν approaches ½. The mesh is created by revolving a meridian mesh. For a tilted
-plane, the mesh covers half a turn, with the symmetry plane y = 0. For an upright plane, the mesh is
-one thin wedge, and all nodes at the same r and z have the same motion.
+avoids locking as ν approaches ½. Revolving a meridian mesh creates the mesh of the tip. For a
+tilted plane, the mesh covers half a turn and ends at the symmetry plane y = 0. For an upright
+plane, the mesh is one thin wedge, and all nodes at the same r and z have the same motion.
 
 Contact is modelled at the nodes. An active node lies in the plane and transmits a normal force.
 Unless the face is sticking, an active node moves freely along the plane. Each Newton step also
@@ -36,10 +36,10 @@ from research.solid_tip.green import (
 )
 
 WEDGE = 0.1  # angle of the wedge [rad]
-# Stiffness of the spring that holds the mean position of an unbonded base, in units of E.
+# Stiffness of the spring that constrains the mean position of an unbonded base, in units of E.
 STIFF = 1e3
 HARMONICS = 9
-AZIMUTHS = 48  # number of azimuths at which the base pressure is evaluated
+AZIMUTHS = 48  # number of azimuths for evaluating the base pressure
 SLICES = 8
 ROOTS = np.linspace(0.2, np.sqrt(0.4), 8)  # √(d/a) of each press
 REACHED = 0.5  # minimum undeformed height of nodes that the plane may touch [a]
@@ -62,11 +62,11 @@ class State(NamedTuple):
     depth: float
     motion: FloatArray  # displacement of each degree of freedom
     touching: NDArray[np.bool_]  # True for each face node in contact
-    held: FloatArray  # positions of the sticking nodes along the plane
+    held: FloatArray  # in-plane positions of the sticking nodes
 
 
 class Body:
-    """Meshed tip at one ν for a plane at ``theta`` [rad]; axisymmetric if ``theta`` is None."""
+    """Mesh of a tip at one ν for a plane at ``theta`` [rad]; axisymmetric if ``theta`` is None."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class Body:
             self.moves = self.solve(rest, loads, known)
 
     def _revolve(self, mesh: Meridian, phis: FloatArray) -> None:
-        """Create nodes and elements by revolving ``mesh`` to ``phis``; axis nodes are shared."""
+        """Revolve ``mesh`` to the angles ``phis``; nodes on the axis are shared by all angles."""
         count = len(mesh.nodes)
         on_axis = mesh.nodes[:, 0] < 1e-12
         number = np.zeros((count, phis.size), dtype=np.int64)
@@ -145,7 +145,7 @@ class Body:
         self.lines = number[mesh.base].T  # base nodes from the centre to the rim
 
     def _geometry(self) -> FloatArray:
-        """Set weights and linear functions; return the shape functions' gradients (e, q, 27, 3)."""
+        """Set weights and linear functions; return the shape-function gradients (e, q, 27, 3)."""
         points, gauss = GAUSS
         value, slope = quadratic(points)
 
@@ -258,11 +258,11 @@ class Body:
     def forces(
         self, motion: FloatArray, pressures: FloatArray | None = None
     ) -> tuple[float, FloatArray, FloatArray | None]:
-        """Return the energy, the dof forces and, given ``pressures``, the tangent's upper triangle.
+        """Return energy, dof forces and, given ``pressures``, the tangent's upper triangle.
 
-        ``pressures`` are the coefficients (e, 4) of each element's linear functions. Each Newton
-        step updates the coefficients, as in a mixed method. Recomputed pressures would contain κ
-        times the second-order volume change and would distort the next tangent.
+        ``pressures`` contains the coefficients (e, 4) of the linear functions of each element. Each
+        Newton step updates the coefficients, as in a mixed method. Recomputed pressures would
+        contain κ times the second-order volume change and would distort the next tangent.
         """
         if self.at_rest is not None:
             out = self.times_tangent(self.at_rest, motion)
@@ -322,7 +322,7 @@ class Body:
         return stress, density, four, swell
 
     def solve(self, numbers: FloatArray, right: FloatArray, known: FloatArray) -> FloatArray:
-        """Solve for the dofs under forces ``right``; ``known`` prescribes dofs that are not NaN."""
+        """Solve for the dofs under forces ``right``; non-NaN values in ``known`` are prescribed."""
         if self.moves is not None:
             return self._solve_at_rest(right, known)
         given = ~np.isnan(known)
@@ -339,7 +339,7 @@ class Body:
         return np.asarray(found).squeeze()
 
     def _solve_at_rest(self, right: FloatArray, known: FloatArray) -> FloatArray:
-        """Solve as `solve` does, but for linear elements and from the response to face forces."""
+        """Solve for linear elements, using the response to face forces; otherwise like `solve`."""
         assert self.moves is not None
         # Initially, all forces except those on the face are in equilibrium.
         given = ~np.isnan(known[self.pushed])
@@ -358,7 +358,7 @@ class Body:
         return np.asarray(matrix @ vector + matrix.T @ vector - diagonal * vector)
 
     def press(self, depths: Iterable[float]) -> Iterator[Strained]:
-        """Press to increasing ``depths`` in sequence; stop if there is no solution."""
+        """Press to each of the increasing ``depths``; stop if there is no solution."""
         state = State(
             0.0,
             np.zeros(self.count),
@@ -381,7 +381,7 @@ class Body:
             )
 
     def _go(self, state: State, d: float) -> State:
-        """Advance to depth ``d`` in as many steps as necessary, and return the state."""
+        """Advance to depth ``d`` in as many steps as necessary, and return the final state."""
         try:
             return self._step(state, d)
         except RuntimeError:
@@ -393,7 +393,7 @@ class Body:
         depth, before, touching, held = state
         held = held.copy()
         target = (1 - d) - self.reach
-        room = before[self.normal] - ((1 - depth) - self.reach)  # gap to the plane at `depth`, ≤ 0
+        room = before[self.normal] - ((1 - depth) - self.reach)  # gap at `depth`, at most 0
         motion, pressures = before.copy(), self.pressures(before, 0 * before)
         touching = touching | (target < 0.3 * target.min()) if not touching.any() else touching
         size = 1.0
@@ -416,7 +416,7 @@ class Body:
             reaction = (forces + self.times_tangent(numbers, change))[self.normal]
             gap = motion[self.normal] - target
             now = np.where(touching, reaction < 0, gap > 1e-10)
-            if attempt > 15:  # After 15 attempts, keep alternating nodes active.
+            if attempt > 15:  # Nodes that still alternate after 15 attempts stay active.
                 now |= touching
             still = np.abs(change).max() < 1e-6 and size == 1.0
             if still and (now == touching).all():

@@ -30,16 +30,16 @@ from research.solid_tip.rubber import HARMONICS, strained
 NU = fit.chebyshev_nodes(*fit.NU, 3)
 SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
 AREAS = np.pi * np.diff(RING_EDGES**2)
-# For each block, this map contains the indices of `SINES` of the computed tilts, and the values of
-# ν. At the largest depth and tilt, the elements of lying rubber collapse, and the solution does not
-# converge. The fit therefore extrapolates there.
+# Computed values of ν for each block and tilt. Each tilt is an index of `SINES`. At the largest
+# depth and tilt, the elements of lying rubber collapse, and the solution does not converge. The fit
+# therefore extrapolates there.
 TILTS = {
     "bonded": {1: NU[1:2], 2: NU[1:2], 4: NU[1:2]},
     "lying": {1: NU[1:2], 2: NU[1:2]},
     "bonded-sticking": {2: NU[1:2], 4: NU[1:2]},
     "lying-sticking": {2: NU[1:2]},
 }
-IN_ROOT = 5  # number of terms in √(d/a) for the effect of strain; the lowest order is d/a
+IN_ROOT = 5  # number of terms in √(d/a) for the effect of strain, the first being d/a
 
 
 NOTES = """Hemisphere of neo-Hookean rubber, W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², pressed
@@ -59,14 +59,14 @@ where the base has slid. force_error and pressure_error are the errors of N and 
 where the pressure is smooth (within 0.95 a), compared with other meshes, for d up to 0.35 a and θ
 up to 20°. Maximum and rms errors of the fit:
 {errors}"""
-# Errors determined from the results of tests/harness/solid_reference.py. A coarse mesh hardly
-# resolves the rim of a tilted bonded base.
+# Errors determined from the results of tests/harness/solid_reference.py. A coarse mesh barely
+# resolves the rim of a bonded base under tilt.
 FORCE_ERROR = 0.005
 PRESSURE_ERROR = {"bonded": 0.01, "lying": 0.004}
 
 
 class Change(NamedTuple):
-    """Effect of finite strain on presses at one θ and ν, as a function of d."""
+    """Effect of finite strain on presses at a single θ and ν, as a function of d."""
 
     s: FloatArray
     energy: FloatArray  # ratio to the linear energy, minus 1, shape (n,)
@@ -137,7 +137,7 @@ class Strain:
     """Effect of finite strain in one block, for any d, θ and ν."""
 
     def __init__(self, block: str, tilts: Mapping[int, FloatArray], folder: Path) -> None:
-        """Set up a block; ``tilts`` maps indices of `SINES` to the ν values of coarse presses."""
+        """Set up a block; ``tilts`` maps indices in `SINES` to the ν values of coarse presses."""
         fine, coarse = Meridian(16), Meridian(8, finer=2, widest=0.2)
 
         def of(name: str, poisson: float, mesh: Meridian, theta: float | None) -> Any:
@@ -166,7 +166,7 @@ class Strain:
         self.energy, self.shear, self.base, self.first = energy, shear, base, first
 
     def at(self, poisson: float) -> Callable[[float], tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return a function of sin²θ that gives the coefficients at one ν.
+        """Return a function that computes the coefficients at one ν from sin²θ.
 
         The coefficients describe the energy ratio, T/(N sin θ cos θ) and the base pressure.
         """
@@ -178,8 +178,8 @@ class Strain:
         rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
         first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
         shear, harmonics = through(self.sines, shears), through(self.sines, bases)
-        # At small tilts, the higher harmonics are very small. After division by sin^m θ, only mesh
-        # errors would remain.
+        # At small tilts, the higher harmonics are very small. Division by sin^m θ would leave only
+        # mesh errors.
         least = len(self.sines) > 1
         higher = through(self.sines[least:], bases[least:])
 

@@ -1,4 +1,4 @@
-"""Gymnasium environments with the simulated hand.
+"""Gymnasium environments for the simulated hand.
 
 Importing this package registers ``SoftFinger-Grasp-v0``, ``SoftFinger-Rotate-v0`` and
 ``SoftFinger-Push-v0``. The simulated hand is loaded when an environment is created, for example

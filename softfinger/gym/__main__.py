@@ -66,15 +66,15 @@ def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> float:
 
 
 def at_random(env: gymnasium.Env[Any, Any]) -> Policy:
-    """Return a policy that draws uniform random actions."""
+    """Return a policy that chooses actions uniformly at random."""
     return lambda _: env.action_space.sample()
 
 
 def by_law(observation: Observation) -> NDArray[np.float32]:
-    """Return the action that commands the target force and, in ``rotate``, the goal angle."""
+    """Return an action that commands the target force and, for ``rotate``, the goal angle."""
     least, most = FORCES
     goal = float(observation["goal"][0])
-    angle = goal / ANGLE if abs(goal) < ANGLE else 0.0  # A larger goal is a force [N].
+    angle = goal / ANGLE if abs(goal) < ANGLE else 0.0  # Larger goals are forces [N].
     return np.array([2.0 * (FORCE - least) / (most - least) - 1.0, angle], np.float32)
 
 

@@ -28,9 +28,9 @@ from softfinger.tools.sweep import Sweep, add_sweep
 SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, and episodes per sample
 STEPS = 200
 FEATURES = 5
-# Scale of the weights. An action of 1 means 1 rad/s, so small weights keep the joints slow.
+# Scale of the weights. An action of 1 means 1 rad/s, so small weights limit the joint speed.
 _WEIGHT_SCALE = 0.2
-_ADDED_STD = 0.2  # increase in standard deviation that avoids premature convergence
+_ADDED_STD = 0.2  # added to the standard deviation to avoid premature convergence
 
 Weights = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def policy(weights: Weights) -> Policy:
 
 
 def returns(seed: int, shaped: bool, weights: Weights) -> float:
-    """Compute the mean return of EPISODES episodes, whose seeds start at ``seed``."""
+    """Compute the mean return of EPISODES episodes with consecutive seeds from ``seed`` on."""
     env = SoftFingerEnv("grasp", shaped=shaped)
     limited = gymnasium.wrappers.TimeLimit(env, STEPS)
     try:

@@ -35,12 +35,12 @@ __all__ = ["Images", "SoftFingerEnv"]
 Observation = dict[str, NDArray[Any]]
 
 FORCE = 6.0  # target grip force [N]
-REACH = 0.02  # maximum joint goal change per step [rad]
-FORCES = 1.0, 12.0  # grip forces for the actions −1 and 1 [N]
-ANGLE = 0.25  # object angle for the action 1 [rad]
+REACH = 0.02  # maximum change in a joint goal per step [rad]
+FORCES = 1.0, 12.0  # grip forces for actions of −1 and 1 [N]
+ANGLE = 0.25  # object angle for an action of 1 [rad]
 WHITE = 50e3  # pressure shown as white (255) in images [Pa]
 LOST = 0.03  # displacement at which the object counts as lost [m]
-_START_D = 0.004  # tip displacement of the initial grip with joint goals [m]
+_START_D = 0.004  # tip displacement in the initial grip if actions are joint goals [m]
 _GRIP_TIMEOUT = 3.0  # timeout for the initial grip [s]
 _OBSERVATION_MAX = 200.0  # bound on every float observation, in SI units
 
@@ -59,7 +59,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
           the object along its faces for a limited time. The reward is exp(−s/2 mm), where s is the
           slip.
     control
-        - ``joints``: An action [2] between −1 and 1 moves the left and right joint goals by up to
+        - ``joints``: An action [2] between −1 and 1 changes the left and right joint goals by up to
           0.02 rad. Positive values close the fingers.
         - ``law``: The action sets the force (1 to 12 N) and object angle (−0.25 to 0.25 rad) for
           the built-in grip control law.
@@ -77,7 +77,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Notes
     -----
-    Observations are float32 in SI units unless noted. The left finger comes first:
+    Observations are float32 in SI units unless noted otherwise. The left finger comes first:
 
     - ``joints`` [6]: angles, velocities and currents,
     - ``contacts`` [6]: displacement d, tilt θ and force of each tip,
@@ -89,7 +89,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     - ``truth``: the object's x, y [m] and angle [rad],
     - ``fault``: the daemon's fault, or an empty string,
     - ``refused``: the reason why the daemon refused a command, or an empty string,
-    - ``is_success``: True if the error is below the reward's scale of 1 N, 0.05 rad or 2 mm.
+    - ``is_success``: True if e (or s) is below 1 N, 0.05 rad or 2 mm, depending on the task.
 
     References
     ----------
@@ -118,7 +118,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._window: Window | None = None
         self._pack_state, self._pack_truth = packer(STATE), packer(TRUTH)
-        # With joint goals, the fingers may press as hard as under the grip law.
+        # Joint goals may cause the same grip forces as the grip law.
         ours = ("loop.clock=virtual", "safety.current_move=1.2")
         file = None if profile is None else Path(profile)
         self._settings = load(file, changes=(*ours, *changes))
@@ -187,7 +187,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._settings.model_copy(update={"simulation": simulation.model_copy(update=drawn)})
 
     def _take_hold(self) -> None:
-        """Grip the object with the grip control law or with joint goals."""
+        """Grip the object, using either the grip control law or joint goals."""
         state = self._loop.state
         if self._by_law:
             self._command("grasp", force=FORCE)
@@ -293,7 +293,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         }
 
     def render(self) -> Image | None:
-        """Return the image of the last step if the mode is ``rgb_array``, otherwise None."""
+        """Return the image of the last step if the render mode is ``rgb_array``, otherwise None."""
         if self.render_mode != "rgb_array" or self._daemon is None:
             return None
         return self._picture()

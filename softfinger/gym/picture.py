@@ -1,8 +1,8 @@
 """Draw the simulated hand and its pressure maps as an RGB image, and display the image.
 
 The scene contains the same lines as the `softfinger view` page. The estimated object is green, and
-the true object is grey. The pressure maps are next to the scene, with the left finger's map above
-the right finger's map.
+the true object is grey. The pressure maps are next to the scene. The left finger's map is above the
+right finger's map.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ Image = NDArray[np.uint8]
 _SIDE, _MAP = 400, 150  # width of the scene and side length of a pressure map [pixels]
 HEIGHT, WIDTH = 2 * _MAP, _SIDE + _MAP
 _SCALE = 2100.0  # scale of the picture [pixels/m]
-_LOWEST = -0.012  # y of the scene's lower edge [m]
+_LOWEST = -0.012  # y coordinate of the lower edge of the scene [m]
 _THINNEST = 1.6  # pixels
 _BACKGROUND = 24
 
 
 class Painter:
-    """Painter for images of one hand."""
+    """Renderer for images of one hand."""
 
     def __init__(self, settings: Settings, full_scale: float) -> None:
-        """Create a painter; ``full_scale`` [counts] is shown in the brightest colour of a map."""
+        """Create a renderer; pressure maps show ``full_scale`` [counts] in the brightest colour."""
         self._settings = settings
         colours = np.array(colour_map(), np.uint8)
         self._colours, self._full = colours, full_scale / len(colours)
@@ -97,7 +97,7 @@ class Window:
             import tkinter
 
             self._root = tkinter.Tk()
-        except Exception as error:  # ImportError or TclError, which is defined in tkinter
+        except Exception as error:  # ImportError, or TclError from tkinter itself
             raise RuntimeError(
                 f"render_mode: found 'human', but no window can be opened: {error}; use a display "
                 "and a Python installation with tkinter, or render_mode 'rgb_array'"
@@ -107,7 +107,7 @@ class Window:
         tkinter.Label(self._root, image=self._photo).pack()
 
     def show(self, image: Image, period: float) -> None:
-        """Show an image ``period`` [s] after the last image, unless the window has been closed."""
+        """If the window is open, show an image ``period`` [s] after the previous image."""
         time.sleep(max(self._shown + period - time.monotonic(), 0.0))
         self._shown = time.monotonic()
         import tkinter

@@ -3,7 +3,8 @@
 The pytest fixtures `emulated_hand`, `virtual_hand` and `recorded_hand` are available in all test
 runs if softfinger is installed. The fixtures return objects of this package's classes. The classes
 also work as context managers without pytest. The conformance checks are intended for authors of
-backend plugins. Each name is imported on first access, so that other test runs do not load Numba.
+backend plugins. Each name is imported when it is first accessed, so that test runs without this kit
+do not load Numba.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Conformance checks for backend plugins.
 
-Each check takes the settings of a profile that uses the backend, for example
+The argument of each check contains the settings of a profile that uses the backend, for example
 ``check_tactile(load(Path("profile.toml")))``. The check creates the backend in the same way as the
-daemon does. A failed check raises AssertionError with the found and expected values.
+daemon. If a check fails, it raises AssertionError with the found and expected values.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ _POLL = 1e-3  # poll interval [s], equal to a control tick
 
 
 def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:
-    """Open each finger's tactile board twice, and check the given number of ``frames``.
+    """Open each finger's tactile board twice, and check ``frames`` frames each time.
 
-    ``patience`` [s] is the maximum waiting time. The check works without an object in the hand.
+    Each time, the check waits up to ``patience`` [s] for the frames. The check does not require an
+    object in the hand.
     """
     clock = make_clock(settings)
     for name in settings.scene.fingers:
@@ -77,8 +78,8 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
     """Connect to the servos twice, and read the servos each time.
 
     If ``torque`` is True, the check also switches the torque on at the current position, and then
-    off. While torque is on, the joints must not move by more than 0.05 rad. ``patience`` [s] limits
-    each waiting time.
+    off. While torque is on, the joints must not move by more than 0.05 rad. ``patience`` [s] is the
+    maximum duration of each wait.
     """
     servos = make_servos(settings, make_clock(settings), None)
     assert servos is not None, "servos.backend: found none, expected servos"
@@ -127,7 +128,7 @@ def _check_counters(backend: Servos | TactileSensor) -> None:
 
 
 def check_shape(settings: Settings) -> None:
-    """Check the properties of the object's shape against values computed from its corners."""
+    """Check the properties of the object's shape against values computed from the corners."""
     shape = shape_of(settings)
     assert isinstance(shape, Shape), f"found {type(shape).__name__}, expected a Shape"
     if shape.kind == DISC:

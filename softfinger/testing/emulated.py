@@ -26,11 +26,11 @@ from softfinger.tools.processes.emulate import emulator_process
 
 _SERVOS_MAX = 8
 _LOOK = 0.005  # interval between checks for changes made by another thread [s]
-_STALL = 0.5  # maximum pause of this process that the servos' clock includes [s]
+_STALL = 0.5  # maximum stall of this process that still counts as servo time [s]
 
 
 class EmulatedHand:
-    """Emulated hand in a `softfinger emulate` process that ends with this context.
+    """Emulated hand in a `softfinger emulate` process that this context starts and ends.
 
     The first start on a machine compiles kernels, which takes minutes.
 
@@ -83,7 +83,7 @@ class EmulatedHand:
         """Return the traffic on the servo bus and the true state of the hand.
 
         `softfinger help emulate` lists the fields. If ``forget`` is True, the recorded traffic is
-        then cleared.
+        cleared afterwards.
         """
         report: dict[str, Any] = json.loads(self.send("report forget" if forget else "report"))
         return report
@@ -110,7 +110,7 @@ def free_servos(
     t: float = 0.0,
     **options: Any,
 ) -> ServoBus:
-    """Create factory-new servos on free joints at time ``t`` [s]; ``counts`` are the positions.
+    """Create factory-new servos on free joints at time ``t`` [s]; ``counts`` are their positions.
 
     If ``for_daemon`` is True, the servos have the return delay and the mode that `softfinger run`
     expects.
@@ -141,7 +141,7 @@ class EmulatedBus:
     model, ids : model and IDs of the servos
     baud : if 0, the servos reply immediately at any baud rate; otherwise they reply only at this
         baud rate, with its transmission time
-    bus : your own servos instead, for example on another plant
+    bus : your own servos, used instead of new ones, for example on another plant
 
     Attributes
     ----------
@@ -169,11 +169,11 @@ class EmulatedBus:
 
     @property
     def port(self) -> str:
-        """Path of the serial port; the path changes when the port is plugged in again."""
+        """Path of the serial port, which changes when the port is plugged in again."""
         return self._terminal.path
 
     def call(self, job: Callable[[], Any]) -> Any:
-        """Run ``job`` between two packets on the bus, and return the result."""
+        """Run ``job`` between two packets on the bus, and return the result of ``job``."""
         with self._between_packets:
             return job()
 
@@ -217,7 +217,7 @@ class EmulatedBus:
                 self._terminal.service(self.now())
 
     def now(self) -> float:
-        """Return the servos' time [s], which is real time without long stalls of this process."""
+        """Return the servos' time [s], which is real time minus long stalls of this process."""
         seen, self._seen = self._seen, time.monotonic()
         self._origin += max(self._seen - seen - _STALL, 0.0)
         return self._seen - self._origin

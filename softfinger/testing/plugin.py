@@ -1,4 +1,4 @@
-"""Pytest fixtures of the test kit. The module imports little, because every test run loads it."""
+"""Pytest fixtures of the test kit, with few imports because every pytest run loads this module."""
 
 from __future__ import annotations
 

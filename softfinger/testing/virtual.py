@@ -42,11 +42,11 @@ _EVERYTHING = -1  # bit mask of all topics
 
 
 class RecordingOver(NoStream):
-    """Error raised at the end of the recording."""
+    """Error raised at the end of a recording."""
 
 
 class Tap(Link):
-    """Link that also passes published messages to ``take``, and queues its owner's requests."""
+    """Link that also passes published messages to ``take`` and queues requests from its owner."""
 
     def __init__(self, take: Callable[[bytes, dict[str, Any]], None]) -> None:
         super().__init__()
@@ -119,7 +119,7 @@ class VirtualSubscription(Subscription[Any]):
 
 
 class VirtualTimeHand(Hand):
-    """Base class of hands in virtual time, which advances only during calls.
+    """Base class for hands in virtual time, which advances only during method calls.
 
     All methods of `softfinger.Hand` work, so a program that uses a `Hand` runs unchanged and waits
     in virtual time. The method `run` is intended for controllers that are functions of the state.
@@ -144,7 +144,7 @@ class VirtualTimeHand(Hand):
 
     @property
     def address(self) -> str:
-        """Address for `Hand` or for the variable SOFTFINGER_ADDRESS while `serve` is active."""
+        """Address during `serve`, for `Hand` or for the environment variable SOFTFINGER_ADDRESS."""
         return f"{self.stream_address},{self.command_address}"
 
     def step(self) -> None:
@@ -171,8 +171,8 @@ class VirtualTimeHand(Hand):
         Returns
         -------
         list[Refused]
-            Refusals of the controller's commands. Refusals may be caused by events that occurred
-            after the controller's state.
+            Refusals of the controller's commands. A refusal may be due to an event that occurred
+            after the state was published.
 
         Raises
         ------
@@ -219,7 +219,7 @@ class VirtualTimeHand(Hand):
                 while not over.is_set():
                     self._step()
                     due = begin + (self.t - first) / speed
-                    # If the machine is late, delay the schedule instead of catching up.
+                    # If this thread falls behind, delay the schedule instead of catching up.
                     begin += max(time.monotonic() - due, 0.0)
                     over.wait(max(due - time.monotonic(), 0.0))
 
@@ -243,7 +243,7 @@ class VirtualTimeHand(Hand):
         return made
 
     def _select_topics(self) -> None:
-        """Select the topics of the open subscriptions, or all topics during a recording."""
+        """Select the topics of the open subscriptions, or all topics while recording."""
         self._subscriptions = [each for each in self._subscriptions if each.is_open]
         self._link.tapped = 0 if self._writer is None else _EVERYTHING
         for each in self._subscriptions:
@@ -269,10 +269,9 @@ class VirtualHand(VirtualTimeHand):
 
     Parameters
     ----------
-    profile : name or file of a profile with a simulated hand; None for the default settings
-    changes : settings to change, in the form of ``--set``
-    plant : settings that apply only to the simulated hand and are unknown to the daemon, in the
-        same form
+    profile : name or file of a profile with a simulated hand; None for the default settings changes
+    : settings to change, in the form of ``--set`` plant : settings, in the same form, that apply
+    only to the simulated hand and not to the daemon
 
     Attributes
     ----------
@@ -342,7 +341,7 @@ class VirtualHand(VirtualTimeHand):
 
     @contextlib.contextmanager
     def record(self, path: Path | str) -> Iterator[None]:
-        """Record all topics to a new file until the context ends (extra ``record``)."""
+        """Record all topics to a new file until the context ends; requires the extra ``record``."""
         self._writer = RecordingWriter(Path(path))
         for topic, message in self._link.kept():
             self._writer.add(topic, message)
@@ -373,13 +372,13 @@ def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
 
 
 class RecordedHand(VirtualTimeHand):
-    """Recording with the interface of a `Hand`, in virtual time; commands have no effect.
+    """Recording that behaves like a `Hand` in virtual time; commands have no effect.
 
     When the recording ends, iteration over a stream stops and `run` returns.
 
     Parameters
     ----------
-    path : a recording (extra ``record``)
+    path : a recording; requires the extra ``record``
 
     Attributes
     ----------
