@@ -121,7 +121,7 @@ SWITCHED_FAULTS = ("mirror", "replay")  # faults that are either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
-    """Invalid fault word. The message states the reason."""
+    """Invalid fault word. The error message states the reason."""
 
 
 class FaultEvent(NamedTuple):
@@ -149,7 +149,7 @@ class _Form(NamedTuple):
     """Group of fault types with the same syntax."""
 
     kinds: Collection[str]
-    value: str  # syntax of the value, in brackets if optional, or empty if not allowed
+    value: str  # syntax of the value, in brackets if optional, empty if no value is allowed
     parts: tuple[str, ...]  # affected parts if the word does not name a finger
     sided: bool = False  # True if the word may name a finger
 
@@ -163,7 +163,7 @@ class _Form(NamedTuple):
         )
 
     def bounds(self, kind: str) -> tuple[float, float]:
-        """Return the minimum and maximum value."""
+        """Return the minimum and maximum allowed values."""
         if kind in MEASUREMENT_FAULTS:
             return MEASUREMENT_FAULTS[kind][1:]
         return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
@@ -186,7 +186,7 @@ _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?
 
 
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
-    """Parse fault words and return the faults in order of time.
+    """Parse fault words and return the faults in chronological order.
 
     - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated`` and ``zero`` affect
       both boards. The prefix ``left:`` or ``right:`` selects one board; see :class:`TactileBoard`.
@@ -196,10 +196,11 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
     - ``unplug`` and ``plug`` affect the servo port, and ``left:unplug`` affects a board's port.
     - ``push=15`` and ``twist=0.3`` apply a permanent load to the object. 0 removes the load.
     - ``well`` ends all faults; ``left:well`` ends the faults of one finger's board and
-      measurements. Loads on the object remain.
+      measurements. ``well`` does not remove loads from the object.
 
     The suffix ``@START`` sets the start time [s]. With ``@START..END``, a measurement fault
-    increases linearly from START to END. Simultaneous faults keep their order.
+    increases linearly from START to END. Faults with the same start time stay in the order of their
+    words.
 
     Parameters
     ----------
@@ -322,7 +323,7 @@ class MeasurementFaults:
 
 
 def _shift(count: int, cells: float) -> FloatArray:
-    """Return the [count, count] matrix that shifts a signal by ``cells``, with interpolation."""
+    """Return the [count, count] matrix that shifts a signal by ``cells`` and interpolates."""
     places = np.arange(count)
     weights: FloatArray = np.maximum(1.0 - np.abs(places[:, None] - places - cells), 0.0)
     return weights

@@ -1,5 +1,5 @@
 """Implement `softfinger emulate`, which provides a simulated hand on pseudo-terminals.
 
-This package handles ports, transmission times, framing and injected faults. The `servo_model`
-package emulates the servos.
+This package manages the ports and simulates transmission times, framing and faults. The
+`servo_model` package emulates the servos.
 """

@@ -1,10 +1,10 @@
 """Emulate a hand in real time, with servos and tactile boards on pseudo-terminals.
 
 On a busy machine, the emulator and the daemon wait for each other (see `EmulatorClock`). If the
-daemon's ``loop.clock`` is ``real``, neither process waits.
+daemon's ``loop.clock`` is ``real``, neither process waits for the other.
 
 The event loop runs in a single thread and waits for incoming bytes or the next event. Each pass of
-the loop serves the servos first and then computes at most one physics step or frame.
+the loop first serves the servos and then computes at most one physics step or one tactile frame.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # maximum interval between physics updates [s]
-_REQUESTS = ("report", "forget", "place")  # words that are requests instead of faults
+_REQUESTS = ("report", "forget", "place")  # words that are requests rather than faults
 # Joint goals [rad]. A goal of 6 rad lies beyond the joint stops.
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
 _TURN_CURRENT = 0.3  # motor current that simulates a person turning a joint [A]
@@ -69,14 +69,14 @@ DEFAULT_BOARD = {
 
 
 class EmulatorError(SoftfingerError):
-    """Failure to set up the emulated hand. The message states the reason and a remedy."""
+    """Failure to set up the emulated hand. The error message states the reason and a remedy."""
 
 
 class EmulatorClock:
     """Clock that measures real time but excludes interruptions of the emulator process.
 
     If the clock counted interruptions, the emulator would have to simulate the missed time before
-    its next reply. A daemon whose clock can pause on a busy machine writes deadlines for the
+    its next reply. A daemon that can pause its clock on a busy machine sets deadlines for the
     emulator. While torque is on, the emulator clock and the daemon clock advance by the same amount
     from one deadline to the next. The emulator clock leads the daemon clock by at most
     `_AHEAD_TIME`.
@@ -128,14 +128,14 @@ class EmulatedServos:
     """Servo options that are not part of the settings."""
 
     baud: int = 0  # 0 to reply immediately at any baud rate
-    factory: bool = False  # True for factory defaults, except for IDs and baud rate
+    factory: bool = False  # True to use factory defaults, except for IDs and baud rate
     ids: tuple[int, ...] | None = None  # IDs that replace the configured IDs; duplicates allowed
 
 
 class Emulator:
-    """Emulated hand whose ports are linked in ``folder``. :meth:`run` serves the ports.
+    """Emulated hand; ``folder`` contains links to its ports, which :meth:`run` serves.
 
-    A finger that is not in the scene has no board. The ``none`` backend has no port.
+    A finger that is not in the scene has no tactile board. The ``none`` backends have no ports.
     """
 
     def __init__(
@@ -241,7 +241,7 @@ class Emulator:
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Serve the ports until :meth:`end` is called.
 
-        Call ``on_ready`` once, as soon as all sensors have a frame.
+        Call ``on_ready`` once, when every sensor has produced a frame.
         """
         ready = False
         while not self._stopping:
@@ -355,7 +355,7 @@ class Emulator:
         """Start the presses in ``text`` and return the reply.
 
         The reply is JSON, or ``error: `` and the reason. The JSON field ``wait`` is the time [s]
-        until the plates reach their last presses. If the text is empty, no press is started.
+        until all plates have reached their last presses. If the text is empty, no press is started.
         """
         now = self.clock.now()
         if text.strip():
@@ -378,11 +378,11 @@ class Emulator:
         self._sources[finger].stage = None
 
     def turn(self, words: Sequence[str]) -> str:
-        """Turn joints as if by hand, as requested by ``words`` such as ``left=closed``.
+        """Turn joints to the poses in ``words``, such as ``left=closed``, as a person would.
 
-        The poses are ``closed``, ``open`` and ``zero``; the first two are the joint stops. The
-        emulator holds the joints until a client writes to the servos. The reply has the same form
-        as that of :meth:`press`. If ``words`` is empty, no joint is turned.
+        The poses are ``zero`` and the two joint stops, ``closed`` and ``open``. The emulator holds
+        the joints in these poses until a client writes to the servos. :meth:`press` describes the
+        format of the reply. If ``words`` is empty, no joint is turned.
         """
         now = self.clock.now()
         turns = [word.partition("=") for word in words]
@@ -411,8 +411,8 @@ class Emulator:
     def report(self, t: float) -> dict[str, Any]:
         """Return the servo bus traffic and the true state of the hand.
 
-        Times are measured by the hand's clock [s]. ``monotonic`` is the machine's monotonic time at
-        ``t``, which other processes can compare with their own.
+        Times [s] refer to the hand's clock. ``monotonic`` is the machine's monotonic time at ``t``.
+        Other processes can compare ``monotonic`` with their own monotonic clocks.
         """
         servos = self._servos.bus.report(t) if self._servos is not None else []
         held = {"pose": self.hand.object_pose.tolist()}
@@ -440,7 +440,7 @@ class Emulator:
 
 
 def with_board(settings: Settings) -> Settings:
-    """Return settings that use `DEFAULT_BOARD` if the configured board has no encoder."""
+    """Return the settings, with `DEFAULT_BOARD` if the configured board has no encoder."""
     if settings.tactile.backend in (*ENCODERS, "none"):
         return settings
     tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})

@@ -33,14 +33,14 @@ _QUERY_INTERVAL = 0.1  # interval at which a client asks for the remaining time 
 
 
 class FolderError(SoftfingerError):
-    """Unusable folder. The message states the reason and a remedy."""
+    """Unusable folder. The error message states the reason and a remedy."""
 
 
 class LinkFolder:
     """Folder that an emulator locks and fills with links to its ptys.
 
-    The user must own the folder, and other users must not have write access. Links from a killed
-    emulator are replaced. Other files are never replaced.
+    The user must own the folder, and other users must not have write access. Links that a killed
+    emulator left behind are replaced. Other files are never replaced.
     """
 
     def __init__(self, path: Path) -> None:
@@ -118,7 +118,7 @@ class NoEmulator(SoftfingerError):
 class ControlPort:
     """Control socket ``folder``/control. The function ``handle`` returns the reply to a message.
 
-    For each readable key, the owner of ``selector`` must call the function ``key.data``.
+    The owner of ``selector`` must call ``key.data`` for each key that becomes readable.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class ControlPort:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with contextlib.suppress(FileNotFoundError):
-                # This process holds the folder lock, so any existing socket is from a killed
+                # This process holds the folder lock, so any existing socket was left by a killed
                 # emulator.
                 if not stat.S_ISSOCK(os.stat(_CONTROL, dir_fd=self._folder).st_mode):
                     raise FolderError(f"{folder / _CONTROL}: already exists; move it elsewhere")
@@ -185,7 +185,7 @@ class ControlPort:
 
 
 def carry_out(folder: Path, text: str) -> str:
-    """Send ``text`` to the emulator in ``folder``, wait until motions end, and return the reply.
+    """Send ``text`` to the emulator in ``folder``; return the reply when all motions have ended.
 
     The result is empty unless the text requests a report.
 
@@ -212,7 +212,7 @@ def carry_out(folder: Path, text: str) -> str:
 
 
 def send_words(folder: Path, text: str) -> str:
-    """Send ``text`` to the emulator in ``folder`` and return its reply.
+    """Send ``text`` to the emulator in ``folder`` and return the emulator's reply.
 
     Raises
     ------

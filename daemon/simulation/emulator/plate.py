@@ -38,14 +38,14 @@ _NUMBER = re.compile(r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)(.*)")
 
 
 class PlateError(SoftfingerError, ValueError):
-    """Invalid or impossible press. The message states the expected format or range."""
+    """Invalid or impossible press. The error message states the expected format or range."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlatePress:
     """One press of the plate, to the depth ``d`` [m] at the tilt ``theta`` [rad].
 
-    A ``pressure`` [Pa] above 0 replaces the contact by a uniform pressure on all cells. ``force``
+    A ``pressure`` [Pa] above 0 replaces the contact with a uniform pressure on all cells. ``force``
     [N] is the resulting force on the tip base. The press is held for ``hold`` [s]. If ``hold`` is
     infinite, the press lasts until the next command.
     """
@@ -71,12 +71,13 @@ class PlatePress:
 
 
 def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, list[PlatePress]]:
-    """Parse comma-separated presses such as ``tip=left depth=4mm tilt=10deg`` for each finger.
+    """Parse comma-separated presses such as ``tip=left depth=4mm``, and group them by finger.
 
-    Each press specifies a depth, a force, or a uniform pressure like that of a bladder. A depth of
-    0 lifts the plate off. The optional words are tilt, speed, hold and tip. The tip is left, right
-    or both (default). By default, the last press is held indefinitely, and each earlier press is
-    held for one second. The forces in ``table`` are multiplied by ``scale``. Raises PlateError.
+    Each press specifies a depth, a force, or a uniform pressure, as exerted by a bladder. A depth
+    of 0 lifts the plate off. The words ``tilt=``, ``speed=``, ``hold=`` and ``tip=`` are optional.
+    The tip is ``left``, ``right`` or, by default, ``both``. By default, the last press is held
+    indefinitely, and each earlier press is held for one second. The forces in ``table`` are
+    multiplied by ``scale``. Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
     each = [part.split() for part in text.split(",")]
@@ -143,7 +144,7 @@ class Plate:
         self._d = [-_CLEARANCE]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
-        ]  # press of each interval, and True if the plate is stationary
+        ]  # press of each interval, and whether the plate is stationary
         self._reported = -1
         self.arrives = 0.0  # time at which the plate reaches the last press
 

@@ -1,8 +1,8 @@
 """Provide an emulated servo bus on a pseudo-terminal.
 
-This module manages the terminal and the transmission times. A paced bus sends each reply when a
-real bus would deliver the reply's last byte. The delivery time includes the return delay and the
-transmission time at the client's baud rate. An unpaced bus replies immediately. Transmission times
+This module manages the terminal and simulates the transmission times. A paced bus sends each reply
+when a real bus would deliver the reply's last byte. The delivery time includes the return delay and
+the transmission time at the client's baud rate. An unpaced bus replies immediately. Delivery times
 are absolute, so delays of this process do not add up.
 """
 
@@ -25,15 +25,15 @@ _TCGETS2 = 0x802C542A  # termios2 fields: four flag words, line, 19 control char
 _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # one start bit, eight data bits and one stop bit
 _READ_SIZE = 4096
-_READS_PER_TURN = 4  # maximum number of reads per turn, to leave time for other tasks
+_READS_PER_TURN = 4  # maximum number of reads per service call, to leave time for other tasks
 # Duration of silence that ends a packet [s]. The parser's default of 1.5 ms would be too short
 # because this process may be delayed.
 _GAP_TIME = 0.02
 # Typical latency from a write to a pseudo-terminal until the reader wakes up [s]. A paced bus
 # simulates transmission times, so it subtracts this latency in both directions.
 PASSAGE_TIME = 15e-6
-# Maximum age of a reading when its reply is sent [s]. If slightly older readings are accepted, the
-# physics can be computed between exchanges. Real servos also measure at their own intervals.
+# Maximum age of a reading at the time of the reply [s]. An age above 0 allows the emulator to
+# compute the physics between exchanges. Real servos also measure at their own intervals.
 _LAG_TIME = 0.0005
 
 
@@ -133,7 +133,7 @@ class PtyServoBus:
 
     @property
     def answering_until(self) -> float:
-        """Arrival time [s] of the last reply, excluding replies delayed by a fault."""
+        """Arrival time [s] of the last reply that was not delayed by a fault."""
         return self._arrives
 
     def driven(self) -> bool:

@@ -40,10 +40,10 @@ class FrameSource(Protocol):
 
 
 class FrameWriter:
-    """Board end of a pty. Frames are sent completely or not at all.
+    """The board's end of a pty. Frames are sent completely or not at all.
 
     A pty buffers tens of kilobytes. If no client reads, frames are dropped long before this buffer
-    is full, so the next client receives no old frames.
+    is full. The next client therefore receives no old frames.
     """
 
     def __init__(self) -> None:
@@ -66,7 +66,7 @@ class FrameWriter:
         return True
 
     def flush(self) -> bool:
-        """Write the unsent part of the last frame and return True if nothing remains."""
+        """Write the unsent part of the last frame, and return True if no bytes remain."""
         if self._remaining:
             with contextlib.suppress(BlockingIOError):
                 self._remaining = self._remaining[os.write(self._master, self._remaining) :]
@@ -97,7 +97,7 @@ class TactileBoard:
     to its probability:
 
     - ``torn``: a sequence of bytes is missing from a frame.
-    - ``noisy``: random bytes precede a frame, and one of its bytes is wrong.
+    - ``noisy``: random bytes precede a frame, and one byte of the frame is wrong.
     - ``silent``: the board sends no frames.
     - ``frozen``: the board repeats its last frame.
     - ``wrong-size``: the grid has half as many rows and columns.
@@ -154,7 +154,7 @@ class TactileBoard:
 
     @property
     def dropped(self) -> int:
-        """Number of frames dropped because no client read them in time."""
+        """Number of frames dropped because no client read the frames in time."""
         return self._writer.dropped
 
     def fileno(self) -> int:
@@ -232,7 +232,7 @@ class Encoder:
 
 
 def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.0) -> bytes:
-    """Encode a frame as ``AA 55`` and one byte per cell, row by row; counts above 255 saturate."""
+    """Encode a frame as ``AA 55`` and one byte per cell, row by row. Counts above 255 saturate."""
     return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
 
 
@@ -241,9 +241,9 @@ def encode_glove(
 ) -> bytes:
     """Encode a frame of a glove-style board as a scan number, the counts and a newline.
 
-    Each count is split into a high half and a low half. A half ranges from 0 to ``values`` − 1,
-    where ``values`` is 32, or 64 with a 12-bit converter. The scan number and the halves are offset
-    by 11. Counts that are too large saturate.
+    Each count is split into a high half and a low half. A half ranges from 0 to ``values`` − 1.
+    ``values`` is 64 for boards with a 12-bit converter and 32 for other boards. The scan number and
+    the halves are offset by 11. Counts that are too large saturate.
     """
     counts = np.minimum(counts, values * values - 1)
     halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)
@@ -251,7 +251,7 @@ def encode_glove(
 
 
 def encoder_for(backend: str, full_count: int) -> Encoder:
-    """Return the encoder of a backend's board, whose maximum count is ``full_count``."""
+    """Return the encoder for a backend's board; ``full_count`` is the board's maximum count."""
     if backend == "glove" and 1023 < full_count <= 4095:
         return Encoder(partial(encode_glove, values=64), b"a")
     return ENCODERS[backend]

@@ -15,9 +15,9 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Plant
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth undamped steps
-# Relative rounding error of the energy. The error is large because d is a small difference between
-# two lengths.
+LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth steps of undamped tips
+# Relative rounding error of the energy. The error is large because d is the small difference
+# between two larger lengths.
 _ROUNDING = 3e-13
 HALVINGS = 12  # maximum number of times that a step is halved
 
@@ -70,7 +70,7 @@ def is_on_rim(plant: Plant) -> bool:
 
 @inner_kernel
 def open_guard(plant: Plant) -> None:
-    """Accept the current energy if code outside the integrator has changed the state."""
+    """Accept the new energy if code outside the integrator has changed the state."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy
@@ -79,7 +79,7 @@ def open_guard(plant: Plant) -> None:
 
 @inner_kernel
 def work_done(plant: Plant) -> float:
-    """Return an upper bound for the work [J] done by motors and loads in the current step."""
+    """Return an upper bound on the work [J] that motors and loads do in the present step."""
     before, now = plant.last_state, plant.state
     work = 0.0
     for j in range(5):
@@ -152,7 +152,7 @@ def shorten(plant: Plant, scale: float) -> None:
 
 @inner_kernel
 def is_within_limit(plant: Plant) -> bool:
-    """Return True if the elastic and gravitational energy is within the limit."""
+    """Return True if the sum of elastic and gravitational energy is within the limit."""
     energy = elastic_energy(plant) + weight_energy(plant)
     return bool(energy <= plant.energy_limit + work_done(plant))
 

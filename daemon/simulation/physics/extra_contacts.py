@@ -13,9 +13,9 @@ The tips are equal hemispheres and meet in the plane midway between their centre
 compressed as if by a rigid plane. If the centres are a distance D apart, the compression is d = a −
 D/2. The total energy of both tips is U(d, θ1, d_t1) + U(d, θ2, d_t2), which equals 2 U(d, θ) for
 symmetric fingers. If the tilts differ, a real contact surface bulges towards the softer tip. The
-modelled energy is then too high by a term of second order in the difference of cos² θ. Both tips
-stick equally to the contact plane. Each tip's shear rate is half the sliding velocity between the
-two surfaces, minus the tip's tan θ ḋ.
+modelled energy is then too high by a second-order term in the difference between the tips' cos² θ.
+Both tips stick equally to the contact plane. Each tip's shear rate is half the sliding velocity
+between the two surfaces, minus the tip's tan θ ḋ.
 """
 
 from __future__ import annotations

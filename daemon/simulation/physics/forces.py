@@ -1,4 +1,4 @@
-"""Compute the forces of motors, weight, loads, friction and end stops.
+"""Compute the forces due to motors, weight, loads, friction and end stops.
 
 The modules `tip` and `extra_contacts` compute the contact forces.
 """
@@ -54,9 +54,9 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 def set_motor_slopes(plant: Plant, g: float) -> None:
     """Set the derivatives of the motor torques with respect to joint angle and velocity.
 
-    The derivatives are divided by τ + g, where τ is the time constant of the current. A derivative
-    is 0 unless the motor is stiff at the step size ``g``. The derivatives are upper bounds, because
-    the current may enter or leave its limits within the step.
+    The derivatives are divided by τ + g, where τ is the time constant of the current. The
+    derivatives are 0 if their effect over the step size ``g`` is negligible. The derivatives are
+    upper bounds, because the current may reach or leave its limits during the step.
     """
     p, goals = plant.parameters, plant.goals
     constant = p.torque_constant
@@ -77,7 +77,7 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def joint_stiffness(plant: Plant, joint: int) -> float:
-    """Return the stiffness [N·m/rad] of a joint's bristles and of an end stop within reach."""
+    """Return the stiffness [N·m/rad] of a joint's bristles and of any end stop it may touch."""
     p = plant.parameters
     stiffness: float = plant.gears[joint].stiffness
     q = plant.state.position[joint]
@@ -89,7 +89,7 @@ def joint_stiffness(plant: Plant, joint: int) -> float:
 
 @inner_kernel
 def free_object(plant: Plant, now: Motion) -> None:
-    """Set the forces on the object that result from weight, loads and table friction."""
+    """Set the forces on the object that are due to weight, loads and table friction."""
     p, load = plant.parameters, plant.goals.load
     vx = now.velocity[2]
     vy = now.velocity[3]
@@ -108,9 +108,8 @@ def free_object(plant: Plant, now: Motion) -> None:
 def friction_level(plant: Plant, finger: int, rate: float, current: float) -> float:
     """Return the friction torque [N·m] at which a joint slips.
 
-    The base, Stribeck and load terms are those of Rhoban's model M4, which was identified for
-    similar servos (arXiv 2410.08650). The load term is proportional to the gear torque, |external −
-    motor|.
+    The base, Stribeck and load terms are from Rhoban's model M4, which was identified for similar
+    servos (arXiv 2410.08650). The load term is proportional to the gear torque, |external − motor|.
     """
     p = plant.parameters
     still = math.exp(-abs(rate) / p.stribeck_speed)
@@ -131,11 +130,11 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
 
         torque = f z/z_p    ż = q̇ while |z| ≤ z_p
 
-    A load below f deforms the bristles only elastically and therefore never causes drift, even if
-    it oscillates. The number of bristles is proportional to f. New bristles are undeflected, and
-    the energy of removed bristles is lost, so a change in f never adds energy. On average, new
-    bristles are added halfway through the step. A stuck joint has half the critical damping. The
-    sum of bristle torque and damping torque is limited to f.
+    A load below f, even an oscillating load, deforms the bristles only elastically and therefore
+    never causes drift. The number of bristles is proportional to f. New bristles are undeflected,
+    and the energy of removed bristles is lost. A change in f therefore never adds energy. On
+    average, new bristles are added halfway through the step. A stuck joint has half the critical
+    damping. The sum of bristle torque and damping torque is limited to f.
     """
     p, gears = plant.parameters, plant.gears[finger]
     rate = now.velocity[finger]

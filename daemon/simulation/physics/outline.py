@@ -1,4 +1,4 @@
-"""Compute where a tip, or the rim of its backing plate, touches the object.
+"""Compute the point at which a tip, or the rim of its backing plate, touches the object.
 
 The object is a rigid convex polygon or a disc.
 """
@@ -10,7 +10,7 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import DISC, Parameters, TipContact
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-FACE = -1.0  # value that marks a plane face in place of a curvature radius
+FACE = -1.0  # curvature radius that denotes a flat face
 _DISTANCE_MIN = 1e-12  # m
 
 
@@ -18,10 +18,10 @@ _DISTANCE_MIN = 1e-12  # m
 def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
     """Return the direction, distance and curvature radius of the outline point nearest to (u, v).
 
-    The point (u, v) is given in the object's frame. For an outside point, the direction points to
-    the nearest point of the outline. For an inside point, the distance to the nearest face is
-    negative, and the direction is the inward normal of that face. The curvature radius is 0 at a
-    corner, ``FACE`` on a face, and the disc radius on a disc.
+    The point (u, v) is given in the object's frame. If (u, v) is outside the object, the direction
+    points to the nearest point of the outline. If (u, v) is inside, the direction is the inward
+    normal of the nearest face, and the distance is negative. The curvature radius is 0 at a corner,
+    ``FACE`` on a face, and the disc radius on a disc.
     """
     if p.shape == DISC:
         away = max(math.sqrt(u * u + v * v), _DISTANCE_MIN)
@@ -65,9 +65,9 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
 def rim_on_plane(p: Parameters, tip: TipContact) -> float:
     """Evaluate both ends of the rim on a plane and return the larger depth [m].
 
-    The depths of the two ends are d − a(1 ∓ sin θ). A gap has a negative depth. Each end has its
-    own spring, so energy and forces are smooth even if the plate lies flat on the face. If the rim
-    is in contact, this function sets the rim energy and its derivatives.
+    The depths of the two ends are d − a(1 ∓ sin θ). The depth is negative if there is a gap. Each
+    end has its own spring, so energy and forces are smooth even if the plate lies flat on the face.
+    If the rim is in contact, this function sets the rim energy and its derivatives.
     """
     d = tip.d
     sine = tip.sine
@@ -88,7 +88,7 @@ def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
     """Evaluate the rim on a disc as in :func:`rim_on_plane`, but with a single spring.
 
     ``away`` is the distance between the disc centre and the tip centre. The depth is the disc
-    radius minus the distance from the disc centre to the rim's chord, and varies smoothly.
+    radius minus the distance from the disc centre to the rim's chord.
     """
     across = away * tip.sine
     up = away * tip.cosine

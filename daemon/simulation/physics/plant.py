@@ -6,12 +6,12 @@ motor currents:
 
     (1 − γhA) k1 = f(y)    (1 − γhA) k2 = f(y + h k1) − 2 k1    y ← y + h (3 k1 + k2)/2
 
-The method is of second order for any matrix A, and L-stable if A is the Jacobian. Here, A contains
-only the stiff terms: contacts with their damping, end stops, gear bristles, table friction (as a
-secant), motor lag and servo loops. Only the five accelerations are coupled, so a step requires one
-5 × 5 factorisation. The tips are evaluated twice per step. To model Coulomb slip, shears and
-bristles are limited at the start of each step. At the end of each step, the energy guard checks the
-energy.
+The method is second-order accurate for any matrix A, and L-stable if A is the Jacobian. Here, A
+contains only the stiff terms, which describe contact stiffness, contact damping, end stops, gear
+bristles, motor lag and servo loops. Table friction enters A as a secant. Only the five
+accelerations are coupled, so a step requires one 5 × 5 factorisation. The contact forces of the
+tips are evaluated twice per step. To model Coulomb slip, shears and bristles are limited at the
+start of each step. At the end of each step, the energy guard checks the energy.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
 
 @inner_kernel
 def settle(plant: Plant, ring: Records[Sample]) -> None:
-    """Take all samples that are due, then store the current tip contacts."""
+    """Take all samples that are due, and then store the present tip contacts."""
     p, stage = plant.parameters, plant.stages[0]
     while plant.sample_count * p.sample_period <= plant.step_count * p.step:
         take_sample(plant, ring)
@@ -283,8 +283,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
-    # An array argument costs a reference count update per call, so the other kernels receive a
-    # single record.
+    # Each array argument costs a reference-count update per call. The other kernels therefore
+    # receive a single record.
     data = tables[0]
     h = p.step
     g = _GAMMA * h

@@ -85,7 +85,7 @@ class Parameters(Record):
     scale: float  # ratio of the real modulus to the modulus of the contact table
     friction: float
     loss: float  # ratio of damping to stiffness [s]
-    shear_stiffness: float  # ratio of the shear stiffness to that in the spring model
+    shear_stiffness: float  # ratio of the shear stiffness to the spring model's shear stiffness
     shear_coupling: float  # 1 if d_t is coupled with d and θ (springs), else 0 (bristles)
     creep: float  # fraction of the shear that relaxes per sub-step while the tip sticks
     micro_slip: bool  # True if the edge of the footprint slips first
@@ -102,7 +102,7 @@ class Parameters(Record):
     half_width: float  # [m]
     half_height: float  # [m]
     roundness: float  # radius of a disc [m]
-    factor: float  # stiffness of a tip on the object relative to that on a plane
+    factor: float  # stiffness of a tip on the object relative to its stiffness on a plane
     extent: float  # maximum distance from the object centre to the outline [m]
     corners: int  # number of corners in ``outline``
     outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
@@ -119,7 +119,7 @@ class Parameters(Record):
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
     stribeck: float  # additional friction at standstill [N·m]
-    load_friction: Pair  # ratio of friction to gear torque, and its increase at standstill
+    load_friction: Pair  # ratio of friction to gear torque, and the ratio's increase at standstill
     stribeck_speed: float  # speed at which the additional friction has decreased to 1/e [rad/s]
     presliding: float  # bristle deflection at which the gears slip [rad]
     torque_constant: float  # [N·m/A]
@@ -174,7 +174,7 @@ class Gears(Record):
 
 
 class TipContact(Record):
-    """Contact of one tip with the object or the other tip.
+    """Contact of one tip with the object or with the other tip.
 
     The rows of the matrices are d, θ and d_t. The columns are q, x, y and φ. For a tip-to-tip
     contact, the columns are q1 and q2.

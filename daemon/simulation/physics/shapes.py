@@ -28,7 +28,7 @@ class Shape:
     """Outline of an object whose centre of mass is at the origin. Lengths are in m."""
 
     kind: int  # shape constant from plant_state
-    corners: FloatArray  # counter-clockwise [n, 2]; for a disc, corners of the bounding square
+    corners: FloatArray  # corners [n, 2], counter-clockwise; a disc uses its bounding square
     roundness: float  # radius of a disc, or 0 for other shapes
     gyration: float  # radius of gyration
     mean_radius: float  # mean distance of the shape's points from the centre
@@ -50,7 +50,7 @@ class Shape:
         return float(0.5 * (max(across) - min(across)))
 
     def edges(self) -> FloatArray:
-        """Return the edges [n, 5] with the columns start x, y, outward normal x, y, and length."""
+        """Return the edges [n, 5]: start point (x, y), outward normal (x, y) and length."""
         edge = np.roll(self.corners, -1, axis=0) - self.corners
         length = np.hypot(*edge.T)
         normal = np.stack((edge[:, 1], -edge[:, 0]), axis=1) / length[:, None]
@@ -106,7 +106,7 @@ def rectangle(simulation: SimulationSettings) -> Shape:
 def wedge(simulation: SimulationSettings) -> Shape:
     """Create a wedge whose faces are tilted by half the configured taper.
 
-    The width is measured at mid-height. Raises ValueError if the faces meet.
+    The width is measured at mid-height. Raises ValueError if the faces would meet.
     """
     leaning = 0.5 * simulation.object_height * math.tan(0.5 * simulation.object_taper)
     width = simulation.object_width

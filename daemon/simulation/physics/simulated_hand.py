@@ -2,7 +2,7 @@
 
 Only :meth:`SimulatedHand.advance` advances time. The state depends only on the settings, the
 commands and their times, so runs are reproducible bit for bit. Physical constants that are not
-settings have plausible values without a published source.
+settings have plausible values, but no published source.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ class SimulatedHand:
     to the test bench, as in a compression test. If ``settings.servos.backend`` is ``none``, the
     joints stay at ``settings.hand.open_angle``. With this backend, a
     ``simulation.compression_speed`` above 0 moves the object back and forth between the tips. The
-    object compresses each tip by 0.4 tip radii.
+    object compresses each tip by 0.4 times the tip radius.
 
     The array attributes are views of the state. Arrays of shape (2,) contain the value of the left
     finger first. The views are valid until the next call to ``advance``.
@@ -320,7 +320,7 @@ class SimulatedHand:
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
     ) -> None:
-        """Set a servo's mode, torque, goal angle [rad] and goal current [A].
+        """Set a servo's mode, goal angle [rad] and goal current [A]; switch its torque on or off.
 
         The Dynamixel mode numbers are 0 (current), 3 (position) and 5 (current-based position).
         Raises ValueError for another mode or a non-finite goal.
@@ -335,7 +335,7 @@ class SimulatedHand:
         self._goal_current[joint] = goal_current
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
-        """Set a servo's position gains and its voltage limit (fraction of the supply voltage)."""
+        """Set a servo's position gains and its voltage limit, a fraction of the supply voltage."""
         goals = self.plant.goals
         goals.stiffness[joint], goals.damping[joint] = stiffness, damping
         goals.duty[joint] = duty

@@ -47,7 +47,7 @@ def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract g K r from the load; K is the first-stage stiffness, r the rates in ``k``."""
+    """Subtract g K r from the load. K is the first-stage stiffness; r are the rates in ``k``."""
     for finger in range(2):
         tip = plant.stages[0].on_object[finger]
         rows, stiffness = tip.rows, tip.stiffness
@@ -62,7 +62,7 @@ def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def factorise(plant: Plant, g: float) -> None:
-    """Factorise the first-stage matrix M + gD + g²K of the five coordinates."""
+    """Factorise the first-stage matrix M + gD + g²K for the five coordinates."""
     p = plant.parameters
     full = plant.factors.lower
     for i in range(5):
@@ -137,7 +137,7 @@ def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Subtract g K r of the extra rows from the load; r are the rates in ``k``."""
+    """Subtract the extra rows' g K r from the load; r are the rates in ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.stiffness == 0.0:

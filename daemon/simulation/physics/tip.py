@@ -1,25 +1,25 @@
-"""Compute the contact forces of a soft tip on the object.
+"""Compute the contact forces between a soft tip and the object.
 
 All elastic forces are derived from a single energy U, so a contact can't create energy:
 
     U = w(θ) κ [ U₀(d, θ) + F(d, θ) (sin θ d_t + s cos θ d_t²/d) ] + U_rim(d, θ)
 
-The contact table contains the energy U₀ and the force F on a plane face. For a constant modulus E,
-F = πEd²/cos θ. For other materials, F contains the effective modulus of the material. The factor s
-is ``tip_shear_stiffness``. For constant E and s = 1, the second term is πE(d² d_t tan θ + d d_t²).
-This term is the tangential energy of the parallel-distributed model. The factor w(θ) is 1 on the
-soft hemisphere and fades to 0 towards the side of the finger. U_rim is the energy of a stiff spring
-between the rim of the backing plate and the object. A plane reaches the rim at d = a(1 − |sin θ|),
-which is the end of the soft range. Slightly before the rim, beyond d = a(1 − √(sin² θ + 0.03²)), U₀
-is linear in d, and F is constant.
+The contact table contains the energy U₀ and the force F on a flat face. For a constant modulus E,
+the force is F = πEd²/cos θ. For other materials, F contains the effective modulus of the material.
+The factor s is ``tip_shear_stiffness``. For constant E and s = 1, the second term is πE(d² d_t tan
+θ + d d_t²). This term is the tangential energy of the parallel-distributed model. The factor w(θ)
+is 1 on the soft hemisphere and decreases to 0 towards the side of the finger. U_rim is the energy
+of a stiff spring between the rim of the backing plate and the object. A plane reaches the rim at
+the end of the soft range, d = a(1 − |sin θ|). The depth d = a(1 − √(sin² θ + 0.03²)) is slightly
+before the rim. Beyond this depth, U₀ is linear in d, and F is constant.
 
 These formulas are the contact law for ``simulation.tip_law = "springs"``. The law ``"bristles"``
-omits the term sin θ d_t. The tangential force of the bristle law is T = 2 s F cos θ d_t/d, or 2πE s
-d d_t for a constant E. A bristle at the centre of the contact exerts the tangential force. Tilt and
-compression do not bend the bristle. The bristle's deflection d_t changes only when the surfaces
-slide at the centre of the contact. The upright force, the force at d_t = 0 and the sensor readings
-are the same for both laws. A controller that compensates for the tangential terms of springs can be
-tested on a ``"bristles"`` tip, which lacks these terms.
+omits the term sin θ d_t. The tangential force of the bristle law is T = 2 s F cos θ d_t/d. For a
+constant E, T = 2πE s d d_t. A bristle at the centre of the contact exerts the tangential force.
+Tilt and compression do not bend the bristle. The bristle's deflection d_t changes only when the
+surfaces slide at the centre of the contact. The force at θ = 0, the force at d_t = 0 and the sensor
+readings are the same for both laws. A controller that compensates for the tangential terms of
+springs can be tested on a ``"bristles"`` tip, which lacks these terms.
 
 The tip touches the nearest point of the object. On a face, the contact direction is the face
 normal. At a corner, the contact direction is the line to the corner. The corner acts like a plane
@@ -27,19 +27,19 @@ that is normal to the contact direction. On a disc, the contact direction is the
 centre. A disc is a cylinder of radius R whose axis is normal to the hand plane. To leading order in
 d, a contact with a disc differs in two ways from a contact with its tangent plane. First, the
 curvatures add up to 1/a + 1/R, so the footprint is narrower along the tilt by the factor κ = √(R/(R
-+ a)). Second, at any θ, the force and energy are κ times those on the plane. Numerical integrals
-over the springs confirm the factors for a constant modulus, a = 20 mm and d up to 8 mm. For R = 20
-and 40 mm, the error is at most 1.6 % upright and 4.5 % at 30°. For R = 10 mm, the error is at most
-3 % upright and 9 % at 30°. The sensor frame is computed directly from the springs
-(`sensor.sensor_model`). Therefore, the sum of its cells differs from the force by the error of the
-factors. For small d, the force of a solid tip on a disc is proportional to √κ d^(3/2), as in
-Hertz's theory for a sphere on a cylinder. A solid tip's frame on a disc is its frame on a plane
-multiplied by √κ.
++ a)). Second, at any θ, the force and energy are κ times the force and energy on the plane.
+Numerical integrals over the springs confirm the factors for a constant modulus, a = 20 mm and d up
+to 8 mm. For R = 20 and 40 mm, the error is at most 1.6 % at θ = 0 and 4.5 % at θ = 30°. For R = 10
+mm, the error is at most 3 % at θ = 0 and 9 % at θ = 30°. `sensor.sensor_model` computes the sensor
+frame directly from the springs. Therefore, the sum of the frame's cells differs from the force by
+the error of the factors. For small d, the force of a solid tip on a disc is proportional to √κ
+d^(3/2), as in Hertz's theory for a sphere on a cylinder. The frame of a solid tip on a disc is √κ
+times the frame of the tip on a plane.
 
 Coulomb friction limits d_t to the range between the two shears at which |T| = μN. The ratio |T|/N
 has a maximum, which is 1 for constant E, s = 1 and θ = 0. If the maximum of |T|/N is below μ, the
 tip slips at this maximum. Damping is viscous and proportional to the stiffness of the soft part, so
-it increases as the contact grows.
+damping increases as the contact grows.
 
 Creep and micro-slip, which are off by default, relax the shear of a stuck tip. Without creep and
 micro-slip, a tip sticks or slips as a whole and has no memory. Micro-slip occurs because each
@@ -138,9 +138,9 @@ def clear_contact(tip: TipContact) -> None:
 def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) -> None:
     """Compute the forces, stiffness and damping of ``tip`` along d, θ and d_t.
 
-    ζ is the shear d_t, and v is its variance. The factors are γ = ``gain`` = w(θ) κ, ρ = ``ratio``
-    = s cos θ/d, and χ = ``shear_coupling``, which is 1 for springs and 0 for bristles. Within the
-    soft range:
+    ζ is the shear d_t, and v is the variance of the layer shears. The factors are γ = ``gain`` =
+    w(θ) κ, ρ = ``ratio`` = s cos θ/d, and χ = ``shear_coupling``, which is 1 for springs and 0 for
+    bristles. Within the soft range:
 
         T = t0 + t1 ζ             t0 = χ γ F sin θ,  t1 = 2 γ F ρ
         N = n0 + n1 ζ + n2 ζ²     n0 = γ ∂U₀/∂d − χ t0 tan θ + ∂U_rim/∂d
@@ -229,7 +229,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # shear at which T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # Two comparisons detect contacts that are far from slipping, as in most steps.
+        # Two comparisons detect contacts that are far from slipping, which is the usual case.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction
@@ -298,7 +298,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
 
 @inner_kernel
 def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: float) -> None:
-    """Set row ``r`` to the derivatives with respect to (q, x, y, φ)."""
+    """Set row ``r`` of the Jacobian to the derivatives with respect to (q, x, y, φ)."""
     tip.rows[r, 0] = q
     tip.rows[r, 1] = x
     tip.rows[r, 2] = y
@@ -309,8 +309,8 @@ def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: flo
 def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
     """Add the rim stiffness to a tip whose rim may touch the object in this step.
 
-    The row of the rim depth is at most the d row plus a times the θ row. Therefore, doubling the
-    stiffness along each row gives an upper bound.
+    The gradient of the rim depth is at most the gradient of d plus the radius times the gradient of
+    θ. Therefore, doubling the stiffness along d and θ gives an upper bound.
     """
     hard = 2.0 * p.rim_stiffness
     tip.stiffness[ALONG_D] += hard

@@ -1,15 +1,15 @@
 """Convert a simulated contact to the counts that a sensor board sends.
 
-`simulated_tactile` handles delayed and lost frames. The sensor imperfections follow standard
-models.
+`simulated_tactile` handles delayed and lost frames. Standard models describe the sensor
+imperfections.
 
-This module computes the pressure of a cylindrical face, such as that of a disc.
-`sensing.pressure_grid` computes the pressure of a plane face. Both modules model the tip as
-vertical springs that the face compresses. The length of a spring is the height of the hemisphere
-above the foot of the spring. An estimator that assumes a plane face underestimates d on a disc,
-because the footprint is narrower. The estimated d is 0.72 times the true d for a disc radius R = a,
-and 0.83 times for R = 2a. The estimated θ is 1 % to 12 % too small, and this error increases with
-d. The estimated gain is above 1 and compensates for the underestimated force.
+This module computes the pressure that a cylindrical face, such as the side of a disc, exerts on the
+cells. `sensing.pressure_grid` computes the pressure that a flat face exerts. Both modules model the
+tip as vertical springs that the face compresses. The length of a spring is the height of the
+hemisphere above the foot of the spring. An estimator that assumes a flat face underestimates d on a
+disc, because the footprint is narrower. The ratio of the estimated d to the true d is 0.72 for a
+disc of radius R = a and 0.83 for R = 2a. The estimated θ is 1 % to 12 % too small, and this error
+increases with d. The estimated gain is above 1 and compensates for the underestimated force.
 """
 
 from __future__ import annotations
@@ -176,8 +176,8 @@ class SensorModel:
         """Sample positions across the cylinder axis, hemisphere heights [m], and weights.
 
         The position and height arrays have the shape [lines, points per line]. The height is 0
-        beyond the rim. The third and fourth arrays contain the weights for averaging over a cell
-        along y and along x.
+        beyond the rim. The third array contains the weights for averaging over a cell along y. The
+        fourth array contains the weights for averaging along x.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -191,7 +191,8 @@ class SensorModel:
         """Return the pressure [Pa] on each cell due to a cylinder of radius R = ``roundness`` [m].
 
         The normal (n_x, n_y, …) points from the tip centre to the cylinder axis. The distance to
-        the axis is a − d + R. With the coordinate p across the axis:
+        the axis is a − d + R. At the coordinate p across the axis, the face has the height z and
+        the strain is ε:
 
             z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
 
@@ -220,7 +221,7 @@ class SensorModel:
     def read(
         self, out: NDArray[np.uint16], faults: MeasurementFaults | None = None, t: float = 0.0
     ) -> None:
-        """Write the cell counts to ``out``, including the ``faults`` active at ``t`` [s]."""
+        """Apply the ``faults`` active at ``t`` [s], and write the cell counts to ``out``."""
         flaws = self._flaws
         felt = self._pressure
         if flaws.tactile_exponent != 1.0 or flaws.tactile_fold > 0.0:
@@ -252,12 +253,12 @@ class SensorModel:
 def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
     """Apply hysteresis, which makes cells read higher during unloading than during loading.
 
-    This is a Prandtl-Ishlinskii model. The output of a cell is the mean of PLAY_COUNT generalised
-    play operators, whose states are ``state`` [PLAY_COUNT, rows, cols]. At the pressure p, the
-    state of operator k is limited to the range from p to (1 + h_k) p. The widths h_k are evenly
-    spaced between 0 and 2·excess. Therefore, the output is p during loading and at most (1 +
-    excess) p during unloading. Hysteresis loops are closed, and smaller loops lie inside larger
-    loops. Zero pressure always reads 0.
+    The hysteresis is described by a Prandtl-Ishlinskii model. The output of a cell is the mean of
+    PLAY_COUNT generalised play operators, whose states are ``state`` [PLAY_COUNT, rows, cols]. At
+    the pressure p, the state of operator k is limited to the range from p to (1 + h_k) p. The
+    widths h_k are evenly spaced between 0 and 2·excess. Therefore, the output is p during loading
+    and at most (1 + excess) p during unloading. Hysteresis loops are closed, and smaller loops lie
+    inside larger loops. A cell without pressure always reads 0.
     """
     widths = 2.0 * excess * (np.arange(PLAY_COUNT) + 0.5) / PLAY_COUNT
     np.minimum(state, (1.0 + widths)[:, None, None] * pressure, out=state)

@@ -48,14 +48,14 @@ class SimulatedTactile:
 
     The hand's settings define the sensor. Frame k samples the contact at the time k /
     ``tactile.rate`` after the hand's start. A frame arrives at least ``simulation.tactile_delay``
-    after its sample time, or is lost (see :class:`Arrivals`). As on hardware, the exact sample time
-    is unknown. The estimated sample time is the nominal arrival time minus
+    after its sample time, or is lost (see :class:`Arrivals`). As with real sensors, the exact
+    sample time of a frame is unknown. The estimated sample time is the nominal arrival time minus
     ``settings.tactile.latency``. Only the newest frame is computed, and only on request. Frames
     that are not computed still increase ``seq``. The hand's ``measurement_faults`` are applied to
     the frames.
 
-    If the function ``stage`` is set, it defines the contact instead of the object. The argument of
-    ``stage`` is the time since the hand's start [s].
+    If the function ``stage`` is set, it defines the contact, and the object is ignored. The
+    argument of ``stage`` is the time since the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:
@@ -108,7 +108,7 @@ class SimulatedTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return the numbers of ``frames`` received and ``missed`` since opening.
+        """Return the numbers of ``frames`` received and ``missed`` since `open` was called.
 
         ``resyncs`` and ``skipped_bytes`` are always 0.
         """
@@ -141,7 +141,7 @@ class SimulatedTactile:
         self._frame = Frame(number + 1, t + self._early, arrival, valid=True, data=data)
 
     def _counts(self, t: float) -> NDArray[np.uint16]:
-        """Return the readings at ``t`` [s], or the next replayed frame during a replay fault."""
+        """Return the readings at ``t`` [s] or, during a replay fault, the next replayed frame."""
         last = round(self._faults("replay", t) / self._period)
         if last == 0 or not self._given:
             self._replayed = None

@@ -1,5 +1,5 @@
 """Emulate the registers and bus packets of Dynamixel servos.
 
-The input and output are bytes with time stamps, so no port is needed. The package shares only the
-control table and the CRC with the client.
+The input and output are bytes with time stamps, so no port is needed. The package and the client
+share only the control table and the CRC.
 """

@@ -64,7 +64,7 @@ def fast_head(length: int) -> bytes:
 
 
 def old_status(packet_id: int) -> bytes:
-    """Return a Protocol 1.0 status packet without error or data."""
+    """Return a Protocol 1.0 status packet that contains no error and no data."""
     body = bytes((packet_id, 2, 0))
     return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
 
@@ -142,7 +142,7 @@ class PacketParser:
             end = 7 + length
             body = bytes(buffer[7 : end - 2])
             if len(buffer) > end - 2:
-                body += b"\0"  # A header at the end of the body is not followed by stuffing.
+                body += b"\0"  # A header at the end of the body counts as unstuffed.
             if intruder := _UNSTUFFED.search(body):
                 self._drop(7 + intruder.start())
                 continue

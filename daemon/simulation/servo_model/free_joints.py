@@ -27,7 +27,7 @@ class FreeJoints:
     def __init__(self, count: int = 2, start: float = 0.0) -> None:
         self._start = start
         self._done = 0  # number of steps since the start
-        self.q: FloatArray = np.zeros(count)  # joint angles [rad]; callers may write them
+        self.q: FloatArray = np.zeros(count)  # joint angles [rad]; callers may change the angles
         self.dq: FloatArray = np.zeros(count)  # rad/s
         self.current: FloatArray = np.zeros(count)  # A
         # Torque-on flag, signed current, angle, and current limit of each joint.

@@ -176,7 +176,7 @@ class ControlTable:
     def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
         """Restore the defaults from address ``first`` onwards, except for the items in ``keep``.
 
-        If ``first`` is `control_table.RAM`, the reset has the effect of a power-up.
+        If ``first`` is `control_table.RAM`, the reset has the same effect as a power-up.
         """
         for item in self.items:
             if item.address >= first and item.address not in keep:
@@ -189,7 +189,7 @@ class ControlTable:
         return length > 0 and address + length <= self.size
 
     def resolve(self, address: int) -> int:
-        """Return the actual address of a byte. An indirect data byte refers to another address."""
+        """Resolve the address of a byte. An indirect data byte refers to another address."""
         pointer = self._indirect.get(address)
         if pointer is None:
             return address

@@ -1,13 +1,13 @@
 """Emulate a Dynamixel X servo that drives a joint of the plant.
 
 The model includes torque, operating modes, limits, profiles, bus watchdog, hardware errors,
-shutdown and reboot. Packets are handled in :mod:`simulation.servo_model.servo_bus`. PWM mode, which
-no known client uses, is rejected as out of range. The emulator ignores the integral gain, and the
-option to restore RAM from a backup at startup.
+shutdown and reboot. :mod:`simulation.servo_model.servo_bus` handles the packets. PWM mode, which no
+known client uses, is rejected as out of range. The emulator ignores the integral gain. The emulator
+also ignores the option to restore RAM from a backup at startup.
 
-The manuals do not specify two details. In this emulation, a write that violates any rule leaves all
-registers unchanged. After a shutdown, the servo returns RESULT_FAIL if a client tries to switch
-torque on.
+The manuals do not specify how a servo handles partly invalid writes and torque-on requests after a
+shutdown. In this emulation, a write that violates any rule leaves all registers unchanged. After a
+shutdown, the servo returns RESULT_FAIL if a client tries to switch torque on.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
 
 REBOOT_TIME = 0.34  # duration of a reboot, during which the servo does not reply [s]
 JUMP_COUNTS = 130  # jump of the encoder zero [counts], equal to 0.2 rad at the shaft
-FAR_GOAL = 0.05  # minimum distance between a far goal and the joint angle [rad]
+FAR_GOAL = 0.05  # distance from the joint angle above which a goal counts as far [rad]
 _WATCHED_REGISTERS = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 _TUNING_REGISTERS = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
 _CLEAR_FIRMWARE = 42
@@ -50,9 +50,9 @@ class EmulatedServo:
     """Emulated servo that drives joint number ``joint`` of ``plant``.
 
     All registers have factory defaults except for the ``eeprom`` values. ``health`` may be set
-    externally. A ``silent`` servo neither receives nor replies. In a ``frozen`` servo, the measured
-    values and the clock stay constant. If ``refuses`` is set, the servo replies to every read with
-    an error.
+    externally. A ``silent`` servo ignores all packets and sends no replies. In a ``frozen`` servo,
+    the measured values and the clock stay constant. If ``refuses`` is set, the servo replies to
+    every read with an error.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class EmulatedServo:
 
     @property
     def old_protocol(self) -> bool:
-        """True if the servo is set to Protocol 1.0; this emulator then supports only ping."""
+        """True if the servo is set to Protocol 1.0, of which this emulator supports only ping."""
         return self._memory[reg.PROTOCOL_TYPE] == 1
 
     @property
@@ -374,7 +374,7 @@ class EmulatedServo:
     # --- internal events -------------------------------------------------------------------
 
     def _stop(self) -> None:
-        """Stop after a bus watchdog timeout, and hold the current position with torque on."""
+        """Stop after a bus watchdog timeout, and hold the present position with torque on."""
         table = self.table
         if self.mode == reg.CURRENT_MODE:
             table.set(reg.GOAL_CURRENT, 0)
@@ -406,7 +406,7 @@ class EmulatedServo:
 class BusRecorder:
     """Record of the goals that a servo has received, for tests of the daemon's limits.
 
-    Goals are recorded in counts, even if the servo rejects them.
+    Goals are recorded in counts, including goals that the servo rejects.
     """
 
     def __init__(self, t: float) -> None:
@@ -422,7 +422,7 @@ class BusRecorder:
         self._fired_t: float | None = None
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
-        """Record the goals of a write. While torque is off, ignore goals near the current angle."""
+        """Record the goals in a write. While torque is off, ignore goals near the present angle."""
         goals = _WATCHED_REGISTERS & values.keys()
         self._refused += refused and bool(goals)
         for address in goals:
@@ -474,5 +474,5 @@ class BusRecorder:
 
 
 def _away(joint: ServoJoint, position: int) -> float:
-    """Return the distance [rad] between a goal and the current joint angle."""
+    """Return the distance [rad] between a goal and the present joint angle."""
     return abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))

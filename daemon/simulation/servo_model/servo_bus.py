@@ -3,7 +3,7 @@
 Input and output are bytes with time stamps, so tests and fuzzers need no port.
 :mod:`simulation.emulator.pty_bus` adds the pseudo-terminal. In a group read, each servo waits for
 the reply of the previous servo in the list. Servos after a missing servo therefore do not reply.
-Control table backups are not supported; their instructions return an instruction error. Servos that
+Backups of the control table are not supported, so backup instructions return an error. Servos that
 are set to Protocol 1.0 reply only to a Protocol 1.0 ping.
 """
 
@@ -45,7 +45,7 @@ _ITEM = struct.Struct("<BHH")  # ID, address, length
 class TimedReply(NamedTuple):
     """Reply that is sent ``delay`` [s] after the wire becomes free.
 
-    ``late`` [s] is an extra delay of this reply that does not delay later replies.
+    ``late`` [s] delays this reply further, but does not delay later replies.
     """
 
     delay: float
@@ -67,10 +67,10 @@ class ServoBus:
         self.plant = plant
         self.faults = FaultSource(seed)
         self.parser = PacketParser()
-        self.lag = 0.0  # maximum age of a reading when its reply is sent [s]
+        self.lag = 0.0  # maximum age of a reading at the time of the reply [s]
         self.packets = 0  # number of packets received
         self._now = -math.inf
-        self._due = -math.inf  # lower bound for the time of the next servo event
+        self._due = -math.inf  # lower bound on the time of the next servo event
 
     @classmethod
     def from_settings(
@@ -83,7 +83,7 @@ class ServoBus:
         factory: bool = False,
         t: float = 0.0,
     ) -> ServoBus:
-        """Create the configured servos, one per joint, left finger first.
+        """Create the configured servos, one per joint, starting with the left finger.
 
         ``ids`` replaces the IDs in the settings, and a ``baud`` above 0 replaces the baud rate. If
         ``factory`` is True, all other registers have their factory defaults. Raises ValueError if
@@ -130,17 +130,17 @@ class ServoBus:
         self._now = t
 
     def next_event(self) -> float:
-        """Return a lower bound [s] for the time of the next servo event."""
+        """Return a lower bound [s] on the time of the next servo event."""
         return self._due
 
     # --- bytes -----------------------------------------------------------------------------
 
     def feed(self, data: bytes, t: float, baud: int = 0) -> bytes:
-        """Return the replies, without delays, to ``data`` that arrives at time t."""
+        """Return the bytes of all replies to ``data``, which arrives at time t."""
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
-        """Return the replies to ``data`` with their delays. If ``baud`` is 0, all servos reply."""
+        """Return the replies to ``data`` with their delays. A ``baud`` of 0 matches all servos."""
         if t >= self._due or t > self._now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []
@@ -367,8 +367,9 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
 def _at_once(replies: list[TimedReply]) -> list[TimedReply]:
     """Merge the replies of servos with the same ID into one corrupted reply.
 
-    On the wire, 0 bits dominate. Servos never start at exactly the same time, so even identical
-    replies collide. In the emulation, each reply begins one byte after the previous reply.
+    On the wire, 0 bits dominate. Servos never start to reply at exactly the same time, so even
+    identical replies collide. In the emulation, each reply begins one byte after the previous
+    reply.
     """
     if len(replies) < 2:
         return replies

@@ -23,7 +23,7 @@ from softfinger.daemon.simulation.servo_model.registers import ControlTable
 STEP_TIME = 0.001  # time step for trajectories and velocity mode [s]
 OVERLOAD_TIME = 2.0  # time at the current limit after which an overload error occurs [s]
 SENSE_INTERVAL = 0.010  # interval between checks of heat, voltage and overload [s]
-_VOLTAGE = 0  # bit in the hardware error status
+_VOLTAGE = 0  # bit number in the hardware error status
 POSITION_MODES = (
     reg.POSITION_MODE,
     reg.EXTENDED_POSITION_MODE,
@@ -32,7 +32,7 @@ POSITION_MODES = (
 # Counts/s per register unit.
 _PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
 _PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-_ARRIVAL_COUNTS = 20  # tolerance for arrival at the goal [counts]
+_ARRIVAL_COUNTS = 20  # maximum distance from a goal that counts as reached [counts]
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 
 
@@ -92,7 +92,7 @@ class ServoJoint:
         return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
 
     def position(self) -> int:
-        """Return the current position in counts, as in register 132."""
+        """Return the present position in counts, as in register 132."""
         within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
         return self.sign * within + self._table.get(reg.HOMING_OFFSET)
 
@@ -108,7 +108,7 @@ class ServoJoint:
     # --- trajectory --------------------------------------------------------------------------
 
     def hold(self) -> None:
-        """End the trajectory at the current position."""
+        """End the trajectory at the present position."""
         self.profile.hold(self.position())
 
     def aim(self) -> None:
@@ -215,15 +215,15 @@ ROOM_TEMPERATURE = 25.0  # °C
 _THERMOMETER_LAG = 4.0  # s
 _CONVECTION = 0.006  # relative increase in cooling per kelvin of temperature difference [1/K]
 _STEP_MAX = 1.0  # maximum step [s]
-# Arrival tolerance in counts. Without a tolerance, rounding of the square root would prevent
-# arrival.
+# Arrival tolerance in counts. Without a tolerance, rounding of the square root would keep the
+# trajectory from reaching its target.
 _ARRIVAL_TOLERANCE = 1e-6
 
 
 class Profile:
     """Velocity-based or time-based trajectory to a goal.
 
-    The object stores the present position and velocity of the trajectory. A velocity or
+    The profile stores the present position and velocity of the trajectory. A velocity or
     acceleration limit of 0 means no limit.
     """
 
@@ -251,7 +251,7 @@ class Profile:
             self.hold(target)
 
     def aim_in(self, target: float, duration: float, ramp: float) -> None:
-        """Set a target to reach after ``duration`` [s], with ramps of ``ramp`` [s] (time-based)."""
+        """Set a target for a time-based profile of ``duration`` [s] with ramps of ``ramp`` [s]."""
         if duration <= 0.0:
             self.hold(target)
             return
@@ -271,7 +271,7 @@ class Profile:
             return
         limit = self.speed if self.speed > 0.0 else math.inf
         if self.acceleration > 0.0:
-            # Maximum speed in this step that still allows a stop at the target.
+            # Maximum speed in this step at which the trajectory can still stop at the target.
             a = self.acceleration
             stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
             speed = math.copysign(min(limit, stop), distance)
