@@ -1,4 +1,4 @@
-"""Tactile backends: common interface, boards on serial ports, and recordings.
+"""Provide the tactile backends for serial boards and for recordings.
 
 `daemon.backends` maps the backend names in the settings to the backend classes.
 """

@@ -13,7 +13,7 @@ __all__ = ["TactileSensor"]
 
 
 class TactileSensor(Protocol):
-    """Pressure sensor under one fingertip, which is read outside the control tick."""
+    """Pressure sensor under one fingertip. The sensor is read outside the control tick."""
 
     def open(self) -> None:
         """Open the sensor and wait for a valid frame. Raises TactileError if no frame arrives."""

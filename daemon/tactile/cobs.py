@@ -1,6 +1,7 @@
 """Read boards with COBS framing, a format for custom boards and for sensors of 44 × 44 cells.
 
-Any baud rate is allowed, and USB boards may ignore it. The firmware sends every scan unprompted:
+Any baud rate is allowed, and USB boards may ignore the baud rate. The firmware sends each scan
+without a request, in four steps:
 
 1. Build the message with all numbers in little-endian order:
 
@@ -25,10 +26,10 @@ Any baud rate is allowed, and USB boards may ignore it. The firmware sends every
                        eight times:  crc = (crc << 1) ^ (crc & 0x8000 ? 0x1021 : 0)   in 16 bits
 
 3. Encode the message with COBS, which removes all zero bytes. Split the message at its zero bytes
-   and drop the zero bytes. Before each piece, write one byte: the length of the piece plus 1. Split
-   pieces of 254 bytes or more into blocks of 254 bytes, each preceded by the byte 255. Send the
-   rest of the piece, which may be empty, as a separate piece. (An empty piece at the end of the
-   message may be omitted.)
+   and drop the zero bytes. Before each piece, write one byte, which is the length of the piece plus
+   one. Split pieces of 254 bytes or more into blocks of 254 bytes, each preceded by the byte 255.
+   Send the rest of the piece, which may be empty, as a separate piece. An empty piece at the end of
+   the message may be omitted.
 
 4. Send a zero byte. An additional zero byte before the first frame is allowed.
 
@@ -119,7 +120,7 @@ class CobsDecoder(DelimitedDecoder):
         self._wraps = 0  # number of overflows of the board clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """Parse a packet like :meth:`DelimitedDecoder.parse`, with its sequence number and time."""
+        """Parse a packet with a sequence number and time; see :meth:`DelimitedDecoder.parse`."""
         if len(packet) >= self.longest:
             self._reason = f"packets of {len(packet)} bytes"
             return None

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 __all__ = ["Decoded", "DelimitedDecoder"]
 
-_LOST_AFTER = 10  # The stream is lost after this many frame lengths without a frame.
+_LOST_AFTER = 10  # number of frame lengths without a frame after which the stream is lost
 
 
 @dataclass(slots=True)
 class Decoded:
-    """Decoded frame: a new array of counts [rows, cols], and the read time [s] of the last byte."""
+    """Decoded frame, with a new array of counts [rows, cols] and the last byte's read time [s]."""
 
     data: NDArray[np.uint16]
     t: float
@@ -51,7 +51,7 @@ class Decoder(ABC):
 
     @abstractmethod
     def diagnosis(self) -> str:
-        """Explain in one line why no frames are found in the stream."""
+        """Return a one-line explanation of why the decoder finds no frames in the stream."""
 
     @property
     def pending(self) -> bool:
@@ -73,7 +73,7 @@ class Decoder(ABC):
 
     @property
     def lost(self) -> bool:
-        """True if the last ten frame lengths of data contained no frame."""
+        """True if the decoder has found no frame in the last ten frame lengths of data."""
         behind = self._skipped - self._skipped_at_frame + len(self._buffer)
         return behind > _LOST_AFTER * self.frame_bytes
 

@@ -29,15 +29,15 @@ class FlexiTacDecoder(Decoder):
 
     *Lock.* A marker can be distinguished from two counts ``AA 55`` only by its position. The search
     requires two markers at a distance of one frame. If another ``AA 55`` between the markers also
-    recurs one frame later, the search waits for more frames. The search ends when only one position
-    remains. The decoder can't lock to a constant image that contains ``AA 55``, and counts the
-    failed search as ``ambiguous``.
+    recurs one frame later, the search waits for more frames. The search ends when only one possible
+    position remains. The decoder can't lock onto a constant image that contains ``AA 55``, and
+    counts the failed search as ``ambiguous``.
 
     *Hold.* After locking, the decoder returns a frame when it finds the next marker at the expected
     position. The marker proves that no byte of the frame was lost. On a line with gaps between
     frames, waiting for the next marker would delay every frame by one period. After a gap, the
-    decoder therefore returns a complete frame immediately if the frame can't consist of parts of
-    two frames. The bytes must have arrived within their transmission time, and the counts must not
+    decoder therefore returns a frame immediately if two conditions rule out a mixture of two
+    frames. The bytes must have arrived within their transmission time, and the counts must not
     contain ``AA 55``. All other frames are returned at the next marker or by ``settle``.
 
     *Loss.* If a marker is not at its expected position, the preceding frame is dropped, and the
@@ -50,7 +50,7 @@ class FlexiTacDecoder(Decoder):
         self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # [s]
         self._t_whole = -math.inf  # time at which the last returned frame was complete
         self._start = 0  # stream position of the buffer's first byte
-        # For each buffered piece: stream position of its end, and read time [s].
+        # Stream position of the end, and read time [s], of each buffered piece.
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
         self._markers: deque[int] = deque(
@@ -82,7 +82,7 @@ class FlexiTacDecoder(Decoder):
 
     @property
     def found_cells(self) -> int:
-        """Number of cells per frame, from the most common distance of markers; 0 while locked."""
+        """Number of cells per frame, based on the most common marker spacing; 0 while locked."""
         apart = Counter(b - a for a, b in combinations(self._markers, 2))
         spacings = [each for each in apart if each >= _CELL_COUNT_MIN + len(MARKER)]
         spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)

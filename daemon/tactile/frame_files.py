@@ -2,18 +2,18 @@
 
 Supported files:
 
-- ``.npz`` with ``frames`` [n, rows, cols], or with exactly one three-dimensional array of any other
-  name. Optional arrays are ``t`` [n] and ``live`` [rows, cols] (bool). If the true contacts are
+- ``.npz`` with ``frames`` [n, rows, cols], or with a single three-dimensional array of any name.
+  The arrays ``t`` [n] and ``live`` [rows, cols] (bool) are optional. If the true contacts are
   known, the arrays ``d`` [m], ``theta`` [rad] and ``force`` [N], all [n], contain them.
 - ``.npy`` with one frame [rows, cols] or several frames [n, rows, cols], or a folder of such files.
-  The files are sorted by name, and numbers in the names by value. The folder may contain ``t.npy``
-  [n].
+  The files are sorted by name; numbers in the names are compared by value. The folder may contain
+  ``t.npy`` [n].
 - Other files are read as Tekscan-style ASCII exports.
 
 Integer frames contain counts. Floating-point frames are in Pa and are converted with
 ``pascal_per_count``. A cell that is NaN in all frames counts as dead. Negative readings are set to
-0 if noise around a tared zero can explain them. Times are in seconds unless their intervals or, for
-Unix times, their values indicate another unit.
+0 if noise around a tared zero can explain them. Times are in seconds by default. Another unit is
+detected from the intervals between the times or, for Unix times, from the values.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TIMES = ("t", "time", "times", "timestamp", "timestamps")
 _COUNT_MAX = 65535
 _RANGE_ERROR = f"frames: found readings outside 0 to {_COUNT_MAX} counts"
 _LISTED_COUNT_MAX = 8  # maximum number of arrays listed in a message
-_SAMPLE_COUNT_MAX = 200  # maximum number of frames from which zero and noise are estimated
+_SAMPLE_COUNT_MAX = 200  # maximum number of frames used to estimate the zero level and the noise
 _NOISE_SIGMA_MAX = 6.0  # maximum magnitude of negative readings, in noise standard deviations
 _CLIPPED_COUNT_MIN = 3  # minimum number of saturated cells that causes a warning
 _UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # time units other than s
@@ -51,7 +51,7 @@ _INTERVAL_RATIO_NOTED = 10.0  # ratio of actual to expected frame interval that 
 
 @dataclass(frozen=True)
 class FrameRecording:
-    """Recording of counts uint16 [n, rows, cols] at times t float64 [n] [s], which increase from 0.
+    """Recorded counts uint16 [n, rows, cols] and times t float64 [n] [s], which increase from 0.
 
     ``live`` [rows, cols] is False where the sensor has no cell. ``truths`` contains the true
     contact of each frame. ``largest`` is the maximum reading, in counts if ``whole`` is True and
@@ -164,7 +164,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
 
 
 def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) -> str:
-    """Return the name of the frames array. Raises ValueError if no single array qualifies."""
+    """Return the name of the frames array. Raises ValueError unless exactly one qualifies."""
     if "frames" in names:
         return "frames"
     shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
@@ -185,8 +185,8 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
 
 def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     part = archive.getinfo(f"{name}.npy")
-    # NumPy writes only stored and deflated parts. With other compression methods, the unpacked data
-    # may exceed the stated size.
+    # NumPy stores the parts of an archive uncompressed or compresses them with deflate. With other
+    # compression methods, the unpacked data may exceed the stated size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name}: found an unsupported compression method, expected deflate")
     return part
@@ -277,7 +277,7 @@ def _checked(
 def _without_dead(
     frames: NDArray[Any], live: NDArray[np.bool_], most: float
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Mark cells that are NaN in all frames as dead; clear out-of-range readings of dead cells."""
+    """Mark cells as dead if they are NaN in all frames; clear dead cells' out-of-range readings."""
     if frames.dtype.kind == "f":
         unknown = np.isnan(frames)
         live = live & ~unknown.all(axis=0)
@@ -377,7 +377,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
 
 
 def _factor(t: NDArray[Any], step: float, rate: float) -> float:
-    """Return the unit [s] of times without a date, based on their intervals. Raises ValueError."""
+    """Infer the unit [s] of non-Unix times from the intervals between them. Raises ValueError."""
     whole = t.dtype.kind in "ui"
     if len(t) > 2 and (t % 1 == 0).all() and (np.diff(t) == 1).all():
         if 1.0 / _INTERVAL_RATIO_NOTED < rate < _INTERVAL_RATIO_NOTED:  # The rate is about 1 Hz.

@@ -1,10 +1,12 @@
 """Read a glove-style board with 32 × 32 cells by polling it over a serial port.
 
 The board runs at 1,000,000 baud. The host writes ``a``, and the board replies with one frame of 2 +
-2 · rows · cols bytes. The first byte of a frame is an index + 11, and the last byte is a newline
-(10). Between them, each cell has two bytes, in row-major order: the high 5 bits + 11 and the low 5
-bits + 11. Only the last byte can be a newline, so the decoder resynchronises at the next newline. A
-frame has no checksum. A corrupted byte is therefore detected only if its value is outside 11 to 42.
+2 · rows · cols bytes. The first byte of a frame is an index, offset by 11. The last byte is a
+newline (10). The bytes in between encode the cells in row-major order. The first byte of a cell
+contains the high 5 bits of the count, offset by 11. The second byte contains the low 5 bits, with
+the same offset. Only the last byte can be a newline, so the decoder resynchronises at the next
+newline. A frame has no checksum. A corrupted byte is therefore detected only if its value is
+outside the range from 11 to 42.
 
 Boards with a 12-bit converter send 6 bits per half of a count. A ``tactile.full_count`` from 1024
 to 4095 selects a 12-bit board.

@@ -43,7 +43,7 @@ class GivenFrames:
     """Sensor whose newest ``frame`` is set by the caller.
 
     ``live`` [rows, cols] is False where the sensor has no cell; None means that all cells exist.
-    ``full_count`` is the reading of saturated cells; None means the value in the settings.
+    ``full_count`` is the reading of saturated cells; None selects the value in the settings.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class GivenFrames:
         self.full_count = full_count
 
     def open(self) -> None:
-        """Do nothing: there is no port."""
+        """Do nothing, because there is no port."""
 
     def latest(self) -> Frame | None:
         """Return the frame that was set most recently."""
@@ -65,7 +65,7 @@ class GivenFrames:
         return {}
 
     def close(self) -> None:
-        """Do nothing: there is no port."""
+        """Do nothing, because there is no port."""
 
 
 class ReplayTactile:
@@ -127,7 +127,7 @@ class ReplayTactile:
 
     def latest(self) -> Frame | None:
         """Return the newest frame that is due, or None before `open`."""
-        now = self._clock.now() + 1e-9  # With this margin, rounding can't delay a frame.
+        now = self._clock.now() + 1e-9  # This margin keeps rounding errors from delaying a frame.
         if now < self._due:
             return self._frame
         turn = math.floor((now - self._start) / self._period)

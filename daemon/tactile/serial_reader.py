@@ -38,7 +38,7 @@ class SensorClock:
 
     Frames may arrive late but never early. Using the minimum delay therefore removes port jitter
     from ``t_sample``. The offset between the clocks may increase at up to 200 ppm, which is faster
-    than two quartz clocks drift apart. A jump of the offset by more than one second is treated as a
+    than two quartz clocks drift apart. A jump in the offset of more than one second is treated as a
     board restart.
     """
 
@@ -75,8 +75,8 @@ class SerialReader:
     arrives within its transmission time plus 0.1 s, the reader repeats the request.
 
     ``latest`` may be called from any thread. Each frame has its own array, which is never modified.
-    If the port is lost or the stream becomes unreadable, the reader provides the old data again in
-    a frame with ``valid`` False.
+    If the port is lost or the stream becomes unreadable, the reader repeats the last data in a
+    frame with ``valid`` False.
     """
 
     request = b""
@@ -148,7 +148,7 @@ class SerialReader:
 
     @property
     def error(self) -> str:
-        """Reason why frames are missing; empty while frames arrive."""
+        """Reason why no frames arrive; empty while frames arrive."""
         return self._error
 
     def close(self) -> None:

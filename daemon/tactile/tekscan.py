@@ -1,15 +1,15 @@
 """Parse Tekscan-style ASCII exports of pressure frames.
 
-An export starts with a header: lines of the form ``KEY value``, up to the line ``ASCII_DATA @@``.
-Each frame starts with a line ``Frame n``, which may contain more text, and continues with its rows.
-The letter ``B`` marks a position without a cell. A line ``@@`` may end the file. An export with a
-single frame has no ``Frame`` line.
+An export starts with a header, which consists of ``KEY value`` lines and ends with the line
+``ASCII_DATA @@``. Each frame consists of a line that starts with ``Frame n``, and of the rows of
+the frame. The letter ``B`` marks a position without a cell. A line ``@@`` may end the file. An
+export with a single frame has no ``Frame`` line.
 
-The encoding, the decimal sign and the separator depend on the locale of the exporting machine, so
-the parser detects them. Lengths are in mm, cm, m or inches, abbreviated or spelt out. Readings are
-raw counts, pressures, or forces per cell. Free text may follow ``COMMENTS:``. Within the free text,
-a line is a ``KEY value`` line only if its first word is in capitals. Spreadsheets may add quotation
-marks and may append separators to lines.
+The parser detects the encoding, the decimal separator and the cell separator, which depend on the
+locale of the exporting machine. Lengths are in mm, cm, m or inches. The unit names are abbreviated
+or spelt out. Readings are raw counts, pressures, or forces per cell. Free text may follow
+``COMMENTS:``. After ``COMMENTS:``, a line is a ``KEY value`` line only if its first word is in
+capitals. Spreadsheets may add quotation marks and may append separators to lines.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SIZE_MAX = 1024  # maximum number of rows or columns
 _HEADER_LINES_MAX = 1000
 _READING_MAX = 1e12  # maximum reading, in the unit of the file
 _RAW_SATURATION = 255  # maximum reading of the manufacturer's 8-bit electronics
-_SATURATION_FRACTION = 0.995  # Cells above this fraction of the saturation pressure are saturated.
+_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure above which a cell is saturated
 _EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
@@ -66,10 +66,10 @@ class TekscanError(SoftfingerError, ValueError):
 class Export:
     """Parsed export.
 
-    ``values`` float64 [frames, rows, cols] are in Pa, or counts if ``raw``. The values are 0 where
-    ``live`` [rows, cols] is False. ``t`` float64 [frames] is the time since the first frame [s].
-    ``pitch`` (x, y) [m] is NaN if the header does not contain it. ``full`` is the reading of a
-    saturated cell, inf if unknown.
+    ``values`` float64 [frames, rows, cols] are in counts if ``raw`` is True, and otherwise in Pa.
+    The values are 0 where ``live`` [rows, cols] is False. ``t`` float64 [frames] is the time since
+    the first frame [s]. ``pitch`` (x, y) [m] is NaN if the header does not contain it. ``full`` is
+    the reading of a saturated cell, or inf if unknown.
     """
 
     values: NDArray[np.float64]
@@ -81,7 +81,7 @@ class Export:
 
 
 def decode(data: bytes) -> str:
-    """Decode text in UTF-8, UTF-16 or a single-byte encoding, with or without byte order mark."""
+    """Decode text in UTF-8, UTF-16 or a single-byte encoding, with or without a byte order mark."""
     for mark, code in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
         if data.startswith(mark):
             return data.decode(code, "replace")
@@ -181,7 +181,7 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
 def _frames(
     lines: list[str], first: int, rows: int, cols: int
 ) -> tuple[list[int], list[list[NDArray[np.float64]]], list[list[int]]]:
-    """Parse the lines after the header; return frame numbers, rows and line numbers of rows."""
+    """Parse the lines after the header; return frame numbers, rows, and the rows' line numbers."""
     numbers: list[int] = []
     frames: list[list[NDArray[np.float64]]] = []
     places: list[list[int]] = []
@@ -247,11 +247,11 @@ def _cells(line: str, separator: str, cols: int) -> list[str]:
 
 
 def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float64]:
-    """Parse a row of readings; return −inf where the sensor has no cell."""
+    """Parse a row of readings, with −inf at positions without a cell."""
     cells = [cell.strip(' "').upper() for cell in _cells(line, separator, cols)]
     missing = cells.count("B")
     if separator == "," and len(cells) != cols:
-        # Commas are decimal signs only if every number contains one.
+        # Commas are decimal separators only if every number contains a comma.
         if len(cells) == 2 * cols - missing:
             parts = iter(cells)
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
@@ -278,7 +278,7 @@ def _number(text: str) -> float:
     """Parse a number with a decimal point or comma.
 
     If both a point and a comma occur, whichever comes last is the decimal separator, and the other
-    separates groups of digits. Apostrophes and narrow spaces only group digits.
+    character groups digits. Apostrophes and narrow spaces only group digits.
     """
     text = text.translate(_GROUPS)
     if "," in text:
@@ -297,7 +297,7 @@ def _count(header: dict[str, str], key: str) -> int:
 
 
 def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> float:
-    """Parse a number with a unit and convert it to SI."""
+    """Parse a number with a unit and convert the number to SI units."""
     match = re.fullmatch(r"([-+0-9.,eE]+)[\s,;]*(.*)", header[key])
     try:
         value = _number(match[1].rstrip(",")) if match else math.nan
@@ -324,7 +324,7 @@ def _pitch(header: dict[str, str]) -> tuple[float, float]:
 
 
 def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
-    """Return the unit of the readings [Pa], or 0 if they are raw."""
+    """Return the unit of the readings [Pa], or 0 for raw counts."""
     text = header.get("UNITS", "")
     unit = _plain_unit(text)
     if unit in _RAW:
