@@ -1,4 +1,4 @@
-"""Define how the stream and the commands are sent: schema, packing, sockets and keys.
+"""Define the schema, packing, sockets and keys for stream messages and commands.
 
 The `gateway` package contains the process that serves the client connections.
 """

@@ -2,8 +2,9 @@
 
 The command server runs in the loop's thread, once per tick, without a lock. A ``stop`` is executed
 before all other requests. The gateway stamps each request with the number of stops that preceded
-it. If this number is below the current number of stops, the request is refused, except for
-``status``. A ``hold`` replaces a queued ``hold`` that directly precedes it on the same connection.
+the request. If this number is lower than the current number of stops, the daemon refuses every
+request except ``status``. A ``hold`` replaces a queued ``hold`` that directly precedes it on the
+same connection.
 
 A client may add a unique ``key`` to a request. If the request is refused as late, the client may
 repeat it. The daemon executes a command with a key at most once. To protect newer commands, the
@@ -50,11 +51,11 @@ class CommandServer:
         self._clock = clock
         self._changes = 0  # number of executed commands other than status and stop
         # Outcomes of requests with a key, oldest first. The dictionary keys consist of the client
-        # name and the packed request. The outcome is the reply. For a late request, the outcome
-        # consists of the counts of stops and changes at the first attempt.
+        # name and the packed request. The outcome is the reply. For a late request, the outcome is
+        # the pair of stop count and change count at the first attempt.
         self._outcomes: OrderedDict[tuple[str, bytes], bytes | tuple[int, int]] = OrderedDict()
         self._stopped = b""  # reply to the last local stop
-        self._answer_by = 0.0  # time at which the wait for the gateway's confirmation ends
+        self._answer_by = 0.0  # deadline for the gateway's confirmation
 
     def serve(self, handler: Handler) -> None:
         """Pass this tick's requests to ``handler`` and send its replies.
@@ -77,7 +78,7 @@ class CommandServer:
 
     def _stop(self, handler: Handler, client: str) -> bytes:
         reply = accepted(handler({"command": "stop", "client": client}, 0.0))
-        self.link.fence()  # The client may act on the reply at once, so update the fence first.
+        self.link.fence()  # The client may act on the reply at once, so count the stop first.
         return reply
 
     def _unpack(self, handler: Handler) -> None:
@@ -135,7 +136,7 @@ class CommandServer:
 
 
 def _replaces(request: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Return True if both requests are ``hold`` and ``request`` sets all values of ``other``."""
+    """Return True if both are ``hold`` requests and ``request`` sets all values in ``other``."""
     is_hold = request["command"] == other["command"] == "hold"
     return is_hold and other.keys() - {"key"} <= request.keys()
 

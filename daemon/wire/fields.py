@@ -91,7 +91,7 @@ def members(cls: type[Any]) -> Iterator[Member]:
 
 @dataclass_transform(frozen_default=True)
 def record(cls: type[_Record]) -> type[_Record]:
-    """Turn a class of declared fields into a record; list the fields in the docstring."""
+    """Turn a class of declared fields into a record; list the fields in the class docstring."""
     made = dataclasses.dataclass(frozen=True, slots=True)(cls)
     listed = ["", "Attributes", "----------"]
     for each in members(made):

@@ -1,19 +1,19 @@
-"""Manage CurveZMQ keys for the daemon and its clients: key files and socket options.
+"""Manage CurveZMQ key files and socket options for the daemon and its clients.
 
 The server and the clients each have their own key pair. A client needs the server's public key. The
 server needs the public keys of its clients and rejects all other clients. `make_keys` creates a
 folder with these files:
 
 ``server/server.key_secret``, ``server/server.key``
-    the daemon's key pair, and its public key alone
+    the daemon's key pair, and a file that contains only its public key
 ``server/clients/NAME.key``
     an accepted client's public key; removing the file disconnects that client
 ``NAME/server.key``, ``NAME/client.key_secret``
     the files to copy to the client's machine; the client ``local`` is for this machine
 
-The files are ZeroMQ certificates, which other ZeroMQ programs can also read. A file or folder is
-refused if another user owns it or may write to it, because this user could add a key. All parent
-folders are checked in the same way.
+The files are ZeroMQ certificates, which other ZeroMQ programs can also read. Files and folders that
+another user owns or may write to are refused, because this user could add a key. All parent folders
+are checked in the same way.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ import zmq.utils.z85
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.kinematics.compiled.own_folder import check_above, fault
 
-LOCAL = "local"  # name of the client for this machine, in every key folder
+LOCAL = "local"  # name of the local client, which every key folder contains
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _LENGTH = 32  # length of a key [bytes]
@@ -50,7 +50,7 @@ class ServerKeys:
     clients: dict[bytes, str]  # maps each public key to a client name
 
     def left(self, folder: Path) -> ServerKeys:
-        """Return the keys without those of clients whose key files have been removed.
+        """Return the keys, excluding clients whose key files have been removed.
 
         Raises KeyFileError.
 
@@ -143,7 +143,8 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
             client.mkdir()
             zmq.auth.create_certificates(client, "client")
             shutil.copyfile(server / "server.key", client / "server.key")
-            # Move the public key last, so that the server accepts only clients with complete keys.
+            # Move the public key last, so that the server accepts only clients that have all their
+            # keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     finally:
         os.umask(before)
@@ -173,7 +174,7 @@ def load_server(folder: Path) -> ServerKeys:
 
 
 def load_client(folder: Path) -> ClientKeys:
-    """Load a client's keys from its folder, or the local client's keys from a `make_keys` folder.
+    """Load the keys of a client from its folder, or of the local client from a `make_keys` folder.
 
     Raises KeyFileError.
     """

@@ -1,4 +1,4 @@
-"""Provide a local socket for ``stop``, which other clients can't block.
+"""Provide a local socket for ``stop`` that other clients can't block.
 
 The socket is a Unix datagram socket, so the daemon can't run out of connections. Only the daemon's
 user can send to the socket. `client.command_client` uses the socket if it exists.
@@ -70,7 +70,7 @@ class LocalStop:
     def answer(self, reply: bytes) -> None:
         """Send the reply to all clients that sent a stop."""
         while self._senders:
-            with contextlib.suppress(OSError, TypeError):  # The sender has exited or has no name.
+            with contextlib.suppress(OSError, TypeError):  # The sender has exited or is unnamed.
                 self._socket.sendto(reply, self._senders.popleft())
 
     def close(self) -> None:
@@ -81,7 +81,7 @@ class LocalStop:
 
 
 def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
-    """Stop this user's daemon with the command address ``address``; return its reply.
+    """Stop this user's daemon that uses the command address ``address``; return its reply.
 
     Returns None if this user's daemon is not running on this machine or does not respond.
     """
@@ -103,7 +103,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
 
 def free_socket_path(path: Path, kind: socket.SocketKind) -> str:
-    """Remove a socket file left behind by a killed process; return a reason if it is in use."""
+    """Remove a killed process's socket file; if ``path`` is still occupied, return the reason."""
     if not path.exists():
         return ""
     if not path.is_socket():
@@ -130,7 +130,7 @@ def _name(address: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Yield candidate folders, starting with those of the login session and the service."""
+    """Yield candidate folders; the folders of the login session and the service come first."""
     session = f"/run/user/{os.geteuid()}"
     for place in (os.environ.get("XDG_RUNTIME_DIR"), "/run/softfinger", session):
         if place:

@@ -50,7 +50,7 @@ class Ask(NamedTuple):
 
 
 def machine_time() -> float:
-    """Return the monotonic time [s], including time spent in suspend."""
+    """Return the monotonic time [s], including time during which the machine was suspended."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
@@ -81,7 +81,7 @@ class Channel:
         return self._end.fileno()
 
     def send(self, *message: object, droppable: bool = False) -> None:
-        """Send a message. If the buffer is full, queue the message, or drop it if ``droppable``."""
+        """Send a message. If the buffer is full, drop a ``droppable`` message; queue any other."""
         if not self.over and (self.flush() or not droppable):
             self._unsent += msgpack.packb(message)
             self.flush()
@@ -132,7 +132,7 @@ class Link:
         self._channel.close()
 
     def offer(self, channel: Channel) -> None:
-        """Switch to this channel at the next call of `look`. Any thread may call this method."""
+        """Switch to this channel at the next call to `look`. Any thread may call this method."""
         self._offered = channel
 
     def look(self) -> bool:

@@ -20,13 +20,16 @@ _COLOUR = "#0a8078"  # colour that is readable on light and on dark pages
 # Number of shades in a picture. More shades would make the SVG longer without a visible difference.
 _SHADES = 12
 _SIDE = 176  # longer side of a picture [px]
-# The darkest shade stands for at least this pressure [Pa], so that the noise of an unloaded tip
+# The darkest shade represents at least this pressure [Pa], so that the noise of an unloaded tip
 # stays faint.
 _FULL = 10e3
 
 
 def state_parts(state: HandState) -> list[str]:
-    """Return mode, tip forces, object angle and width; in a fault, return only mode and fault."""
+    """Return texts with the mode, the tip forces, and the object's angle and width.
+
+    During a fault, the texts contain only the mode and the fault.
+    """
     if state.fault:
         return [state.mode, state.fault]
     parts = [state.mode]
@@ -52,7 +55,7 @@ def why_invalid(state: HandState) -> str:
 
 
 def finger_text(finger: FingerState) -> str:
-    """Return force, displacement and tilt with standard deviations, and the joint angle."""
+    """Return the force, displacement and tilt (with standard deviations) and the joint angle."""
     joint = f"joint {math.degrees(finger.q):z.1f}°"
     if finger.invalid:
         return f"not valid: {finger.invalid}, {joint}"

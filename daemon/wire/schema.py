@@ -3,10 +3,11 @@
 Each topic is a record. Each field has a unit, a meaning and a source. The value of a field is a
 function of the source or, by default, the source attribute of the same name. The packers
 (`wire.publisher`) and the clients' records (`client.stream`) use these declarations. The
-``STREAM.md`` page and the JSON Schemas of recordings (`wire.schema_docs`) are generated from them.
+``STREAM.md`` page and the JSON Schemas of recordings (`wire.schema_docs`) are generated from the
+declarations.
 
-New versions may add fields but never remove them. A float is always sent as a float. Values are in
-SI units.
+New versions may add fields but never remove fields. A float is always sent as a float. Values are
+in SI units.
 """
 
 import json
@@ -75,7 +76,7 @@ TRUTH = b"hand/truth"
 
 NO_FRAME = Frame(0, t_sample=0.0, t_arrival=0.0, valid=False, data=np.zeros((0, 0), np.uint16))
 
-# Fields with which several topics begin.
+# Fields at the start of several topics.
 _SCHEMA = "", "schema version; changes only if the meaning of a field changes"
 _SEQ = "", "sequence number of the tick, frame or event"
 _STEP = "", "decimation factor n: every n-th message is sent"
@@ -89,7 +90,7 @@ def _ns(t: float) -> int:
     return int(t * 1e9)
 
 
-# If several sources share a field, only one of them declares it.
+# If several sources share a field, only one of the sources declares the field.
 _tick = FieldSource["StateSource"]()
 _state = _tick.of(lambda m: m.state)
 _timing = _state.of(lambda s: s.timing)
