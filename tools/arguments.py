@@ -81,12 +81,12 @@ def profile(arguments: argparse.Namespace) -> Settings:
 
 
 def own_runtime_folder() -> Path | None:
-    """Return an emulated hand's default port folder, or None if there is no runtime folder."""
+    """Return the default folder for emulated ports, or None if there is no runtime folder."""
     return None if runtime_fault() else runtime_folder()
 
 
 def client_keys(folder: Path | None) -> ClientKeys | None:
-    """Load the client keys from ``--keys``, which a socket requires before it connects.
+    """Load the client keys from the folder ``--keys``; a socket needs them before it connects.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def _hint(folder: Path | None) -> str:
 
 
 def to_stderr(subcommand: str) -> Callable[[str], None]:
-    """Return a function that prints a line to standard error, prefixed with the subcommand."""
+    """Return a function that prints a line to standard error, after the subcommand's name."""
     return lambda line: print(f"{subcommand}: {line}", file=sys.stderr, flush=True)
 
 
@@ -238,7 +238,7 @@ def add_stream(
     kind: Callable[[str], Any] = stream_address,
     client: bool = False,
 ) -> None:
-    """Add a subscriber's arguments: the `add_daemon` arguments, ``--no-wait``, ``--duration``."""
+    """Add the `add_daemon` arguments, ``--no-wait`` and ``--duration`` for a subscriber."""
     add_daemon(parser, kind, client)
     parser.add_argument(
         "--no-wait",
@@ -257,7 +257,7 @@ def add_duration(parser: argparse.ArgumentParser) -> None:
 def add_split(parser: argparse.ArgumentParser) -> None:
     """Add ``--split-size`` and ``--split-time``.
 
-    A recorder's memory use grows with the file size, so splitting limits the memory use.
+    A recorder's memory use grows with the file size, so splitting the file limits the memory use.
     """
     parser.add_argument(
         "--split-size",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from softfinger.daemon.errors import SoftfingerError
 
-_EXTRAS = {  # maps each extra to the reason in the error message and the required modules
+_EXTRAS = {  # maps each extra to its error message and required modules
     "plot": ("plots require matplotlib", ("matplotlib",)),
     "record": ("recordings require mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
     "view": ("the web page requires websockets and orjson", ("websockets", "orjson")),

@@ -93,7 +93,7 @@ class StopCondition:
 
 
 class Interrupted(BaseException):
-    """Raised if a signal arrives before the daemon runs; deliberately not an `Exception`."""
+    """Raised if a signal arrives before the daemon is running; deliberately not an `Exception`."""
 
 
 # By default, these signals end the process immediately. Only the servo watchdog would then switch

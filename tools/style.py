@@ -77,7 +77,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def ordered(count: int) -> list[dict[str, Any]]:
-    """Return colours and dashes for an ordered family of lines; the first is light and solid."""
+    """Return colours and dashes for an ordered family of lines; the first is a light solid line."""
     import matplotlib
 
     shades = matplotlib.colormaps["viridis"](np.linspace(0.72, 0.0, count))

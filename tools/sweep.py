@@ -33,8 +33,8 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-# In a checkout, the last three folders are links. A search of the first folder does not follow
-# links.
+# In a checkout, the last three folders are links. These folders must be listed, because a search of
+# the first folder does not follow links.
 _SOURCES = tuple(Path(__file__).parents[1] / n for n in ("", "daemon", "kinematics", "tools"))
 _CONNECT_TIMEOUT = 10.0  # time limit for connecting to the scheduler [s]
 _REDRAW_INTERVAL = 0.1  # time between two updates of a progress bar [s]

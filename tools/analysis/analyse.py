@@ -1,4 +1,4 @@
-"""Run ``softfinger analyse FILE``: compute d, θ, force and energy versus time from frames.
+"""Run ``softfinger analyse FILE``: compute d, θ, force and energy versus time.
 
 The frames are processed with the daemon's perception code. A stream recording (.mcap) contains its
 own settings and calibrations. All other files (.npz, .npy, a folder of .npy files, a Tekscan-style
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Analyse files and write the results. With one file, raises SoftfingerError or OSError."""
+    """Analyse files and write the results. Errors are raised only if there is a single file."""
     settings, files = profile(arguments), arguments.files
     if len(files) == 1:
         print(_analysed(arguments, settings, files[0]), end="")
@@ -111,11 +111,11 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 
 _EIGHT_BITS = 255
-_NOISE_RATIO = 1.5  # the noise is reported above this ratio of measured noise to tactile.noise
+_NOISE_RATIO = 1.5  # ratio of measured noise to tactile.noise above which it is reported
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
-    """Explain why no contact was found: maximum reading, threshold and likely cause."""
+    """Return the maximum reading, the threshold and the likely reason why no contact was found."""
     from softfinger.kinematics.estimation.detection import PEAK_LEVEL
 
     scale = tactile.pascal_per_count if recording.whole else 1.0
@@ -163,9 +163,9 @@ class Source:
     """Frames from all sensors in one file; ``frames(progress)`` yields (finger, t [s], counts).
 
     In a stream recording, ``t`` is relative to the first message. In files that contain only
-    frames, ``t`` is relative to the first frame, and ``recording`` is set. ``total`` is the final
-    value of ``progress``. Kernels are loaded only when ``models`` is called, so an unreadable file
-    is reported quickly.
+    frames, ``t`` is relative to the first frame, and ``recording`` is set. At the end, ``progress``
+    is called with ``total``. Kernels are loaded only when ``models`` is called, so that errors in
+    the file are reported first.
     """
 
     settings: Settings

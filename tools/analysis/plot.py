@@ -1,7 +1,7 @@
 """Run ``softfinger plot FILE.mcap``: plot a recording versus time, and compare it with the model.
 
 The model uses the recorded settings and calibrations. Force and energy are taken from the recorded
-states. The recorded force and energy include the modulus factor that was estimated in grips.
+states. These values include the modulus factor that was estimated during grips.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Missing(SoftfingerError):
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """Recording, or part of a recording, in SI units.
+    """All or part of a recording, in SI units.
 
     ``t`` is relative to the first message of the recording. ``states`` contains one array per
     field. The fields are named as in the stream; the names of nested fields contain a dot.

@@ -141,7 +141,7 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
 
 
 def _kept(name: str, tables: list[Report]) -> list[Row]:
-    """Convert the rows of all tables for JSON, with NaN replaced by null."""
+    """Convert the rows of all tables to JSON values, and replace NaN with null."""
     return [
         {"measurement": name, "table": table.title}
         | {key: None if value != value else value for key, value in row.items()}

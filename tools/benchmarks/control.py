@@ -1,4 +1,4 @@
-"""Measure the object angle error that remains with each control law of the grip.
+"""Measure the error that remains in the object angle with each control law.
 
 An object is placed between the fingers at an angle and then grasped. The error is computed from the
 object's true angle in the simulation, not from the daemon's estimate. The simulated plants differ
@@ -41,9 +41,9 @@ _SLOW_BANDWIDTH, _FAST_BANDWIDTH = 0.5, 4.0
 
 
 class Altered(Grip):
-    """The daemon's control law, which receives the object angle with a ``delay`` [s].
+    """The daemon's control law, with the object angle delayed by ``delay`` [s].
 
-    The torque constants of the two joints differ by ``apart``, as a fraction of their mean.
+    ``apart`` is the difference between the two joints' torque constants, divided by their mean.
     """
 
     def __init__(self, hand: SimulatedDaemon, delay: float = 0.0, apart: float = 0.0) -> None:
@@ -67,8 +67,8 @@ class TwoPhased(Altered):
     """Serial two-phased controller from the literature.
 
     Phase one integrates the object angle error with ``bandwidth`` [Hz] into an antisymmetric joint
-    goal. Phase two is a PD law that moves the joints to this goal. Equal bias torques for the grip
-    are computed from the requested force and added. The measured force is not used.
+    goal. Phase two is a PD law that moves the joints to this goal. Both torques also include an
+    equal bias, which is computed from the requested force. The measured force is not used.
     """
 
     def __init__(
@@ -94,13 +94,13 @@ _DEFAULT: Sections = {}
 
 
 class Way(NamedTuple):
-    """Control law to test, with its `control` settings, the plant's settings and the aim [°]."""
+    """Control law under test, with its settings, the plant's settings and the target error [°]."""
 
     control: Mapping[str, Any] = _DEFAULT
     tips: Sections = _DEFAULT
     aim: float | None = None
     is_steered: bool = False  # True if the measured angle is controlled to 0
-    law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's control law
+    law: Callable[[SimulatedDaemon], Grip] | None = None  # control law that replaces the daemon's
     force: float = _FORCE
     # Load along x and y after the grip is established [N].
     weight: tuple[float, float] = (0.0, 0.0)
@@ -132,7 +132,7 @@ def _upright(
     weight: tuple[float, float] = (0.0, 0.0),
     **simulation: Any,
 ) -> Way:
-    """Return a test of the `upright` law on a plant that violates the assumptions of this law."""
+    """Return a test of the `upright` law on a plant that violates the law's assumptions."""
     tips: Sections = {"simulation": simulation}
     if width:
         tips = {"object": {"width": width}, "simulation": {"object_width": width}}
@@ -213,7 +213,7 @@ def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
 
 
 def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
-    """Return one law's row, with the residual angles on ``plants`` and the number of lost objects.
+    """Return one law's row, with the residual angles on ``plants`` and the count of lost objects.
 
     ``angles`` lists the residual angle on each plant [°], or None if the object is not held.
     """

@@ -1,12 +1,13 @@
 """Measure the run time and the error of contact table lookups and frame estimates.
 
-All measured functions take turns in one run. All lookups use the same random points with |θ| up to
-30° and d up to 8 mm. Half of the displacements are distributed uniformly, and half logarithmically
-down to 1 µm. The reported error is the maximum relative deviation from quadrature with many nodes.
+Within one run, calls to all measured functions alternate. All lookups use the same random points
+with |θ| up to 30° and d up to 8 mm. Half of the displacements are uniformly distributed. The
+logarithms of the other half are uniformly distributed, down to 1 µm. The reported error is the
+maximum relative deviation from a quadrature with many nodes.
 
 Each frame has 44 × 44 cells on a 58 mm square. The contact has d = 4 mm and a tilt of 15°, unless a
 row gives other values. The noise is 0.2 % of the modulus. As in the control loop, the estimator is
-called from Python. Spring tips and solid tips are measured in turn. The table lists the RMS errors
+called from Python. Both spring tips and solid tips are measured. The table lists the RMS errors
 over these frames and the Cramér-Rao bound. The "sensor" rows show the errors for a profile's sensor
 after one second of constant contact.
 """
@@ -55,7 +56,7 @@ _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
 _D_MAX, _TILT_MAX = 0.008, math.radians(30.0)  # [m], [rad]
-_SINGLE_POINT_COUNT = 16  # number of points for separate calls with scalar arguments
+_SINGLE_POINT_COUNT = 16  # number of points that are looked up in separate calls
 _CALL_AIM_NS = 800.0  # target duration of one call [ns]
 
 
@@ -84,7 +85,7 @@ def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
 
 
 def lookups(rounds: int, count: int = 512) -> Report:
-    """Measure the time per point [ns] and the error of lookups, in one or in separate calls."""
+    """Measure the time per point [ns] and the error, for vectorised and for single lookups."""
     rng = np.random.default_rng(3)
     even = rng.uniform(0.0, _D_MAX, count)
     spread = 10.0 ** rng.uniform(-6.0, np.log10(_D_MAX), count)
@@ -150,7 +151,7 @@ def frames_to_contacts(rounds: int) -> Report:
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
     times = {name: taken / _FRAME_COUNT for name, taken in interleave(subjects, rounds).items()}
-    # Use the minimum, because other programs on the machine affect the minimum least.
+    # Other programs on the machine affect the minimum least.
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
     for name, (run, truth, aim) in cases.items():
@@ -171,7 +172,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
 
     For a constant modulus, the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance is
     d (4a − d)/6 − sin² θ d (12a − 5d)/36. The initial footprint contains all cells above a
-    threshold. The footprint is then recomputed from the last d and tilts.
+    threshold. The footprint is then recomputed from the latest d and tilts.
     """
     cells, a = GRID.on(TIP), TIP.radius
     x = cells.x + cells.pitch_x * (np.arange(SIZE) + 0.5)
@@ -201,7 +202,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
 
 
 def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> FloatArray:
-    """Estimate d and tilts [count, 3] from a profile's sensor that has been pressed for 1 s."""
+    """Estimate d and tilts [count, 3] with a profile's sensor, after 1 s of constant contact."""
     model = make_sensor_model(settings, 0)
     estimator = make_estimator(settings, make_material(settings.material))
     counts = np.zeros(model.grid.shape, np.uint16)
@@ -216,7 +217,7 @@ def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> Floa
 def bound() -> float:
     """Return the Cramér-Rao bound for d [m] from all cells, for unknown tilts and gain.
 
-    Pressure derivatives with respect to (d, tilt_x, tilt_y, gain) are central differences.
+    The derivatives of pressure with respect to (d, tilt_x, tilt_y, gain) are central differences.
     """
     at, slopes = np.array([*TRUTH, 1.0]), []
     for step in np.diag(_STEPS):

@@ -35,7 +35,7 @@ SETTLES = "settles at 0.8 to 1.2 without a force increase"
 BOUNDED = "≤ 50 ms above 1.3, reported within 0.3 s"
 _SETTLED_RANGE = (0.8, 1.2)
 _EXCESS_TIME_MAX = 0.05  # maximum time with a force above 1.3 times the requested force [s]
-_REPORT_TIME_MAX = 0.3  # time limit for a report, counted from the midpoint of the onset [s]
+_REPORT_TIME_MAX = 0.3  # time limit for a fault report, measured from the middle of the onset [s]
 _SLIDE_MAX = 0.010  # m
 
 # Phases of a trial.
@@ -45,8 +45,7 @@ _OBSERVATION_TIME = 5.0  # observation time after the fault [s]
 _REPEATED_LAG = 1.0  # time from the fault to the second force request [s]
 
 _SENSORS = ("left_sensor", "right_sensor")
-# Real tactile boards have a full scale of 127.5 kPa, and the simulated sensor has 262 kPa by
-# default.
+# Real tactile boards have a full scale of 127.5 kPa. The simulated sensor's default is 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
@@ -119,7 +118,7 @@ NAMES = tuple(case.name for case in CASES)
 class GripTrial:
     """Outcome of a trial.
 
-    Forces are relative to the requested force. Times [s] are counted from the grasp or from the
+    Forces are relative to the requested force. Times [s] are measured from the grasp or from the
     fault.
     """
 
@@ -129,11 +128,11 @@ class GripTrial:
     peak: float = 0.0  # maximum force of either tip
     above: float = 0.0
     slid: float = 0.0  # m
-    end: str = ""  # fault or mode at the end
+    end: str = ""  # final fault or mode
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
-        """Store the results of ``watch`` and the final state of the hand."""
+        """Store the results of ``watch`` and the hand's final state."""
         self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events
@@ -141,7 +140,7 @@ class GripTrial:
     def named(self, rightly: bool) -> list[tuple[float, str]]:
         """Return (time, channel) of each correct diagnosis.
 
-        If ``rightly`` is False, the wrong diagnoses are returned.
+        If ``rightly`` is False, the wrong diagnoses are returned instead.
         """
         names = [
             (t, k.removeprefix(_EVENT_PREFIX))
@@ -171,7 +170,7 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return one table per criterion, for the cases whose names contain ``only``.
+    """Run the cases whose names contain ``only``; return one table per criterion.
 
     ``brief`` runs one trial per case. ``sweep`` maps trials to outcomes in one or more processes.
     """
@@ -231,7 +230,7 @@ def trial(case: FaultCase, seed: int) -> GripTrial:
 
 
 def summary(case: FaultCase, found: Sequence[GripTrial]) -> Row:
-    """Return a case's row, with the median, extremes, missed criteria and event times."""
+    """Return a row with a case's force statistics, missed criteria and event times."""
     settled = [each.settled for each in found if not math.isnan(each.settled)]
     missed = [each.missed(case) for each in found]
     return {
@@ -258,7 +257,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Format each event kind with its trial count and the median time of its first event [s]."""
+    """Format each event kind, the number of trials with it, and its median first time [s]."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

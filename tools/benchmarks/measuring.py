@@ -1,4 +1,4 @@
-"""Functions for all measurements: interleaved timing and result tables."""
+"""Time functions alternately, and format the results as tables."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from softfinger.tools.terminal.text_layout import plain_table, table_text
 # Result of one measurement. Each key is a column heading, and "name" is the first column.
 Row = dict[str, Any]
 
-# Duration of a repetition [s]. A repetition is short enough to avoid most interruptions, but long
-# relative to the clock resolution.
+# Duration of a repetition [s]. A repetition is short enough to avoid most interruptions, but much
+# longer than the clock resolution.
 _SLICE = 4e-4
 
 
@@ -47,9 +47,9 @@ class Report:
 
 
 def attempt(title: str, part: Callable[[], Report]) -> Report:
-    """Run one part of a measurement; on an error, return a report with the reason of the failure.
+    """Run one part of a measurement; if it fails, return a report that states the reason.
 
-    The remaining parts still run after an error, e.g. if a hand loses its grip on a busy machine.
+    The other parts therefore run even if, for example, a hand loses its grip on a busy machine.
     """
     try:
         return part()
@@ -76,9 +76,9 @@ def interleave(
 ) -> dict[str, NDArray[np.float64]]:
     """Measure each subject's time per call [ns], with one value per round.
 
-    The subjects take turns, so that a slow phase of the machine affects all of them. The first call
-    to each subject, which compiles it, is not counted. Each measurement repeats the call to fill a
-    time slice. Garbage collection is disabled during the measurement.
+    Calls to the subjects alternate, so a slow phase of the machine affects all subjects. The first
+    call compiles the subject and is not counted. Each measurement repeats the call to fill a time
+    slice. Garbage collection is disabled during the measurement.
     """
     timers, repeats = {name: Timer(run) for name, run in subjects.items()}, {}
     for name, timer in timers.items():

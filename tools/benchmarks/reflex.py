@@ -23,7 +23,7 @@ from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-# Three kinds of tips with an ideal sensor, and spring tips with defective sensors.
+# Three kinds of tips with an ideal sensor, and spring tips with each defective sensor.
 TIPS: dict[str, Sections] = {
     "springs": {},
     "bristles": {"simulation": {"tip_law": "bristles"}},
@@ -56,7 +56,7 @@ class Overload(NamedTuple):
 def measure(
     brief: bool = False, full: bool = False, sweep: Callable[..., Iterable[Any]] = map
 ) -> list[Report]:
-    """Return one table for each tip or sensor and object mass; ``brief`` runs fewer cases.
+    """Return a table for each entry of `TIPS` with each object mass; ``brief`` runs fewer cases.
 
     ``sweep`` maps cases to outcomes in one or more processes.
     """

@@ -1,4 +1,4 @@
-"""Test rigs for several benchmarks: daemons with a held object, canned backends, emulated hands."""
+"""Provide daemons that hold an object, canned backends and emulated hands for benchmarks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SOLID: Sections = {  # tips of solid rubber
     "material": {"law": "constant", "modulus": 0.15e6},
     "safety": {"d_max": 0.008},
 }
-SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor has only noise
+SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor adds only noise
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
 SOFTFINGER = (sys.executable, "-m", "softfinger")
@@ -38,7 +38,7 @@ _FRAME_COUNT = 16  # number of frames through which the benchmark cycles
 
 
 class RigError(SoftfingerError):
-    """Error raised if the test rig does not work and the measurement is therefore impossible."""
+    """Error raised if a test rig fails, so that a measurement is impossible."""
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
@@ -91,7 +91,7 @@ def must_hold(daemon: Daemon) -> None:
 
 
 class _Canned:
-    """Base class for canned backends, whose operations do nothing."""
+    """Base class for canned backends; its operations do nothing."""
 
     def close(self) -> None:
         """Do nothing."""

@@ -27,25 +27,24 @@ from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
 # Time limit for establishing the hold, duration of the undisturbed hold, and observation time [s].
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
-# Two limits of the relative force error, and the displacement limit [m].
+# Two limits for the relative force error, and one for the displacement [m].
 _ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01
 _REPORT_TIME_MAX = 2.0  # time limit for reporting a force error above `_ERROR_MAX` [s]
-# Limits without a load: ratio of force to requested force, and time above this ratio [s].
+# Limits before a load is applied: ratio of force to requested force, and time above it [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
 _EVENT_PREFIX = "consistency."
 # Logarithm of the gain error above which the daemon may report a faulty sensor.
 _GAIN_ERROR_MIN = math.log(1.3)
-_LOAD_FRACTION = 0.8  # fraction of the friction limit below which the object must not be lost
+_LOAD_FRACTION = 0.8  # loads below this fraction of the friction limit must be held
 
-# Real tactile boards have a full scale of 127.5 kPa, and the simulated sensor has 262 kPa by
-# default.
+# Real tactile boards have a full scale of 127.5 kPa. The simulated sensor's default is 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 _LATENCY = Settings().tactile.latency
 
 
 @dataclass(frozen=True)
 class HandCase:
-    """Grip with ``force`` [N] by a hand that differs from the daemon's settings."""
+    """Grip at ``force`` [N] with a hand that differs from the daemon's settings."""
 
     name: str
     force: float
@@ -176,14 +175,14 @@ class Outcome:
 
     held: bool = False  # True if the hold was established
     settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released
-    peak: float = 0.0  # maximum force of either tip without a load
-    above: float = 0.0  # longest time above `_EXCESS_RATIO` without a load [s]
+    peak: float = 0.0  # maximum force of either tip before the load is applied
+    above: float = 0.0  # longest unloaded time above `_EXCESS_RATIO` [s]
     first_off: float = math.inf  # time when the mean error first rose above `_ERROR_MAX` [s]
     named: float = math.inf  # time of the first diagnosis [s]
     accused: tuple[str, ...] = ()  # channels that were wrongly diagnosed as faulty
-    raised: bool = False  # True if the force was increased without a load
+    raised: bool = False  # True if the force was increased before the load
     lost: bool = False
-    end: str = ""  # fault or mode at the end
+    end: str = ""  # final fault or mode
 
     def well(self) -> bool:
         """Return True if the force error is below `_ERROR_MAX` or was reported in time."""

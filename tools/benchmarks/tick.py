@@ -35,7 +35,7 @@ _IN_TURN = 20  # number of cycles before switching between ticks and exchanges
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Return tick times [µs] while holding an object, and the run time per virtual second [ms]."""
+    """Return tick times [µs] with a held object, and the run time per virtual second [ms]."""
     rounds, turns = (10, 10) if brief else (40, 60)
     parts: dict[str, Callable[[str], Report]] = {
         "tick": partial(_in_turns, rounds=rounds),
@@ -60,7 +60,7 @@ def _simulated(title: str, seconds: int) -> Report:
 
 
 def _in_turns(title: str, rounds: int) -> Report:
-    """Measure the pipeline back to back, with and without subscribers, and in place at 3 rates.
+    """Time ticks back to back, with and without subscribers, and in place at three rates.
 
     SCHED_FIFO is used if permitted.
     """
@@ -119,7 +119,7 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
 
 
 def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Alternately time complete ticks and plain servo exchanges over ptys during a hold.
+    """While holding an object, time complete ticks and plain servo exchanges over ptys alternately.
 
     A ``baud`` of 0 disables pacing, and ``changes`` override the profile. Raises RigError if the
     hand loses its grip, e.g. on a busy machine.

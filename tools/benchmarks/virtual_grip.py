@@ -18,13 +18,13 @@ from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 
-EXCESS_RATIO = 1.3  # an excessive force exceeds this multiple of the requested force
-LOST_SLIDE = 0.1  # the object counts as lost above this displacement along its faces [m]
+EXCESS_RATIO = 1.3  # a force above this multiple of the requested force is excessive
+LOST_SLIDE = 0.1  # displacement along its faces above which the object counts as lost [m]
 _TORQUE_ERROR = 0.1  # maximum relative error of the torque constant
-# Goal current that counts as a reaction, relative to the current during the hold.
+# Ratio of goal current to the current during the hold, above which the daemon has reacted.
 _INCREASED_RATIO = 1.25
 _AVERAGING_TIME = 0.5  # duration of the final part of the hold, in which the force is averaged [s]
-_SLIP_FRACTION = 0.999  # a tip counts as slipping above this fraction of the friction limit
+_SLIP_FRACTION = 0.999  # fraction of the friction limit above which a tip counts as slipping
 
 
 class Watch:

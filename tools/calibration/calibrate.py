@@ -1,4 +1,4 @@
-"""Run ``softfinger calibrate``: calibrate the hand or one tip's sensor, one step per call."""
+"""Run ``softfinger calibrate``: perform one calibration step for the hand or for one tip."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ STEPS = (
     "scales",
 )
 _OF_PROFILE = STEPS[: STEPS.index("tare")]  # All other steps calibrate a single tip.
-# Fraction of the prior standard deviation. A sensor gain with a larger standard deviation has never
-# been measured in a grip.
+# Fraction of the prior standard deviation. If a sensor gain's standard deviation exceeds this
+# fraction, the gain has never been measured in a grip.
 _LEARNT = 0.8
-# Minimum relative standard deviation of each factor. Rubber and joints change from day to day.
+# Minimum relative standard deviation of each stored factor, because rubber and joints change from
+# day to day.
 _LEAST = 0.02
 _EPILOG = """\
 steps for a hand; FILE is a profile; if it does not exist, the --config profile is copied to FILE:

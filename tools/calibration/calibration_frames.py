@@ -32,12 +32,12 @@ from softfinger.tools.arguments import to_stderr
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
 _PATIENCE = 10.0  # maximum interval without a new frame [s]
 _WAIT = 60.0  # time limit for `--move` [s]
-_BEFORE = 4000  # maximum number of frames stored before a hold
+_BEFORE = 4000  # maximum number of frames stored before a load is applied
 
 
 @dataclass(frozen=True)
 class Loads:
-    """Loads in a calibration step.
+    """Loads that were applied in a calibration step.
 
     Attributes
     ----------
@@ -77,8 +77,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
                 raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
-            # If a single recording contains the whole run, each frame with a contact counts as a
-            # load.
+            # If one recording contains the whole run, each frame with a contact is a separate load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
             frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
             return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})

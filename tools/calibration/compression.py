@@ -1,4 +1,4 @@
-"""Run `calibrate law --compression`: fit a tip's material law to CSV files of a testing machine.
+"""Run `calibrate law --compression`: fit a tip's material law to a testing machine's CSV files.
 
 A file contains strain and stress, or displacement and force. A file with displacement and force
 also requires the tilt, in a column or from ``--theta``.
@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 class _Quantity(NamedTuple):
-    """Column names and units that a file may use for a quantity; the units have SI factors."""
+    """Column names that a file may use for a quantity, and the SI factor of each unit."""
 
     words: set[str]
     units: dict[str, float]
@@ -76,7 +76,7 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     """Read a file's known columns and convert them to SI units.
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
-    semicolon. The unit of a column is given after the column name, or in a separate row below the
+    semicolon. The unit of a column follows the column name, or is in a separate row below the
     header. Other columns, empty lines and lines that begin with # are ignored.
 
     Raises
@@ -149,7 +149,7 @@ def _is_number(cell: str) -> bool:
 
 @dataclass(frozen=True)
 class _Test:
-    """Test run, and its name in messages."""
+    """Test run, with the name used in messages."""
 
     name: str
     run: Run
@@ -228,7 +228,7 @@ def _force_law(
         raise CalibrationError(f"law: {'; '.join(notes)}")
     best, deepest = ours[0], max(run.depth for run in runs)
     force = max(float(np.ptp(run.force)) for run in runs)
-    # Attribute any residual beyond the noise to the material law.
+    # Residuals that exceed the noise are attributed to the material law.
     misfit = best.residual * math.sqrt(max(1.0 - 1.0 / best.chi2, 0.0)) / force
     count = 0 if _is_constant(best) else _POINTS
     strain = np.linspace(0.0, deepest / tip.radius, count + 1)[1:]

@@ -30,7 +30,7 @@ _FROM_ENDS = 0.05  # margin at each end of the joint range [rad]
 # Angle tolerance at the start of a sweep [rad]. Friction may stop a joint before its goal.
 _ARRIVED = 0.05
 _REST = 0.3  # pause between two strokes, in addition to the setpoint smoothing time [s]
-_TOUCHED = 0.2  # time discarded before and after each contact [s]; contact detection takes time
+_TOUCHED = 0.2  # time discarded before and after each contact [s], because detection takes time
 # The break-away friction is reported if it exceeds the sliding friction by this number of standard
 # deviations.
 _SEEN = 2.0
@@ -70,7 +70,7 @@ def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str
 def _fit(
     columns: dict[str, NDArray[Any]], name: str, settings: Settings, unit: float
 ) -> FrictionFit:
-    """Fit the friction to a joint's motion without contact. Raises CalibrationError."""
+    """Fit a joint's friction parameters to its motion without contact. Raises CalibrationError."""
     t, touched = columns["t"], columns[f"{name}.contact"]
     used = columns["torque"].copy()
     for begin, end in _stretches(touched):
@@ -137,8 +137,8 @@ def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArr
 def _way(settings: Settings, name: str) -> tuple[float, float]:
     """Return the start and signed length [rad] of a joint's sweeps.
 
-    The sweeps open the joint if its range permits, and close it otherwise. Raises CalibrationError
-    if the range is too short.
+    The sweeps open the joint if its range permits; otherwise, they close the joint. Raises
+    CalibrationError if the range is too short.
     """
     hand, finger = settings.hand, FINGERS.index(name)
     start = hand.open_angle[finger]
@@ -156,7 +156,7 @@ def _way(settings: Settings, name: str) -> tuple[float, float]:
 def _stroke(
     hand: LiveHand, settings: Settings, name: str, ends: tuple[float, float], speed: float
 ) -> None:
-    """Move a joint from one end to the other at ``speed`` [rad/s]. Raises CalibrationError."""
+    """Move a joint between ``ends`` at ``speed`` [rad/s]. Raises CalibrationError."""
     first, last = ends
     touch, rest = settings.control.contact_force, _REST + settings.control.smooth_time
     seconds = abs(last - first) / speed

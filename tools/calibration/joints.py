@@ -1,8 +1,8 @@
 """Run `calibrate joints` and `calibrate heat`: write servo data to a profile.
 
-During `calibrate joints`, torque is off and the user moves each finger by hand. The servo counts
-are read in the closed, open and zero poses. `calibrate heat` fits the thermal constants to the
-recording of a hold that lasts several minutes.
+During `calibrate joints`, torque is off and the user moves each finger manually. The servo counts
+are read in the closed, open and zero poses. `calibrate heat` fits the thermal constants to a
+recording in which the hand holds an object for several minutes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _POSES = {
     "zero": "point the finger straight away from the palm",
 }
 _LEAST = 0.2  # minimum joint rotation from open to closed [rad]
-_ALONE = 0.25  # maximum rotation of the other joint, as a fraction of this joint's rotation
+_ALONE = 0.25  # maximum ratio of the other joint's rotation to this joint's rotation
 _MARGIN = 0.03  # margin between each joint stop and the commanded range [rad]
 _Counts = dict[int, int]  # The keys are servo IDs.
 
@@ -106,8 +106,8 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
                 f"servo {servo}: torque is on: stop `softfinger run`, or send `disarm`"
             )
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # After power-up, the position of a servo is its encoder count, which is always less than
-        # one turn.
+        # After power-up, a servo's position is its encoder count, which is always less than one
+        # turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder
@@ -196,7 +196,7 @@ def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any
 
 
 def put(text: str, section: str, values: Mapping[str, Any]) -> str:
-    """Return a profile's text with ``values``, i.e. arrays or numbers, set in ``[section]``.
+    """Return a profile's text with ``values`` (arrays or numbers) set in ``[section]``.
 
     If the profile has no ``[section]`` header but uses dotted keys, ``section.key`` is used.
     """

@@ -29,13 +29,13 @@ FloatArray = NDArray[np.float64]
 _STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, divided by the first force
 _HELD = 0.5  # hold time at each force [s]
 _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
-# Accepted range for the ratio of d from frames to d from joints. A ratio outside this range means
-# that the frames do not match the motion of the joints.
+# d is estimated from the frames and computed from the joint angles. If the ratio of the two values
+# is outside this range, the frames do not match the joint motion.
 _SCALE = 0.5, 2.0
 # Maximum rms residual [m]. Larger residuals indicate sliding, tilting or a second contact.
 _MISFIT_MAX = 0.3e-3
-# Relative errors of d from frames. The first error applies to d estimated from the frame shape. The
-# second error applies to d estimated from the frame amplitude.
+# Relative error of d if d is estimated from the frame shape, and if d is estimated from the frame
+# amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 
@@ -94,7 +94,7 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
-    """Grasp with several forces, then open the hand; return the hand with its stored stream."""
+    """Grasp at several forces, then open the hand; return the hand with the stored stream."""
     first = arguments.force[0] if arguments.force else settings.control.force_default
     forces = [min(step * first, settings.safety.force_max) for step in _STEPS]
     bring(
@@ -113,10 +113,10 @@ def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
 
 
 def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times, the sum of d over all fingers, and its standard deviation due to noise.
+    """Return times, the sum of d over all fingers, and the sum's standard deviation due to noise.
 
-    Each frame is estimated independently. The times are the sample times of the first finger's
-    frames during which all fingers are in contact.
+    Each frame is estimated independently. The times are the scan times of the first finger's
+    frames, limited to the period in which all fingers are in contact.
     """
     names = sorted(own.scene.fingers)
     models = recorded_models(source)
@@ -151,7 +151,7 @@ def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArra
 
 
 def _closing(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray]:
-    """Return times and d1 + d2 [m] from the joint angles; d1 + d2 has an unknown constant offset.
+    """Compute d1 + d2 [m] versus time from the joint angles, up to an unknown constant offset.
 
     The sum d1 + d2 = W + 2a − (O2 − O1)·n does not change if the object moves between the tips.
     """

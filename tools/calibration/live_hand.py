@@ -88,7 +88,7 @@ class LiveHand:
                 yield state
 
     def until(self, holds: Callable[[HandState], object]) -> None:
-        """Wait until ``holds`` is true for the state; raise CalibrationError after 20 s."""
+        """Wait until ``holds(state)`` is true; raise CalibrationError after 20 s."""
         begin = None
         for state in self.states():
             if holds(state):
@@ -98,7 +98,7 @@ class LiveHand:
                 raise CalibrationError(f"the hand is still {state.mode} after {_WITHIN:g} s")
 
     def wait(self, seconds: float) -> None:
-        """Wait for ``seconds`` on the hand's clock."""
+        """Wait for ``seconds``, measured on the hand's clock."""
         end = next(self.states()).mono_ns + int(1e9 * seconds)
         self.until(lambda state: state.mono_ns >= end)
 

@@ -1,4 +1,4 @@
-"""Compute the contents of the calibration file from loads, step by step.
+"""Compute the calibration file's contents from the loads of each calibration step.
 
 `kinematics.calibration.calibration` contains the mathematics, and
 `daemon.perception.calibration_file` defines the file format.
@@ -64,8 +64,8 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-# A warning is given if the rubber softens by more than this fraction after the first loads. The
-# test plate and noise cause smaller changes.
+# If the rubber softens by more than this fraction after the first loads, a warning is printed. The
+# changes caused by the test plate and noise are smaller.
 _SOFTENS = 0.03
 # New calibration, summary line, and plot panels.
 Done = tuple[Calibration, str, tuple[Panel, ...]]
@@ -87,7 +87,7 @@ def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
 
 @dataclass(frozen=True)
 class Step:
-    """Inputs for one step, and quantities that several steps use."""
+    """Inputs to one step, and quantities that several steps use."""
 
     arguments: argparse.Namespace
     settings: Settings
@@ -96,17 +96,17 @@ class Step:
 
     @cached_property
     def converter(self) -> Converter:
-        """Conversion from counts to pressure, based on the calibration steps completed so far."""
+        """Converter from counts to pressure, based on the calibration steps completed so far."""
         return Converter(self.calibration, self.settings.tactile.pascal_per_count)
 
     @property
     def theta(self) -> FloatArray:
-        """Tilt of each load [rad]."""
+        """Tilt at each load [rad]."""
         return self.loads.truths.get("theta", np.zeros(len(self.loads.frames)))
 
     @cached_property
     def over(self) -> list[FloatArray]:
-        """Mean counts minus zero offset, multiplied by the gains; clipping at 0 is corrected."""
+        """Mean counts minus the zero offset, times the gains; clipping at 0 is corrected."""
         tare, zero, gain = self.calibration.tare, self.converter.zero, self.converter.gain
         means = [frames.mean(axis=0) for frames in self.loads.frames]
         if tare is None or self.settings.tactile.threshold:
@@ -115,7 +115,7 @@ class Step:
 
     @cached_property
     def readings(self) -> list[FloatArray]:
-        """Mean readings of each load, without the noise of cells far from the contact."""
+        """Mean readings at each load, without the noise of cells far from the contact."""
         noise = self.calibration.tare.noise if self.calibration.tare else 0.0
         spread = np.full(self.converter.zero.shape, noise)
         return [
@@ -125,7 +125,7 @@ class Step:
 
     @cached_property
     def pressures(self) -> FloatArray:
-        """Mean pressure [Pa] of each load, float64 [loads, rows, cols]."""
+        """Mean pressure [Pa] at each load, float64 [loads, rows, cols]."""
         return np.stack(
             [
                 np.mean([self.converter(frame) for frame in frames], axis=0)
@@ -214,7 +214,7 @@ def _curve(step: Step) -> Done:
             raise CalibrationError(
                 "curve: expected --force or --d, or a run that contains force or d"
             )
-        # Compute the force on the whole footprint from the material in the profile.
+        # Use the profile's material to compute the force on the whole footprint.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
         pressures = [
             step.plain_grid.pressure(tip, material, float(x), float(theta))
@@ -266,7 +266,7 @@ def _modulus(step: Step) -> Done:
     pressed = zip(step.pressures, step.readings, strict=True)
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
-    whole = ~full.any(axis=(1, 2))  # Saturated cells hide part of the force.
+    whole = ~full.any(axis=(1, 2))  # Saturated cells read less than their actual load.
     tip = make_tip(step.settings)
     found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
@@ -346,7 +346,7 @@ def _law(step: Step) -> Done:
 
 
 def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArray]:
-    """Fit curves to the loads.
+    """Fit the tip's measured curves to the loads.
 
     Returns
     -------
@@ -394,7 +394,7 @@ def _measured_told(law: TipCurves, left: FloatArray) -> str:
 
 
 def _over_d(trend: Trend) -> str:
-    """Describe E at the minimum, middle and maximum d, with a warning if E drifts."""
+    """Describe E at the minimum, middle and maximum d, and append a warning if E drifts."""
     order = np.argsort(trend.d, kind="stable")[[0, len(trend.d) // 2, -1]]
     values = ", ".join(f"{each / 1e6:.3f}" for each in trend.modulus[order])
     depths = ", ".join(f"{each * 1e3:g}" for each in trend.d[order])

@@ -63,7 +63,7 @@ def _force_table_i(d: Numbers, theta: Numbers) -> FloatArray:
 
 
 def compression() -> tuple[Sheet, ...]:
-    """Tabulate the model's force and the sum over the cells, versus displacement and angle."""
+    """Tabulate the model's force and the sum of the cells' forces versus d and θ."""
     material = Material.constant(MODULUS)
     d = np.arange(81) / 10.0
     columns = {"d [mm]": d}
@@ -106,7 +106,7 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return the force while the finger rotates about its root, and then while the object rolls.
+    """Return the force as the finger rotates about its root, and as the object then rolls.
 
     For each final displacement D, the root is D/sin 11.5° away from the tip centre. The tip first
     touches the object at θ = 0, so d = D sin |θ|/sin 11.5° during the rotation. During rolling, d

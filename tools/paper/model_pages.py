@@ -45,7 +45,7 @@ MPA = 1e-6
 _NODES = 64  # number of Gauss nodes per double integral
 _STEEP_TILT = 25  # tilt at which the figure states the slope [degrees]
 _FITTED = slice(10, None)  # rows used to fit the exponents (d from 1 to 8 mm)
-_STEP = 1e-4  # finite-difference step, relative for d and in rad for θ
+_STEP = 1e-4  # finite-difference step: relative for d, in rad for θ
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
 
@@ -208,7 +208,7 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Tabulate the quantity and its exponents versus d, up to 8 mm, at each tilt.
+    """Tabulate the quantity and its exponents at each tilt, for d up to 8 mm.
 
     For each tilt, a second sheet contains the fitted exponent, and the quantity divided by its
     value at θ = 0. The second sheet is computed from the double integral, not from the closed form.
@@ -245,7 +245,7 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def _power(d: FloatArray, values: FloatArray) -> float:
-    """Fit a power law in d to ``values`` from 1 to 8 mm and return its exponent."""
+    """Fit a power law to ``values`` for d from 1 to 8 mm, and return its exponent."""
     return float(np.polyfit(np.log(d[_FITTED]), np.log(values[_FITTED]), 1)[0])
 
 

@@ -36,7 +36,7 @@ from softfinger.tools.style import GREY, KINDS, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ), and the result of `_estimates`
+Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ), then estimates
 
 RADIUS = 0.020  # m
 SCAN = 0.040  # s
@@ -74,7 +74,7 @@ def run_compression(tilt: float) -> dict[str, FloatArray]:
 
 
 def run_rotation() -> dict[str, FloatArray]:
-    """From first touch, rotate the finger by 11.5° about its root against a fixed object.
+    """Starting at first touch, rotate the finger by 11.5° about its root against a fixed object.
 
     The tip's distance from the root is chosen so that d reaches 4 mm. The servo moves the joint.
     Between frames, d and θ are predicted from the joint angle.
@@ -176,7 +176,7 @@ def _estimates(contact: Contact) -> tuple[float, ...]:
 def _columns(
     rows: Iterable[Row], daemon: Daemon, suffix: str = "", sign: float = 1.0
 ) -> dict[str, FloatArray]:
-    """Return true and estimated values per frame; ``sign`` converts θ to the paper's convention."""
+    """Return true and estimated values per frame; ``sign`` is the paper's sign of θ."""
     truth, estimates = (np.array(each) for each in zip(*rows, strict=True))
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
     contact = daemon.tables[0](d, theta)

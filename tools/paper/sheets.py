@@ -1,4 +1,4 @@
-"""Represent a figure by sheets of data, and by panels that are drawn from the sheets."""
+"""Represent a figure by data sheets, and by panels that plot the data."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ from softfinger.tools.style import INK, KINDS, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FORCE, WIDTH = 10.0, 0.040  # force per tip base [N] and object width [m]
+FORCE, WIDTH = 10.0, 0.040  # force on the base of each tip [N], and object width [m]
 REACH = math.radians(8.0)  # maximum object angle in each direction [rad]
 ANTISYMMETRIC_ANGLES = (-4, -2, 0, 2, 4)  # degrees
 _SWING_TIME = 4.0  # duration of a swing from 0 to REACH [s]
@@ -138,7 +138,7 @@ def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
 
 @cache
 def gripped() -> Held:
-    """Return the equilibrium grip of an upright object with unsheared tips."""
+    """Return the equilibrium pose in which unsheared tips grip an upright object."""
 
     def met(x: FloatArray) -> Held:
         q = np.full(2, x[0])
@@ -172,8 +172,8 @@ def potential(there: Held, start: Held) -> float:
 def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
     """Return V at the object angle of ``floor`` plus each offset in ``aside`` [rad].
 
-    V is minimised over all coordinates except the antisymmetric joint angle, which ``floor``
-    provides. The tips roll to each pose from ``start`` in one step. V is NaN where a tip would
+    V is minimised over all coordinates except the antisymmetric joint angle, which is taken from
+    ``floor``. The tips roll to each pose from ``start`` in one step. V is NaN where a tip would
     slip.
     """
     antisymmetric = 0.5 * float(floor.q[0] - floor.q[1])

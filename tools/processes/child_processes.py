@@ -1,7 +1,7 @@
 """Run the monitor and the recorder as child processes of the daemon.
 
-Each child holds one end of a pipe, and only the daemon holds the other end. If the daemon exits for
-any reason, the pipe closes, and the child then exits too.
+Each child reads from a pipe whose other end only the daemon has open. If the daemon exits for any
+reason, the pipe closes and the child exits too.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from softfinger.daemon.errors import SoftfingerError
 
 # This sequence restores the terminal if the monitor was killed.
 RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
-_RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe, and to close its file [s]
+_RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe, and for closing its file [s]
 
 
 class RecorderError(SoftfingerError):

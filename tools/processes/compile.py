@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Built(NamedTuple):
-    """Number of parts that were missing, and True if one of them could not be built."""
+    """Number of parts that were missing, and True if any of these parts could not be built."""
 
     parts: int
     failed: bool
@@ -226,9 +226,9 @@ def _start() -> subprocess.Popen[str]:
 def main() -> None:
     """Compile a scene's kernels part by part, until standard input ends.
 
-    Standard input contains the settings as JSON, followed by one part name per line. Standard
-    output contains a line ``kernel NAME`` when the compilation of a kernel starts. The last line
-    for each part is ``done`` or ``failed REASON``.
+    Standard input contains the settings as JSON, followed by one part name per line. When the
+    compilation of a kernel starts, the line ``kernel NAME`` is written to standard output. The last
+    line for each part is ``done`` or ``failed REASON``.
     """
     # The compiler allocates many long-lived objects, so frequent garbage collection would take 10 %
     # of the time.

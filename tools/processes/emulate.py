@@ -220,7 +220,7 @@ def emulator_process(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def _ready(ports: dict[str, Path]) -> str:
-    """Return the output that announces a ready emulator.
+    """Return the lines that report that the emulator is ready.
 
     The lines are printed together, because readers may wait for the last line.
     """

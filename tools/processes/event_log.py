@@ -33,7 +33,8 @@ _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warnin
 class EventLog:
     """Log in plain text or JSON; the ``line`` method never blocks or fails.
 
-    Lines are appended to ``file`` if the file exists. Raises OSError if the file cannot be opened.
+    If ``file`` already exists, lines are appended to it. Raises OSError if the file cannot be
+    opened.
     """
 
     def __init__(self, form: str = "plain", file: Path | None = None) -> None:
@@ -72,7 +73,7 @@ class EventLog:
         logging.getLogger().addHandler(handler)
 
     def close(self, patience: float = 1.0) -> None:
-        """Write the queued lines, for at most ``patience`` s."""
+        """Write the queued lines, and wait at most ``patience`` s."""
         self._closing = True
         self._news.set()
         self._thread.join(patience)
@@ -119,7 +120,7 @@ def _clock(date: str, timestamp: float) -> str:
 
 
 def _is_journal() -> bool:
-    """Return True if standard error goes to systemd's journal."""
+    """Return True if standard error is connected to systemd's journal."""
     try:
         status = os.fstat(sys.stderr.fileno())
     except (OSError, ValueError, AttributeError):

@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run until a signal arrives or ``--duration`` ends.
+    """Run until a signal arrives or ``--duration`` has elapsed.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def _serve(
 
 @contextmanager
 def _service(loop: Any) -> Iterator[None]:
-    """If requested, notify systemd when the daemon is ready, on each tick and at the end."""
+    """If requested, notify systemd on startup, on each tick and on shutdown."""
     service = Service.of_environment()
     if service is None:
         yield

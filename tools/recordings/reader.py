@@ -1,8 +1,8 @@
 """Read an MCAP file's summary, and its messages in order of arrival.
 
 `Recording` is the reader, and `read_recording` returns the states as NumPy columns. The file may
-come from any MCAP writer and contain other programs' channels. Sizes and counts stated in the file
-are not trusted. The file's size on disk limits the memory use and the run time.
+have been written by any MCAP writer, and may contain other programs' channels. Sizes and counts
+stated in the file are not trusted. The file's size on disk limits the memory use and the run time.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Recording", "read_recording"]
 
-_MESSAGE_SIZE_MAX = 1 << 20  # maximum message size [bytes]; a frame of the largest grid has 0.2 MB
+_MESSAGE_SIZE_MAX = 1 << 20  # maximum message size [bytes]; the largest frame has 0.2 MB
 _SETTINGS_SIZE_MAX = 4 << 20  # maximum settings size [bytes], including per-cell calibrations
-_CHUNK_SIZE_MAX = 64 << 20  # maximum unpacked chunk size [bytes]; usual chunks have 1 to 8 MB
+_CHUNK_SIZE_MAX = 64 << 20  # maximum unpacked chunk size [bytes]; chunks usually take 1 to 8 MB
 # Minimum number of bytes counted per channel or message, because reading even a short record takes
 # time.
 _RECORD_SIZE_MIN = 512
@@ -106,7 +106,7 @@ class Recording:
         self.end = math.nan
         self.chunks = 0
         self._first = 0  # log time of the earliest message [ns]
-        self._left = 0  # number of bytes that may still be unpacked
+        self._left = 0  # remaining number of bytes that may be unpacked
         self._names: dict[int, str] = {}  # maps channel numbers to channel names
         self._other_names: dict[int, str] = {}
         try:
@@ -162,7 +162,7 @@ class Recording:
     @cached_property
     def zero(self) -> int:
         """Time of the first message on the daemon's clock [ns], which is the origin of ``t``."""
-        state = self._left, self.chunks  # Save the variables that the loop changes.
+        state = self._left, self.chunks  # `messages` changes both variables.
         for _, message in self.messages():
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
             if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):

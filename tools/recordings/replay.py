@@ -161,7 +161,7 @@ _POLL_INTERVAL = 1e-3  # s
 
 
 class Wire:
-    """Context manager that publishes on ``address``; ``keys`` restrict the access.
+    """Context manager that publishes on ``address``; ``keys`` restrict access.
 
     Raises RecordingError if the address cannot be bound. An address that other machines can reach
     requires ``keys``.

@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _values(settings: Settings, row: Limit) -> list[str]:
-    """Format a limit's settings, each with the fraction at which the limit is reached."""
+    """Format a limit's settings, each with the fraction at which a violation is reported."""
     share = "" if row.fraction == 1.0 else f"{row.fraction:g} × "
     return [f"{share}{key} = {_shown(_value(settings, key))}" for key in row.keys]
 

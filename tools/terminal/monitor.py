@@ -1,4 +1,4 @@
-"""Run ``softfinger monitor``: show a live page about the hand in the terminal.
+"""Run ``softfinger monitor``: show a live page of the hand in the terminal.
 
 This module parses the arguments, handles keys and signals, and redraws the page. If the output is
 not a terminal, the monitor prints plain lines. `stream_state` collects the data and `monitor_page`
@@ -85,7 +85,7 @@ class HandKeys:
         return self._feed.mode in _GRIPPING
 
     def _adding(self, now: float) -> bool:
-        """Return True just after a force key, while the stream may still contain the old force."""
+        """Return True while the stream may still contain the force from before a key press."""
         reply = self._commander.reply
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
         return now - self._pressed < _ACCUMULATION_TIME and not refused

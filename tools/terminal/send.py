@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def si_numbers(words: list[str]) -> dict[str, float]:
-    """Parse ``key=value`` words into SI numbers.
+    """Parse ``key=value`` words, and convert the values to SI units.
 
     Raises ValueError; the message contains the word and the reason.
     """

@@ -38,7 +38,7 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-RECENT_TIME = 3.0  # period over which the waits of a simulated hand are summed [s]
+RECENT_TIME = 3.0  # period over which a simulated hand's pauses are summed [s]
 EVENT_COUNT_MAX = 200  # number of stored events
 GLOSSARY = (  # meanings of the terms on the pages
     ("d", "displacement of the tip by the object's face"),
@@ -97,7 +97,7 @@ class ShownFrame(NamedTuple):
 
 
 class ShownEvent(NamedTuple):
-    """A single ``hand/event``, prepared for drawing."""
+    """A single ``hand/event`` message, prepared for drawing."""
 
     timestamp: float  # Unix time [s], or NaN if unknown
     level: str
@@ -321,7 +321,7 @@ class _Pending:
     sent: float
     # Reply that refused the command because of a delay, stored until the command is sent again.
     late: dict[str, Any] | None = None
-    again_at: float = 0.0  # time of the next attempt
+    again_at: float = 0.0  # time at which the command is sent again
     warned: bool = False  # True once the page has reported the missing reply
 
 
@@ -329,8 +329,8 @@ class Commander:
     """Send commands without waiting for replies; ``reply`` is the newest reply.
 
     Each command uses its own request socket, so a missing reply does not delay other commands. If
-    the same user runs the daemon on this machine, a stop bypasses the requests of all clients. The
-    daemon replies to the stop on the next tick. If the daemon is stalled, the client waits only
+    the same user runs the daemon on this machine, a stop command bypasses the queue of requests.
+    The daemon replies to the stop on the next tick. If the daemon is stalled, the client waits only
     briefly for this reply.
     """
 

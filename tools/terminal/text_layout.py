@@ -16,7 +16,7 @@ DIM = "#8b929c"
 
 
 def plain_table(*, heads: bool = True) -> Table:
-    """Create a table without rules and with two blanks between columns."""
+    """Create a table without borders, with two blanks between columns."""
     return Table(box=None, padding=(0, 2, 0, 0), show_header=heads)
 
 

@@ -2,7 +2,8 @@
 
 Recordings use the same channel names, schemas and messages (`tools.recordings.channels`). One
 Foxglove layout therefore works for the stream and for recordings. The additional channel
-``hand/scene`` contains the moving hand. Messages that no client has subscribed to are not packed.
+``hand/scene`` contains a drawing of the moving hand. Messages that no client has subscribed to are
+not packed.
 """
 
 from __future__ import annotations

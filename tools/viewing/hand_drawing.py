@@ -121,11 +121,11 @@ def held_outline(
 
 
 def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
-    """Return a list with the true object's outline [m], shape [n, 2], or an empty list."""
+    """Return a list with the object's true outline [m], shape [n, 2], or an empty list."""
     pose = read(TrueState, truth).true_object
     try:
         shape = shape_of(settings)
-    except ValueError:  # The faces of the wedge intersect.
+    except ValueError:  # The settings describe a wedge whose faces intersect.
         return []
     own = np.vstack((shape.corners, shape.corners[:1]))
     if shape.roundness > 0.0:
@@ -153,7 +153,7 @@ def hand_parts(
 
 
 def _held(hand: HandGeometry, state: HandState, height: float) -> list[FloatArray]:
-    """Return a list with the held object's outline; empty unless both tips touch the object."""
+    """Return a list with the object's outline, or an empty list if a tip has no contact."""
     tips = state.left, state.right
     if not state.object.valid or not all(map(touches, tips)):
         return []

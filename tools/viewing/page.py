@@ -1,9 +1,9 @@
 """Serve the ``softfinger view`` page and its pictures, and carry out the page's commands.
 
 A single thread serves the pages. The main thread reads the stream or plays a recording, and creates
-each picture once for all pages. A page requests the next picture after drawing the last picture. A
-slow page therefore skips pictures and does not delay other pages. ``softfinger view`` prints a
-token in the terminal. Pages with this token may send commands, and each page is a separate client.
+each picture once for all pages. After drawing a picture, a page requests the next one. A slow page
+therefore skips pictures and does not delay other pages. ``softfinger view`` prints a token in the
+terminal. Pages with this token may send commands, and each page is a separate client.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _say = to_stderr("view")
 
 
 class _Published(NamedTuple):
-    """Picture with its scene and plot rows."""
+    """Picture with the scene and the plot rows that belong to it."""
 
     scene: str
     picture: str
@@ -209,7 +209,7 @@ class Site:
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Each time a page requests a picture, send the next picture and the missing rows.
+        """Send the next picture and the new plot rows each time a page requests a picture.
 
         A new scene is sent before the picture.
         """
@@ -285,7 +285,7 @@ def _add_headers(_: ServerConnection, __: Request, response: Response) -> None:
 
 
 def _has(request: Request, name: str, secret: str) -> bool:
-    """Return True if the request's query contains this secret under ``name``."""
+    """Return True if ``secret`` is the value of ``name`` in the request's query."""
     given = parse_qs(urlsplit(request.path).query).get(name, [""])[0]
     return secrets.compare_digest(given.encode(), secret.encode())
 
@@ -382,7 +382,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
 
 
 def _address(listener: socket.socket) -> str:
-    """Return host and port for a browser; use the machine's name if all addresses are served."""
+    """Return host and port for a browser; the host is the machine's name for a wildcard address."""
     host, port = listener.getsockname()[:2]
     if host in ("0.0.0.0", "::"):
         host = socket.gethostname()

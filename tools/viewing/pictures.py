@@ -89,9 +89,9 @@ _HEADLINE = (  # title, decimals and plotted fields
     ("Object width", 1, "object.width"),
     ("Displacement d", 2, "left.d right.d"),
 )
-_SERVOS = ("q", "current")  # fields that are missing in a hand without servos
+_SERVOS = ("q", "current")  # fields that are not available without servos
 _DEVIATED = ("force", "d", "theta")  # finger fields whose standard deviation ({}_std) is also drawn
-_OTHERS = {  # names and colours of lines that belong to no finger
+_OTHERS = {  # names and colours of lines that do not belong to a finger
     "object.angle": ("object", OBJECT),
     "object.width": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
@@ -110,7 +110,7 @@ _values = attrgetter(*_FACTORS)
 
 
 def _row(number: int, state: HandState) -> list[Any]:
-    """Create a plot row, with NaN for values that the hand does not have."""
+    """Create a plot row; quantities that the hand does not measure are NaN."""
     row = [number, state.timestamp, printable(state.mode)]
     for value, factor in zip(_values(state), _FACTORS.values(), strict=True):
         row.append(round(min(max(factor * value, -_NUMBER_MAX), _NUMBER_MAX), 4))
@@ -394,7 +394,7 @@ class Pictures:
         return notes
 
     def _facts(self, now: float) -> list[tuple[str, str]]:
-        """Return names and values for the details panel: loop times, frames, servos and losses."""
+        """Return names and values for the details panel, e.g. loop times and lost messages."""
         feed, state, times = self.feed, self.feed.state, self.feed.times
         fingers = [state.finger(name) for name in self._fingers]
 

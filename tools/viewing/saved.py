@@ -16,7 +16,7 @@ from softfinger.tools.viewing.hand_drawing import COLOURS
 from softfinger.tools.viewing.pictures import Pictures, Row
 from softfinger.tools.viewing.sources import Playback, ViewError, marks_of
 
-_PICTURE_COUNT_MAX = 6000  # maximum number of pictures in the page's memory; each has about 10 kB
+_PICTURE_COUNT_MAX = 6000  # maximum number of pictures in the page's memory; each takes about 10 kB
 _SCALE = 3000.0  # SVG user units per metre
 _ARC = 30  # number of points above which a line omits every second point
 
@@ -55,7 +55,8 @@ def _pictures(
 ) -> tuple[list[tuple[str, list[str]]], str, int]:
     """Return each scene with its pictures, all plot rows, and the number of states.
 
-    The scenes, pictures and rows are JSON texts, as the server sends them to a page.
+    The scenes, pictures and rows are JSON texts in the form in which the server sends them to a
+    page.
     """
     scenes: list[tuple[str, list[str]]] = []
     kept: dict[int, str] = {}
