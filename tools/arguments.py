@@ -1,4 +1,4 @@
-"""Command-line arguments shared by several subcommands.
+"""Define command-line arguments that several subcommands share.
 
 The settings module is imported only when a profile is loaded, because clients of a running hand do
 not need settings.
@@ -163,7 +163,7 @@ def _hint(folder: Path | None) -> str:
 
 
 def to_stderr(subcommand: str) -> Callable[[str], None]:
-    """Return a function that prints a line to standard error, after the subcommand's name."""
+    """Return a function that prints the subcommand's name and a text to standard error."""
     return lambda line: print(f"{subcommand}: {line}", file=sys.stderr, flush=True)
 
 
@@ -197,7 +197,7 @@ def megabytes(text: str) -> float:
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:
-    """Add ``--from`` and ``--to``, stored as ``start`` and ``end`` [s] after the first message."""
+    """Add ``--from`` and ``--to``; ``start`` and ``end`` are in seconds after the first message."""
 
     def moment(text: str) -> float:
         return number(text, "a time of 0 s or more", 0.0, includes_low=True)

@@ -24,7 +24,7 @@ from softfinger.daemon.errors import SettingsError, SoftfingerError, nearest
 _OPTIONS = ("-h", "--help", "--version")
 _UNKNOWN = re.compile(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)")
 
-GROUPS = {  # package in tools/ and description of each subcommand
+GROUPS = {  # maps each subcommand to its package in tools/ and its description
     "run": {
         "run": ("processes", "run the daemon; without --config, for the built-in simulated hand"),
         "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),

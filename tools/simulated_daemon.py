@@ -29,11 +29,11 @@ class TrueStates:
     slip: NDArray[np.float64]  # maximum of |T|/μN over both tips
 
     def since(self, index: int) -> TrueStates:
-        """Return the record from tick ``index`` on."""
+        """Return the states from tick ``index`` onwards."""
         return TrueStates(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
 
     def settled(self, off: NDArray[np.bool_]) -> float:
-        """Return the time [s] from the first tick to the last tick at which ``off`` is True."""
+        """Return the time [s] at which ``off`` was last True, measured from the first tick."""
         where = np.flatnonzero(off)
         return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
 

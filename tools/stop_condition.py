@@ -42,7 +42,7 @@ class StopCondition:
 
     @property
     def is_requested(self) -> bool:
-        """True if a signal has arrived or the lifeline has closed."""
+        """True if a signal has arrived or the pipe to the parent process has closed."""
         return self._is_requested
 
     @property

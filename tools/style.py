@@ -1,8 +1,8 @@
 """Plot style: sizes for print, and lines that can be distinguished without colour.
 
-Ordered families of lines (by displacement or angle) use colours of decreasing lightness. The order
-remains visible in greyscale and for colour-blind readers. Each line also has its own dash pattern.
-Unordered categories use the colours of Okabe and Ito.
+An ordered family of lines, e.g. by displacement or angle, uses colours of decreasing lightness. The
+order remains visible in greyscale and for colour-blind readers. Each line also has its own dash
+pattern. Unordered categories use the Okabe-Ito palette.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class Progress:
         self.on = on and sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
-        """Show the completed amount ``done``. A ``note`` replaces the percentage."""
+        """Show that the amount ``done`` is complete. A ``note`` replaces the percentage."""
         if not self.on or time.monotonic() - self._shown < _REDRAW_INTERVAL:
             return
         self._shown = time.monotonic()

@@ -1,7 +1,7 @@
 """Run ``softfinger plot FILE.mcap``: plot a recording versus time, and compare it with the model.
 
 The model uses the recorded settings and calibrations. Force and energy are taken from the recorded
-states. These values include the modulus factor that was estimated during grips.
+states, and include the modulus factor that was estimated during grips.
 """
 
 from __future__ import annotations

@@ -197,7 +197,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
-    """Draw random plants that differ from the settings; all control laws use the same plants."""
+    """Create random plants that differ from the settings; all control laws use the same plants."""
     rng = np.random.default_rng(16)
     return [
         {
@@ -238,7 +238,7 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float | None:
             hand.run(hand.loop.period)
         hand.plant.apply_load(*way.weight)
         hand.run(begun + _READ_TIME - _STEERING_TIME - hand.now)
-        if way.is_steered:  # Do not wait for the force, because some laws do not measure it.
+        if way.is_steered:  # Do not wait for a measured force; some laws do not measure it.
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERING_TIME)
         is_held = min(hand.plant.force) > 0.0

@@ -1,9 +1,9 @@
 """Measure the run time and the error of contact table lookups and frame estimates.
 
 Within one run, calls to all measured functions alternate. All lookups use the same random points
-with |θ| up to 30° and d up to 8 mm. Half of the displacements are uniformly distributed. The
-logarithms of the other half are uniformly distributed, down to 1 µm. The reported error is the
-maximum relative deviation from a quadrature with many nodes.
+with |θ| up to 30° and d up to 8 mm. Half of the displacements are uniformly distributed. The other
+half are log-uniformly distributed, down to 1 µm. The reported error is the maximum relative
+deviation from a quadrature with many nodes.
 
 Each frame has 44 × 44 cells on a 58 mm square. The contact has d = 4 mm and a tilt of 15°, unless a
 row gives other values. The noise is 0.2 % of the modulus. As in the control loop, the estimator is

@@ -45,7 +45,8 @@ _OBSERVATION_TIME = 5.0  # observation time after the fault [s]
 _REPEATED_LAG = 1.0  # time from the fault to the second force request [s]
 
 _SENSORS = ("left_sensor", "right_sensor")
-# Real tactile boards have a full scale of 127.5 kPa. The simulated sensor's default is 262 kPa.
+# The full scale is 127.5 kPa on real tactile boards, and 262 kPa by default in the simulated
+# sensor.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
@@ -257,7 +258,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Format each event kind, the number of trials with it, and its median first time [s]."""
+    """For each event kind, format the trial count and the median time of the first event [s]."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

@@ -34,7 +34,7 @@ SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor adds 
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
 SOFTFINGER = (sys.executable, "-m", "softfinger")
-_FRAME_COUNT = 16  # number of frames through which the benchmark cycles
+_FRAME_COUNT = 16  # number of frames that are stored for each canned sensor
 
 
 class RigError(SoftfingerError):
@@ -112,7 +112,7 @@ class CannedServos(_Canned):
         self._current = reading.current.copy()
 
     def read(self, reading: Reading) -> None:
-        """Repeat the reading with a new time."""
+        """Repeat the reading with a new timestamp."""
         reading.seq += 1
         reading.valid = True
         reading.t = self._clock.now()

@@ -37,7 +37,8 @@ _EVENT_PREFIX = "consistency."
 _GAIN_ERROR_MIN = math.log(1.3)
 _LOAD_FRACTION = 0.8  # loads below this fraction of the friction limit must be held
 
-# Real tactile boards have a full scale of 127.5 kPa. The simulated sensor's default is 262 kPa.
+# The full scale is 127.5 kPa on real tactile boards, and 262 kPa by default in the simulated
+# sensor.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 _LATENCY = Settings().tactile.latency
 
@@ -107,7 +108,7 @@ NAMES = (
 
 
 def drawn(seed: int) -> HandCase:
-    """Draw a random hand for the ensemble; all its parameters differ from the settings."""
+    """Create a random hand for the ensemble; all its parameters differ from the settings."""
     chance = random.Random(f"{_ENSEMBLE}{seed}")
 
     def span(low: float, high: float) -> float:
@@ -176,7 +177,7 @@ class Outcome:
     held: bool = False  # True if the hold was established
     settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released
     peak: float = 0.0  # maximum force of either tip before the load is applied
-    above: float = 0.0  # longest unloaded time above `_EXCESS_RATIO` [s]
+    above: float = 0.0  # longest time above `_EXCESS_RATIO` before the load [s]
     first_off: float = math.inf  # time when the mean error first rose above `_ERROR_MAX` [s]
     named: float = math.inf  # time of the first diagnosis [s]
     accused: tuple[str, ...] = ()  # channels that were wrongly diagnosed as faulty

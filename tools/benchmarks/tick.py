@@ -2,9 +2,9 @@
 
 Back-to-back ticks run without a pause. Each in-place tick starts after a sleep, as in a running
 daemon. Both kinds of ticks are measured alternately, with the same hand and canned readings. In the
-last measurement, another process emulates the servos. The emulation is unpaced, or paced to the
-transmission times of a baud rate. In addition, the complete simulated hand is timed over one second
-of virtual time.
+last measurement, another process emulates the servos. The emulation either runs unpaced, or
+simulates the transmission times of a given baud rate. In addition, the complete simulated hand is
+timed over one second of virtual time.
 """
 
 from __future__ import annotations

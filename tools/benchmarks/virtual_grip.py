@@ -21,7 +21,7 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 EXCESS_RATIO = 1.3  # a force above this multiple of the requested force is excessive
 LOST_SLIDE = 0.1  # displacement along its faces above which the object counts as lost [m]
 _TORQUE_ERROR = 0.1  # maximum relative error of the torque constant
-# Ratio of goal current to the current during the hold, above which the daemon has reacted.
+# Ratio of the goal current to its value before the fault; above this ratio, the daemon has reacted.
 _INCREASED_RATIO = 1.25
 _AVERAGING_TIME = 0.5  # duration of the final part of the hold, in which the force is averaged [s]
 _SLIP_FRACTION = 0.999  # fraction of the friction limit above which a tip counts as slipping
@@ -86,7 +86,7 @@ class VirtualGrip(SimulatedDaemon):
 
     @classmethod
     def drawn(cls, seed: int, chance: random.Random, sections: Sections) -> Self:
-        """Draw a grip with a random object mass and a random error of the torque constant."""
+        """Create a grip with a random object mass and a random error of the torque constant."""
         drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
         error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
         return cls(merged(sections, {"simulation": drawn}), torque=1.0 + error)

@@ -1,7 +1,7 @@
 """Run `calibrate law --compression`: fit a tip's material law to a testing machine's CSV files.
 
 A file contains strain and stress, or displacement and force. A file with displacement and force
-also requires the tilt, in a column or from ``--theta``.
+also requires the tilt, given in a column or with ``--theta``.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _EXAMPLE = "`d [mm],F [N],tilt [deg]` or `strain [%],stress [kPa]`"
 _NAMED = re.compile(r"^(.*?)\s*(?:[\[(]\s*(.*?)\s*[\])]|[/_]\s*([^\s/_]+))?$")
 _SAME_TILT = 2e-4  # maximum tilt difference within a run [rad]
 _POINTS = 10  # number of points that represent a fitted law
-_BINS = 20  # maximum number of points of a measured stress-strain law
+_BINS = 20  # maximum number of points in a measured stress-strain law
 _TOE = 2.0  # slope ratio that indicates a toe region or an offset
 # Difference in the information criterion that counts as strong evidence (Kass & Raftery, 1995).
 _BETTER = 6.0

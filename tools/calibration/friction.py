@@ -135,7 +135,7 @@ def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArr
 
 
 def _way(settings: Settings, name: str) -> tuple[float, float]:
-    """Return the start and signed length [rad] of a joint's sweeps.
+    """Return the start angle and signed length [rad] of a joint's sweeps.
 
     The sweeps open the joint if its range permits; otherwise, they close the joint. Raises
     CalibrationError if the range is too short.

@@ -34,8 +34,7 @@ _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
 _SCALE = 0.5, 2.0
 # Maximum rms residual [m]. Larger residuals indicate sliding, tilting or a second contact.
 _MISFIT_MAX = 0.3e-3
-# Relative error of d if d is estimated from the frame shape, and if d is estimated from the frame
-# amplitude.
+# Relative errors of d: estimated from the shape of a frame, and from its amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 
@@ -115,8 +114,8 @@ def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
 def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return times, the sum of d over all fingers, and the sum's standard deviation due to noise.
 
-    Each frame is estimated independently. The times are the scan times of the first finger's
-    frames, limited to the period in which all fingers are in contact.
+    Each frame is estimated separately. The times are the scan times of the first finger's frames,
+    limited to the period in which all fingers are in contact.
     """
     names = sorted(own.scene.fingers)
     models = recorded_models(source)

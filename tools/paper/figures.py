@@ -17,7 +17,7 @@ NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
     *("fig7", "fig7_run", "fig10", "fig10_run", "fig10_shear", "fig11"),
 )
-BY_NAME = ("slow_turn",)  # figures that take long to compute, and are drawn only on request
+BY_NAME = ("slow_turn",)  # figures that are slow to compute, and are drawn only on request
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def pages() -> dict[str, FigurePage]:
-    """Return a dictionary of all figures."""
+    """Return all figures by name."""
     from softfinger.tools.paper import (
         experiment_pages,
         model_pages,

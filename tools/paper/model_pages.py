@@ -107,9 +107,9 @@ def double_integrals(
 ) -> tuple[FloatArray, FloatArray]:
     """Integrate eqs. 3 and 10 as printed, and return F [N] and U [J].
 
-    ``d`` [m] and ``theta`` [rad] are broadcast. The product Gauss quadrature is independent of the
-    closed forms. The relative error is ≤ 1e-10 if θ is at least 6° below its limit. F and U are 0
-    at d = 0.
+    ``d`` [m] and ``theta`` [rad] are broadcast against each other. The product Gauss quadrature is
+    independent of the closed forms. The relative error is ≤ 1e-10 if θ is at least 6° below its
+    limit. F and U are 0 at d = 0.
     """
     points, weights = leggauss(_NODES)
     # Substituting sines for x and y keeps the quadrature accurate at the rim of the ellipse.

@@ -1,7 +1,7 @@
 """Compute quasi-static manipulation (section V) and compare it with the simulated hand.
 
-Both tips consist of the paper's springs and stick to the object. The model has no other friction.
-The energy and the shear rate of a tip with shear ζ are
+Both tips consist of the paper's springs and stick to the object. The model does not include any
+other friction. The energy and the shear rate of a tip with shear ζ are
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 

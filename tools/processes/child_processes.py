@@ -1,7 +1,7 @@
 """Run the monitor and the recorder as child processes of the daemon.
 
-Each child reads from a pipe whose other end only the daemon has open. If the daemon exits for any
-reason, the pipe closes and the child exits too.
+Each child reads from a pipe that only the daemon keeps open for writing. If the daemon exits for
+any reason, the pipe closes and the child exits too.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe, and for clos
 
 
 class RecorderError(SoftfingerError):
-    """Error raised if the recorder does not start. The text is the recorder's own message."""
+    """Error raised if the recorder does not start. The error text is the recorder's own message."""
 
 
 class _Lifeline:

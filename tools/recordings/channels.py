@@ -43,7 +43,7 @@ Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 def channel_name(topic: bytes, message: dict[str, Any]) -> str:
-    """Return a message's channel name: the topic and, for a tactile frame, the finger."""
+    """Return a message's channel name, formed from the topic and, for a frame, the finger."""
     if topic == schema.TACTILE:
         return f"{topic.decode()}/{message.get('finger')}"
     return topic.decode()

@@ -102,7 +102,7 @@ class CsvTable:
 
 
 class ParquetTable:
-    """Parquet file with the schema's types."""
+    """Parquet file whose columns have the schema's types."""
 
     suffix = ".parquet"
 

@@ -32,8 +32,8 @@ __all__ = ["Recording", "read_recording"]
 _MESSAGE_SIZE_MAX = 1 << 20  # maximum message size [bytes]; the largest frame has 0.2 MB
 _SETTINGS_SIZE_MAX = 4 << 20  # maximum settings size [bytes], including per-cell calibrations
 _CHUNK_SIZE_MAX = 64 << 20  # maximum unpacked chunk size [bytes]; chunks usually take 1 to 8 MB
-# Minimum number of bytes counted per channel or message, because reading even a short record takes
-# time.
+# Reading even a short record takes time, so each channel or message counts as at least this number
+# of bytes.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
 _OTHERS_NAMED_MAX = 3  # maximum number of foreign channels that a warning lists

@@ -48,7 +48,7 @@ class Difference:
 
 @dataclass(slots=True)
 class Comparison:
-    """Comparison result: number of ticks, number of compared states, and differing fields."""
+    """Result of a comparison, with the tick count, the state count and the differing fields."""
 
     ticks: int = 0
     states: int = 0

@@ -247,7 +247,7 @@ class _Recorder:
     def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
         self._ending = ending
-        self._keys = client_keys(arguments.keys)  # Report key errors before a file is created.
+        self._keys = client_keys(arguments.keys)  # Report unusable keys before creating a file.
         self._gaps: dict[bytes, Gaps] = {}
         # The last writer in this list is the active writer.
         self._writers = [RecordingWriter(arguments.file)]

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Check a profile, or print a profile, the list of profiles, the schema or the reference.
+    """Check or print a profile, or print the list of profiles, the schema or the reference.
 
     Raises SettingsError for an unknown profile, section or key. Raises OSError if a file cannot be
     accessed.

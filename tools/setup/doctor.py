@@ -1,7 +1,7 @@
 """Run ``softfinger doctor``: check ports, servos, boards and the machine, and suggest fixes.
 
-Each check prints one line of results. This module parses the arguments, orders the checks, prints
-results and sets the exit status. The checks are in :mod:`softfinger.daemon.diagnosis`.
+Each check prints one line of results. This module parses the arguments, runs the checks in order,
+prints their results and sets the exit status. The checks are in :mod:`softfinger.daemon.diagnosis`.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def _register_files(
 
 
 def _ports(settings: Settings) -> list[tuple[str, str]]:
-    """Return the settings key and path of each required port, except ports of plugins."""
+    """Return the settings key and path of each required port, except the ports of plugins."""
     ports = []
     servos = backend("servos", settings.servos.backend)
     tactile = backend("tactile", settings.tactile.backend)

@@ -144,7 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until q is pressed, a signal arrives, the duration ends or the daemon exits.
+    """Run until q is pressed, a signal arrives, the duration has elapsed or the daemon exits.
 
     Returns 1 if no stream was received. Raises KeyFileError.
     """

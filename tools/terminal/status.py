@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def describe(state: HandState) -> str:
-    """Return a line with mode, mean force, object angle and object width, or with the fault."""
+    """Return a line with the mode, mean force, object angle and width, or with the fault."""
     mode, *details = state_parts(state)
     separator = ": " if state.fault else " "
     return separator.join(filter(None, [mode, ", ".join(details)]))

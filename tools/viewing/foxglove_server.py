@@ -69,7 +69,7 @@ class _Client:
 
 
 class Foxglove:
-    """Server that runs in ``loop``. Another thread supplies the messages and scenes."""
+    """Server that runs in the event loop ``loop``. Another thread supplies messages and scenes."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop

@@ -1,9 +1,9 @@
 """Compute the lines of a drawing: fingers, tips, object, forces and contact footprints.
 
 Coordinates are in the hand's plane [m]. x points from the left to the right pivot, and y points
-away from the palm. A tip's own axes are x along its base and z normal to the base. In the tip's own
-axes, the equation of the object's face is ``x sin θ + z cos θ = a − d``. `hand.geometry` computes
-the tip positions.
+away from the palm. In a tip's own axes, x is along the tip's base and z is normal to the base. In
+these axes, the equation of the object's face is ``x sin θ + z cos θ = a − d``. `hand.geometry`
+computes the tip positions.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]
     own = np.vstack((shape.corners, shape.corners[:1]))
     if shape.roundness > 0.0:
         own = shape.roundness * _UNIT_CIRCLE
-    # Unlike `math`, NumPy returns NaN for an infinite angle.
+    # For an infinite angle, NumPy returns NaN, whereas `math` raises an exception.
     cosine, sine = np.cos(pose.angle), np.sin(pose.angle)
     turned = own @ np.array([(cosine, sine), (-sine, cosine)]) + (pose.x, pose.y)
     return [turned] if shape.kind != NO_OBJECT and np.isfinite(turned).all() else []

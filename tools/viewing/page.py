@@ -182,7 +182,7 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Redirect a browser that has the one-time code to the page with the token."""
+        """Redirect a browser that sends the one-time code to the page's address with the token."""
         if not self._code or not _has(request, "code", self._code):
             said = (
                 "Open this page with the newest address printed by softfinger view; each "
@@ -251,7 +251,7 @@ class Site:
         return future
 
     def _answer(self, text: str | bytes) -> str:
-        """Send the request ``text`` to the daemon; return a line about the result.
+        """Send the request ``text`` to the daemon; return a line that describes the result.
 
         Commands other than stop are dropped if the user's picture is too old. The field ``seen`` is
         the picture's monotonic time [s].
@@ -309,7 +309,7 @@ def listen(host: str, port: int | None) -> socket.socket:
 
 
 def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
-    """Serve the page until ``ending`` is met. Raises SoftfingerError if nothing can be shown."""
+    """Serve the page until a stop is requested. Raises SoftfingerError if nothing can be shown."""
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
     if recording is not None and arguments.save is not None:

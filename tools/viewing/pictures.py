@@ -1,9 +1,9 @@
 """Convert the stream's messages to data for the web page: scene, pictures and plot rows.
 
-A picture is a JSON text that contains each panel's lines, dots, texts and images at one time. The
-scene contains the layout and the energy landscape, which are constant. A row contains the values of
-all plots at one time. A page receives each row once, even if it skips pictures. Colours are sent by
-name, and the page defines their RGB values.
+A picture is a JSON text that contains each panel's lines, dots, texts and images at one point in
+time. The scene contains the layout and the energy landscape, which are constant. A row contains the
+values of all plots at one point in time. A page receives each row once, even if it skips pictures.
+Colours are sent by name, and the page defines their RGB values.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ class PageRecorder:
         self._process: RecorderProcess | None = None
 
     def toggle(self) -> str:
-        """Start a recording, or end the running one, and return a line about the result."""
+        """Start a recording, or end the running one; return a line that describes the result."""
         try:
             from softfinger.tools.processes.child_processes import RecorderError, RecorderProcess
         except ImportError:  # This system has no termios.

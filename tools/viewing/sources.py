@@ -34,7 +34,7 @@ _QUEUE_LENGTH = 5_000
 
 
 class ViewError(SoftfingerError):
-    """Error raised if nothing can be shown. The message gives the reason and a remedy."""
+    """Error raised if nothing can be shown. The error message gives the reason and a remedy."""
 
 
 def follow(
@@ -44,7 +44,7 @@ def follow(
     ending: StopCondition,
     say: Callable[[str], None],
 ) -> None:
-    """Show the stream selected by ``arguments`` until ``ending`` is met. Raises ViewError."""
+    """Show the stream selected by ``arguments`` until ``ending.is_met``. Raises ViewError."""
     context: zmq.Context[Any] = zmq.Context()
     try:
         if keys is not None:
@@ -126,7 +126,7 @@ class Playback:
                 self._target = min(max(place, 0.0), self._recording.duration)
 
     def run(self, ending: StopCondition) -> None:
-        """Play until ``ending`` is met."""
+        """Play until the stop condition ``ending`` is met."""
         recording, pictures = self._recording, self._pictures
         # Use a separate reader to search for marks. Searching a long recording takes seconds and
         # must not delay the first picture.
