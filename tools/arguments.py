@@ -146,7 +146,7 @@ def addresses(text: str) -> tuple[str, str]:
 
 
 def waiting(address: str, folder: Path | None) -> str:
-    """Return the message for a client that waits for the stream, with a hint if keys are missing.
+    """Return the message that a waiting client prints; it includes a hint if keys are missing.
 
     A daemon that requires keys appears unreachable to a client without keys.
     """
@@ -163,7 +163,7 @@ def _hint(folder: Path | None) -> str:
 
 
 def to_stderr(subcommand: str) -> Callable[[str], None]:
-    """Return a function that prints the subcommand's name and a text to standard error."""
+    """Return a function that prints the subcommand's name and a message to standard error."""
     return lambda line: print(f"{subcommand}: {line}", file=sys.stderr, flush=True)
 
 
@@ -238,7 +238,7 @@ def add_stream(
     kind: Callable[[str], Any] = stream_address,
     client: bool = False,
 ) -> None:
-    """Add the `add_daemon` arguments, ``--no-wait`` and ``--duration`` for a subscriber."""
+    """Add a subscriber's arguments: ``--no-wait``, ``--duration`` and those of `add_daemon`."""
     add_daemon(parser, kind, client)
     parser.add_argument(
         "--no-wait",

@@ -39,7 +39,7 @@ class TrueStates:
 
 
 class SimulatedDaemon:
-    """Daemon that runs in virtual time, with an observable simulated hand. Raises SettingsError."""
+    """Daemon in virtual time with an observable simulated hand. Raises SettingsError."""
 
     def __init__(
         self,

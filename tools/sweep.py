@@ -1,4 +1,4 @@
-"""Run sweeps of independent cases on several processors or a Dask cluster, with a progress bar.
+"""Run sweeps of independent cases on several processors or a Dask cluster, and show the progress.
 
 The cases are independent, so the results are bit-identical for any number of workers. If a worker
 dies, its cases are run again. With a journal, an interrupted sweep resumes after the completed
@@ -55,7 +55,7 @@ class Progress:
         self.on = on and sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
-        """Show that the amount ``done`` is complete. A ``note`` replaces the percentage."""
+        """Show ``done`` as the completed amount. A ``note`` replaces the percentage."""
         if not self.on or time.monotonic() - self._shown < _REDRAW_INTERVAL:
             return
         self._shown = time.monotonic()

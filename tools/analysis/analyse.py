@@ -279,7 +279,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Contacts:
-    """One sensor's contacts, with one row per frame; COLUMNS lists the keys of ``values``."""
+    """Contacts of one sensor, one row per frame; COLUMNS lists the keys of ``values``."""
 
     finger: str
     t: FloatArray
@@ -339,7 +339,7 @@ def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
 
 
 def write_csv(path: Path, contacts: list[Contacts]) -> None:
-    """Write one line per frame, sensor by sensor, with units in the header.
+    """Write a header with units, then one line per frame for each sensor in turn.
 
     Raises
     ------

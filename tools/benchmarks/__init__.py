@@ -1,4 +1,4 @@
-"""The ``softfinger bench`` command, with one module for each measurement.
+"""Implement ``softfinger bench``. Each measurement has its own module.
 
 Several measurements share the modules `measuring`, `rigs` and `virtual_grip`.
 """

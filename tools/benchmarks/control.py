@@ -2,7 +2,7 @@
 
 An object is placed between the fingers at an angle and then grasped. The error is computed from the
 object's true angle in the simulation, not from the daemon's estimate. The simulated plants differ
-from the settings, and the sensor is either ideal or has defects. All runs use virtual time, so the
+from the settings, and the sensor is either ideal or defective. All runs use virtual time, so the
 results do not depend on the machine's speed.
 
 The daemon's control laws are compared with two laws from the literature. *Equal torques* is the
@@ -213,7 +213,7 @@ def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
 
 
 def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
-    """Return one law's row, with the residual angles on ``plants`` and the count of lost objects.
+    """Return a row with one law's residual angles on ``plants`` and the number of lost objects.
 
     ``angles`` lists the residual angle on each plant [°], or None if the object is not held.
     """

@@ -47,7 +47,7 @@ TIP = Fingertip(radius=0.020)
 SOLID = Fingertip(0.020, "solid")
 MODULUS = 0.304e6  # Pa
 LINEAR = Material.constant(MODULUS)
-SIZE, WIDTH = 44, 0.058  # cells per side, width [m]
+SIZE, WIDTH = 44, 0.058  # number of cells per side, and width [m]
 NOISE = 0.002 * MODULUS
 _PASCAL_PER_COUNT = 4.0
 _FRAME_COUNT = 32
@@ -215,7 +215,7 @@ def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> Floa
 
 
 def bound() -> float:
-    """Return the Cramér-Rao bound for d [m] from all cells, for unknown tilts and gain.
+    """Return the Cramér-Rao bound for d [m] if the tilts and the gain are also estimated.
 
     The derivatives of pressure with respect to (d, tilt_x, tilt_y, gain) are central differences.
     """

@@ -1,9 +1,9 @@
 """Measure how grips behave with faulty measurements.
 
 Each case is a grip with a faulty measurement or an unusual tip. A trial's seed determines the
-noise, the times, the affected finger, the object mass and the torque constant error. Trials run in
-virtual time, so the results do not depend on the machine. The results are computed from the plant's
-true state.
+noise, the random delays, the affected finger, the object mass and the torque constant error. Trials
+run in virtual time, so the results do not depend on the machine. The results are computed from the
+plant's true state.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 @dataclass(frozen=True)
 class FaultCase:
-    """Benchmark case: a kind of grip and a fault.
+    """Benchmark case that combines a kind of grip with a fault.
 
     ``words`` are faults in the syntax of `softfinger emulate --fault`, with ``{side}`` as a
     placeholder for the finger. The faults start during the hold. If ``before`` is True, the faults

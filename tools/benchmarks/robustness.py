@@ -193,7 +193,7 @@ class Outcome:
 
 
 def grip(case: HandCase, seed: int = 1) -> Outcome:
-    """Run one grip; ``seed`` determines the noise and the times."""
+    """Run one grip; ``seed`` determines the noise and the random delays."""
     chance, found = random.Random(f"{case.name} {seed}"), Outcome()
     daemon = merged({"simulation": {"seed": seed}}, case.daemon)
     with VirtualGrip(daemon, merged(case.hand, daemon), case.torque) as hand:

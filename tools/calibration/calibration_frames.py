@@ -164,7 +164,7 @@ def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | s
 
 
 def _move(command: str, load: Mapping[str, float | str]) -> None:
-    """Run the stage program for one load and wait until it exits. Raises CalibrationError."""
+    """Run the ``--move`` program for one load, and wait until it exits. Raises CalibrationError."""
     try:
         words = [
             word.format(**{"force": 0.0, "d": 0.0, "theta": 0.0, **load})

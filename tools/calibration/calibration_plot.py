@@ -24,7 +24,7 @@ class Map(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Panel that shows measured ``y`` versus ``x``, with the fit if available."""
+    """Panel that shows measured ``y`` versus ``x``, and the fit if there is one."""
 
     title: str
     xlabel: str

@@ -68,7 +68,7 @@ _SAME_TILT = 2e-4  # maximum tilt difference within a run [rad]
 _POINTS = 10  # number of points that represent a fitted law
 _BINS = 20  # maximum number of points in a measured stress-strain law
 _TOE = 2.0  # slope ratio that indicates a toe region or an offset
-# Difference in the information criterion that counts as strong evidence (Kass & Raftery, 1995).
+# A difference of this size in the information criterion is strong evidence (Kass & Raftery, 1995).
 _BETTER = 6.0
 
 
@@ -149,7 +149,7 @@ def _is_number(cell: str) -> bool:
 
 @dataclass(frozen=True)
 class _Test:
-    """Test run, with the name used in messages."""
+    """Test run, and the name by which messages refer to it."""
 
     name: str
     run: Run

@@ -29,8 +29,8 @@ FloatArray = NDArray[np.float64]
 _STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, divided by the first force
 _HELD = 0.5  # hold time at each force [s]
 _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
-# d is estimated from the frames and computed from the joint angles. If the ratio of the two values
-# is outside this range, the frames do not match the joint motion.
+# Accepted ratio of d estimated from the frames to d computed from the joint angles. A ratio outside
+# this range means that the frames do not match the joint motion.
 _SCALE = 0.5, 2.0
 # Maximum rms residual [m]. Larger residuals indicate sliding, tilting or a second contact.
 _MISFIT_MAX = 0.3e-3
@@ -114,8 +114,8 @@ def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
 def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return times, the sum of d over all fingers, and the sum's standard deviation due to noise.
 
-    Each frame is estimated separately. The times are the scan times of the first finger's frames,
-    limited to the period in which all fingers are in contact.
+    Each frame is estimated separately. The times are the first finger's scan times while all
+    fingers are in contact.
     """
     names = sorted(own.scene.fingers)
     models = recorded_models(source)

@@ -1,4 +1,4 @@
-"""Move the hand of a running daemon during a calibration, and store the stream."""
+"""Control a running daemon's hand during a calibration, and store the stream."""
 
 from __future__ import annotations
 

@@ -140,7 +140,7 @@ class Plotted:
     label: str
     unit: str
     scale: float  # factor from SI to this unit
-    row: int  # index in the results of closed_forms and double_integrals
+    row: int  # index of the quantity in the results of closed_forms and double_integrals
     slope: int  # index of the derivative with respect to d in closed_forms
     exponent: int
     equation: int

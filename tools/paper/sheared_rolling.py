@@ -47,7 +47,7 @@ from softfinger.tools.style import GREY, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHARES = (0.0, 0.02, 0.05, 0.1)  # fractions s shown in the figure
+SHARES = (0.0, 0.02, 0.05, 0.1)  # values of the fraction s in the figure
 _EACH = tuple(k / 100.0 for k in range(11))
 DEPTH, SHARE = 6, 0.05  # displacement shown in the figure [mm], and fraction s simulated
 _STEPS = 208

@@ -78,7 +78,7 @@ class Erratum:
 
 @dataclass(frozen=True)
 class Panel:
-    """Axes in a figure, with drawing function, labels, limits and legend."""
+    """Axes in a figure, with a drawing function, labels, limits and a legend."""
 
     content: Callable[..., None]  # drawing function, called with the axes and all sheets
     xlabel: str

@@ -109,7 +109,7 @@ class MonitorProcess:
 
 
 class RecorderProcess:
-    """Run ``record`` with the arguments ``words``; the first argument is the file.
+    """Run ``record`` with the arguments ``words``; the first argument is the file name.
 
     ``failed`` is set as soon as the recording is known to be incomplete.
     """

@@ -67,7 +67,7 @@ class EventLog:
         self._news.set()
 
     def take_over_logging(self) -> None:
-        """Log the warnings and errors that all modules send to Python's logging."""
+        """Log the warnings and errors that any module sends to Python's logging."""
         handler = _LogHandler(self)
         handler.setLevel(logging.WARNING)
         logging.getLogger().addHandler(handler)

@@ -54,7 +54,7 @@ _SILENCE_TIME = 2.0  # time without messages after which a notice is printed [s]
 # Time between socket reads [s]. Waking up for each message would take longer than processing the
 # message.
 _POLL_INTERVAL = 0.1
-_BACKLOG_TIMEOUT = 10.0  # time limit for processing queued messages at the end [s]
+_BACKLOG_TIMEOUT = 10.0  # time limit for processing the messages still queued at the end [s]
 _TRANSIT_TIME = 0.5  # time allowed at the end for messages that are still in transit [s]
 _PROGRESS_INTERVAL = 0.5  # time between two progress lines, and between two flushes [s]
 _BATCH_SIZE = 1000  # maximum number of messages read before the time is checked
@@ -62,7 +62,7 @@ _BATCH_SIZE = 1000  # maximum number of messages read before the time is checked
 
 # If the recorder is killed, only the incomplete chunk is lost. The incomplete chunk contains the
 # messages since the last flush.
-CHUNK_SIZE = 256 * 1024  # chunk size before compression [bytes], about 0.2 s of states at 1 kHz
+CHUNK_SIZE = 256 * 1024  # chunk size before compression [bytes], enough for about 0.2 s at 1 kHz
 
 
 class RecordingWriter:
@@ -242,7 +242,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Recorder:
-    """Files and counters of one ``record`` call."""
+    """Files and counters for one ``record`` call."""
 
     def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments

@@ -367,7 +367,7 @@ class Commander:
         self.reply = ShownReply(now, False, why)
 
     def collect(self, now: float) -> None:
-        """Process received replies, and close commands whose reply is overdue."""
+        """Process received replies, and discard commands whose replies are overdue."""
         for each in list(self._pending):
             if each.late is not None:
                 if now < each.again_at:

@@ -45,7 +45,7 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
 
 
 class DrawnPart(NamedTuple):
-    """Lines and labels of one part of a picture; the lists are empty while the part is absent."""
+    """Lines and labels for one part of a picture; both lists are empty if the part is absent."""
 
     lines: list[tuple[str, float, FloatArray]]  # colour name, width [m], points [n, 2] [m]
     texts: list[tuple[str, FloatArray, str]]  # colour name, position [2] and text of each label
@@ -213,7 +213,7 @@ def footprint(
     sine = math.hypot(*n)
     if sine >= 1.0:
         return None
-    x, y = n / sine if sine > 0.0 else (1.0, 0.0)  # unit vector along the tilt
+    x, y = n / sine if sine > 0.0 else (1.0, 0.0)  # unit vector in the tilt direction
     across = math.sqrt(2.0 * radius * d - d * d)
     ellipse = across * _UNIT_CIRCLE * (math.sqrt(1.0 - sine * sine), 1.0)
     outline = (radius - d) * n + ellipse @ np.array([(x, y), (-y, x)])

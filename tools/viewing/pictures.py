@@ -207,7 +207,7 @@ class Pictures:
             self._foxglove.take(topic, message)
 
     def _read_settings(self, settings: Settings) -> None:
-        """Lay out the scene, with panels and plots only for parts that the hand has."""
+        """Lay out the scene; only parts that the hand has get panels and plots."""
         self._settings, self._fingers = settings, fingers_of(settings)
         self._pressure = heatmap.FullScale(
             heatmap.round_up(_FULL_SCALE_MIN * settings.tactile.noise)

@@ -16,8 +16,8 @@ class PageRecorder:
     """Run one `softfinger record` process at a time, in the current folder.
 
     ``show`` receives a map with the running recording's ``file`` and its start time ``since`` (Unix
-    time [s]). If the recording failed, the map contains the reason as ``failed``. Without a
-    recording, the map is empty.
+    time [s]). If the recording failed, the map contains the reason as ``failed``. If no recording
+    is running, the map is empty.
     """
 
     def __init__(self, address: str, keys: str, show: Callable[[dict[str, Any]], None]) -> None:

@@ -95,7 +95,7 @@ def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
 
 
 class Playback:
-    """Playback of a recording, in real time with ``run`` or at any ``position`` with ``show``."""
+    """Play a recording: `run` plays in real time, and `show` draws the current position."""
 
     def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
         self._recording = recording
