@@ -62,7 +62,7 @@ def settings() -> AbstractContextManager[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of the given size [inch], independent of any window system."""
+    """Return an empty figure of the given size [inch] that does not require a window system."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")

@@ -39,8 +39,8 @@ _REPORT_TIME_MAX = 0.3  # time limit for a fault report, measured from the middl
 _SLIDE_MAX = 0.010  # m
 
 # Phases of a trial.
-_GRIP_TIMEOUT = 2.5  # time limit for establishing the hold [s]
-_REST_TIME = 1.2  # duration of the undisturbed hold [s]
+_GRIP_TIMEOUT = 2.5  # time limit for reaching the mode `holding` [s]
+_REST_TIME = 1.2  # time for which the object is held without a disturbance [s]
 _OBSERVATION_TIME = 5.0  # observation time after the fault [s]
 _REPEATED_LAG = 1.0  # time from the fault to the second force request [s]
 
@@ -55,8 +55,8 @@ class FaultCase:
     """Benchmark case that combines a kind of grip with a fault.
 
     ``words`` are faults in the syntax of `softfinger emulate --fault`, with ``{side}`` as a
-    placeholder for the finger. The faults start during the hold. If ``before`` is True, the faults
-    start before the grasp.
+    placeholder for the finger. The faults start while the object is held. If ``before`` is True,
+    the faults start before the grasp.
     """
 
     name: str
@@ -124,7 +124,7 @@ class GripTrial:
     """
 
     false: tuple[str, ...]  # channels that may be reported as faulty
-    held: bool = True  # True if the hold was established
+    held: bool = True  # True if the mode `holding` was reached
     settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released
     peak: float = 0.0  # maximum force of either tip
     above: float = 0.0

@@ -37,7 +37,7 @@ REDUCED_LOADS = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # loads without `--full` [N
 _FORCE = 10.0  # N
 _TRIAL_COUNT = 3  # number of trials per case
 _RESPONSE_AIM, _REPORT_AIM = 22.0, 200.0  # ms
-_GRIP_TIMEOUT = 5.0  # time limit for establishing the hold [s]
+_GRIP_TIMEOUT = 5.0  # time limit for reaching the mode `holding` [s]
 # Durations of the standing-load ramp, and of the constant standing load that follows [s].
 _LOAD_TIME, _STANDING_TIME = 1.0, 1.5
 _LOAD_STEP_COUNT = 50  # number of steps in the standing-load ramp

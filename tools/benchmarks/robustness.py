@@ -1,7 +1,7 @@
 """Measure the true grip force of hands that differ from their settings.
 
 The simulated hand and the daemon have separate settings. In each of the *rows*, one parameter
-differs from its setting by an amount that is normal for a healthy hand. In the *ensemble*, all
+differs from its setting by an amount that is typical of a healthy hand. In the *ensemble*, all
 parameters are drawn at random. Grips run in virtual time, so the results do not depend on the
 machine.
 """
@@ -25,7 +25,7 @@ from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
-# Time limit for establishing the hold, duration of the undisturbed hold, and observation time [s].
+# Time limit for reaching the mode `holding`, undisturbed holding time, and observation time [s].
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
 # Two limits for the relative force error, and one for the displacement [m].
 _ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01
@@ -53,7 +53,7 @@ class HandCase:
     hand: Sections = field(default_factory=dict)
     daemon: Sections = field(default_factory=dict)
     torque: float = 1.0  # ratio of the true torque constant to its setting
-    words: str = ""  # faults in `softfinger emulate --fault` syntax, which start during the hold
+    words: str = ""  # faults during the hold, in `softfinger emulate --fault` syntax
     load: float = 0.0  # load along the faces [N]
     within: float = 0.0  # duration of the load ramp [s]
     turn: float = 0.0  # commanded object angle [rad]
@@ -174,7 +174,7 @@ def drawn(seed: int) -> HandCase:
 class Outcome:
     """Outcome of a grip. Forces are relative to the requested force, and times are in s."""
 
-    held: bool = False  # True if the hold was established
+    held: bool = False  # True if the mode `holding` was reached
     settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released
     peak: float = 0.0  # maximum force of either tip before the load is applied
     above: float = 0.0  # longest time above `_EXCESS_RATIO` before the load [s]

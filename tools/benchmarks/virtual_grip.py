@@ -23,7 +23,7 @@ LOST_SLIDE = 0.1  # displacement along its faces above which the object counts a
 _TORQUE_ERROR = 0.1  # maximum relative error of the torque constant
 # Ratio of the goal current to its value before the fault; above this ratio, the daemon has reacted.
 _INCREASED_RATIO = 1.25
-_AVERAGING_TIME = 0.5  # duration of the final part of the hold, in which the force is averaged [s]
+_AVERAGING_TIME = 0.5  # time at the end of the hold over which the force is averaged [s]
 _SLIP_FRACTION = 0.999  # fraction of the friction limit above which a tip counts as slipping
 
 

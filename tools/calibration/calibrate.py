@@ -211,7 +211,7 @@ def _frames(text: str) -> int:
 
 
 def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write a finger's calibration factors to its file and return a summary line.
+    """Write a finger's calibration factors to the calibration file; return a summary line.
 
     The sensor gain changes whenever the sensor is remounted, and the tip modulus may be known only
     roughly. Gain and modulus are estimated during a grip (`daemon.perception.hand_state`). A daemon

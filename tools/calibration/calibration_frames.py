@@ -52,7 +52,7 @@ class Loads:
 
 
 def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
-    """Collect the loads for a step.
+    """Collect the loads for a calibration step.
 
     Raises
     ------
@@ -196,7 +196,7 @@ def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[Tacti
 
 
 def _fresh(backend: TactileSensor, clock: RealClock, since: float) -> Iterator[Frame]:
-    """Yield new frames scanned after ``since``; raise TactileError if the sensor stops."""
+    """Yield new frames that were scanned after ``since``. Raises TactileError."""
     last = backend.latest()
     waited = clock.now()
     while True:

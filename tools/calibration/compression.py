@@ -73,7 +73,7 @@ _BETTER = 6.0
 
 
 def read_csv(path: Path) -> dict[str, FloatArray]:
-    """Read a file's known columns and convert them to SI units.
+    """Read the columns that have known names, and convert the values to SI units.
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
     semicolon. The unit of a column follows the column name, or is in a separate row below the

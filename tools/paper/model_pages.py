@@ -210,7 +210,7 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     """Tabulate the quantity and its exponents at each tilt, for d up to 8 mm.
 
-    For each tilt, a second sheet contains the fitted exponent, and the quantity divided by its
+    For each tilt, a second sheet contains the fitted exponent and the ratio of the quantity to its
     value at θ = 0. The second sheet is computed from the double integral, not from the closed form.
     The exponents for Table I's law are computed from the integral of that law.
     """

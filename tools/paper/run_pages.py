@@ -193,7 +193,7 @@ def _columns(
 def roll(hand: SimulatedHand, d: float, angle: float, rolling: float = 1.0) -> None:
     """Move the object as if it had rolled to ``angle`` [rad] at constant ``d`` [m].
 
-    A fraction ``rolling`` of the face motion is rolling; the rest is shear.
+    The fraction ``rolling`` of the face motion is pure rolling; the remainder shears the tip.
     """
     q = float(hand.q[0])
     parameters = hand.plant.parameters
@@ -267,7 +267,7 @@ def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
 
 @cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return the sheets of the rotation, of the rolling, and of the minima of F and U."""
+    """Return the sheets for the rotation, the rolling, and the minima of F and U."""
     columns: dict[str, FloatArray] = {}
     for depth in DEPTHS:
         columns |= run_rolling(depth)

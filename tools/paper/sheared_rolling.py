@@ -1,7 +1,7 @@
 """Show that shear during rolling moves the minima of F and U to θ < 0 (section IV-B).
 
 The finger is tilted to −11.5°. From this tilt, the object rolls to 9.2° at constant displacement d.
-A fraction s of the face motion shears the tip; the rest is rolling. The shear is
+A fraction s of the face motion shears the tip; the remainder is pure rolling. The shear is
 
     ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
 

@@ -75,7 +75,7 @@ def comparisons() -> Iterator[PublishedValue]:
 
 def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
             unit: str = "", why: str = "") -> PublishedValue:  # fmt: skip
-    """Compare ``ours`` with the range [low, high]; all three values are rounded to ``form``."""
+    """Compare ``ours`` with the range [low, high]; format ``form`` rounds all three values."""
     shown = [f"{each:{form}}" for each in (low, high, ours)]
     inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
     verdict = "agree" if inside else "disagree"

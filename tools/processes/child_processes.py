@@ -111,7 +111,7 @@ class MonitorProcess:
 class RecorderProcess:
     """Run ``record`` with the arguments ``words``; the first argument is the file name.
 
-    ``failed`` is set as soon as the recording is known to be incomplete.
+    ``failed`` is set as soon as an incomplete recording is detected.
     """
 
     def __init__(

@@ -231,7 +231,7 @@ def main() -> None:
     line for each part is ``done`` or ``failed REASON``.
     """
     # The compiler allocates many long-lived objects, so frequent garbage collection would take 10 %
-    # of the time.
+    # of the compile time.
     gc.set_threshold(100_000)
     out = sys.stdout
     sys.stdout = sys.stderr  # Other output must not interfere with the protocol.

@@ -292,7 +292,7 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
-        # If softfinger wrote the file, an unknown topic comes from a newer version.
+        # If softfinger wrote the file, an unknown topic was written by a newer version.
         if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
             self._other_names[channel.id] = channel.topic
             return

@@ -36,7 +36,7 @@ _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of h
 
 @dataclass(slots=True)
 class Difference:
-    """Differences in one ``hand/state`` field: number, first difference and largest difference."""
+    """Number of differences in a ``hand/state`` field, and the first and largest difference."""
 
     count: int = 0
     first_tick: int = 0

@@ -125,7 +125,7 @@ def round_up(value: float) -> float:
 
 
 class FullScale:
-    """Full-scale value that increases with a signal's peak at once and decreases after a delay."""
+    """Full-scale value that rises immediately with a signal's peak, and falls after a delay."""
 
     def __init__(self, smallest: float, patience: float = 3.0) -> None:
         self._smallest = smallest

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 def si_numbers(words: list[str]) -> dict[str, float]:
     """Parse ``key=value`` words, and convert the values to SI units.
 
-    Raises ValueError; the message contains the word and the reason.
+    Raises ValueError with the invalid word and the reason.
     """
     numbers = {}
     for key, text in _pairs(words):

@@ -195,7 +195,7 @@ class StreamState:
 
     def _read_event(self, event: schema.Event, _: float) -> None:
         # A late subscriber receives repeated events with their original seq and time. An event with
-        # the same seq but another time comes from another daemon.
+        # the same seq but a different time was sent by a different daemon.
         name = event.seq, event.timestamp
         if event.again and name in self._event_times:
             return

@@ -109,7 +109,7 @@ class Terminal:
                 # terminal.
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, self._attributes)
         with contextlib.suppress(OSError, termios.error, TerminalGone):
-            if self._stuck:  # Discard the rest of the page.
+            if self._stuck:  # Discard output that has not been written yet.
                 termios.tcflush(self._output, termios.TCOFLUSH)
             # Resume a terminal that was stopped by Ctrl-S; otherwise the next write would block.
             termios.tcflow(self._output, termios.TCOON)

@@ -1,7 +1,7 @@
 """Read the settings in ``hand/settings``, and draw the tip's energy landscape U(d, θ).
 
-A key that cannot be read, for example because it comes from another version, gets its default
-value.
+If a key cannot be read, for example because another version wrote the settings, the default value
+is used.
 """
 
 from __future__ import annotations

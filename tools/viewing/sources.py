@@ -128,8 +128,8 @@ class Playback:
     def run(self, ending: StopCondition) -> None:
         """Play until the stop condition ``ending`` is met."""
         recording, pictures = self._recording, self._pictures
-        # Use a separate reader to search for marks. Searching a long recording takes seconds and
-        # must not delay the first picture.
+        # Use a separate reader to search for marks. Searching a long recording takes several
+        # seconds, and must not delay the first picture.
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
