@@ -330,7 +330,7 @@ class _Pass:
 
 
 def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
-    """Compute the contacts of each sensor. Errors in ``source.frames`` are propagated."""
+    """Compute each sensor's contacts. Errors in ``source.frames`` are propagated."""
     models = source.models()
     passes = {finger: _Pass(source, models, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):

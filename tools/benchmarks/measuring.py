@@ -33,7 +33,10 @@ class Report:
     failed: bool = False
 
     def __str__(self) -> str:
-        """Format as aligned text with four digits. None and NaN are blank; lists are omitted."""
+        """Format as aligned text with four significant digits.
+
+        None and NaN are blank; lists are omitted.
+        """
         shown = (key for row in self.rows for key in row if not isinstance(row[key], list))
         keys = list(dict.fromkeys(shown)) or ["name"]
         table = plain_table()

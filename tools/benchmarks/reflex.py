@@ -1,6 +1,6 @@
 """Measure how a grip reacts to a sudden load increase.
 
-In a 10 N grip, the object is under a constant load along its faces, away from the palm. Then a
+In a 10 N grip, a constant load acts on the object along its faces, away from the palm. Then a
 larger load is applied and maintained. The larger load is a push, or a twist with the same force at
 the faces. Trials run in virtual time, and the results are computed from the simulated hand's true
 state. *Lost*: the object is no longer between the tips. *Slid*: displacement of the object along

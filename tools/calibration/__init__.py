@@ -1,1 +1,1 @@
-"""The `calibrate` command: frame acquisition, calibration steps and plots."""
+"""Implement the `calibrate` command, including frame acquisition and plots."""

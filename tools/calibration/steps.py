@@ -141,7 +141,7 @@ class Step:
 
     @property
     def plain_grid(self) -> SensorGrid:
-        """Sensor grid, centred and not rotated."""
+        """Sensor grid without offset or rotation."""
         sensor = self.calibration.sensor
         return SensorGrid(sensor.rows, sensor.cols, sensor.pitch)
 
@@ -394,7 +394,7 @@ def _measured_told(law: TipCurves, left: FloatArray) -> str:
 
 
 def _over_d(trend: Trend) -> str:
-    """Describe E at the minimum, middle and maximum d, and append a warning if E drifts."""
+    """Format E at the minimum, middle and maximum d, and append a warning if E drifts."""
     order = np.argsort(trend.d, kind="stable")[[0, len(trend.d) // 2, -1]]
     values = ", ".join(f"{each / 1e6:.3f}" for each in trend.modulus[order])
     depths = ", ".join(f"{each * 1e3:g}" for each in trend.d[order])

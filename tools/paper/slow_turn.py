@@ -1,4 +1,4 @@
-"""Compute quasi-static manipulation (section V) and compare it with the simulated hand.
+"""Compute a quasi-static manipulation (section V), and compare it with the simulated hand.
 
 Both tips consist of the paper's springs and stick to the object. The model does not include any
 other friction. The energy and the shear rate of a tip with shear ζ are

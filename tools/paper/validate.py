@@ -84,7 +84,7 @@ def between(quantity: str, low: float, high: float, source: str, ours: float, fo
 
 
 def exponent(d: FloatArray, force: FloatArray) -> float:
-    """Return ζ from a least-squares fit to ln F = ln C + ζ ln d."""
+    """Return ζ from a least-squares fit of ln F = ln C + ζ ln d."""
     return float(np.polyfit(np.log(d), np.log(force), 1)[0])
 
 

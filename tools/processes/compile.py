@@ -129,7 +129,7 @@ def _available() -> float:
 
 
 class _Build:
-    """Build parts in several processes, each controlled by its own thread."""
+    """Build pipeline parts in several processes, each controlled by its own thread."""
 
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
         self._head = f"{settings.model_dump_json()}\n"

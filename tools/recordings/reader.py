@@ -292,7 +292,7 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
-        # If softfinger wrote the file, an unknown topic was written by a newer version.
+        # If softfinger wrote the file, an unknown topic means that a newer version wrote the file.
         if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
             self._other_names[channel.id] = channel.topic
             return
@@ -434,7 +434,8 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
-    """Unpack a chunk's records. Raises ValueError for a wrong checksum or an excessive size."""
+    """Unpack a chunk's records. Raises ValueError if the checksum is incorrect or the size is
+    excessive."""
     if size > _CHUNK_SIZE_MAX:
         raise ValueError(f"a chunk of {size >> 20} MB, which is too large")
     if method == "zstd":

@@ -28,7 +28,7 @@ from softfinger.tools.recordings.reader import MessageSource, Recording
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
-# These fields depend on the machine's timing, not on the inputs of the loop.
+# These fields depend on the machine's timing, not on the loop's inputs.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 _SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of hand/settings

@@ -254,7 +254,7 @@ class MonitorPage:
         )
 
     def _ticks(self) -> Text:
-        """Draw the tick rate, the overruns, and the median, p99 and maximum of the tick times."""
+        """List the tick rate, the number of overruns, and the median, p99 and maximum tick time."""
         times, overruns = self.feed.times, self.feed.state.overruns
         rate = math.nan if times is None else times.rates.tick
         line = Text(f" tick {format_value(rate, 0)} Hz").append("  overruns ", DIM)
@@ -269,7 +269,7 @@ class MonitorPage:
         return line.append(" µs", DIM)
 
     def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
-        """Draw the commanding client, the last reply, and events; wrap a long fault or reply."""
+        """List the commanding client, last reply and events; wrap long faults and replies."""
         who = truncated(Text(self.feed.commander(now)), 16)
         title = Text(f"events ─ {who} commands the hand" if who else "events")
         full: list[Text] = []

@@ -1,4 +1,4 @@
-"""Collect the data for a live page from the daemon's sockets.
+"""Collect data from the daemon's sockets for display on a live page.
 
 The contents of messages are not trusted. Fields that are missing or have the wrong type become NaN
 or empty. Messages that cannot be decoded are counted and skipped.

@@ -55,7 +55,7 @@ _DEGREE = math.degrees(1.0)
 
 
 class _Plot(NamedTuple):
-    """Plot of several lines versus time; ``span`` is its minimum axis range, in ``unit``."""
+    """Plot of several lines versus time; ``span`` is the minimum axis range in ``unit``."""
 
     title: str
     unit: str
@@ -151,7 +151,7 @@ class Pictures:
         self._live = live
         self._foxglove = foxglove
         self._period = period
-        self._number = 0  # number of rows so far
+        self._number = 0  # number of rows created so far
         self._marks: list[Any] = []
         self.recording: dict[str, Any] = {}  # status of the page's recorder
         self._settings_text = ""  # last settings message, unparsed

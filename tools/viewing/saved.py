@@ -1,4 +1,4 @@
-"""Save a recording as a page that plays without a server, or as an animation of the hand."""
+"""Save a recording as a page that does not need a server, or as an animation of the hand."""
 
 from __future__ import annotations
 
