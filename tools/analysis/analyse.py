@@ -111,7 +111,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 
 _EIGHT_BITS = 255
-_NOISE_RATIO = 1.5  # ratio of measured noise to tactile.noise above which it is reported
+_NOISE_RATIO = 1.5  # measured noise above this multiple of tactile.noise is reported
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:

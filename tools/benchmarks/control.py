@@ -67,8 +67,8 @@ class TwoPhased(Altered):
     """Serial two-phased controller from the literature.
 
     Phase one integrates the object angle error with ``bandwidth`` [Hz] into an antisymmetric joint
-    goal. Phase two is a PD law that moves the joints to this goal. Both torques also include an
-    equal bias, which is computed from the requested force. The measured force is not used.
+    goal. Phase two is a PD law that moves the joints to this goal. Both joint torques also include
+    the same bias, which is computed from the requested force. The measured force is not used.
     """
 
     def __init__(

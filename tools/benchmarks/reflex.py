@@ -56,7 +56,7 @@ class Overload(NamedTuple):
 def measure(
     brief: bool = False, full: bool = False, sweep: Callable[..., Iterable[Any]] = map
 ) -> list[Report]:
-    """Return one table for each hand and object mass; ``brief`` runs fewer cases.
+    """Return one table for each kind of hand and object mass; ``brief`` runs fewer cases.
 
     ``sweep`` maps cases to outcomes in one or more processes.
     """

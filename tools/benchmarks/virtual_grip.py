@@ -19,7 +19,7 @@ from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 EXCESS_RATIO = 1.3  # a force above this multiple of the requested force is excessive
-LOST_SLIDE = 0.1  # displacement along its faces above which the object counts as lost [m]
+LOST_SLIDE = 0.1  # displacement along the object's faces that counts as a loss [m]
 _TORQUE_ERROR = 0.1  # maximum relative error of the torque constant
 # Ratio of the goal current to its value before the fault; above this ratio, the daemon has reacted.
 _INCREASED_RATIO = 1.25

@@ -34,7 +34,7 @@ _STD_MAX = 5e-3  # maximum standard deviation of the latency [s]
 _SCALE = 0.5, 2.0
 # Maximum rms residual [m]. Larger residuals indicate sliding, tilting or a second contact.
 _MISFIT_MAX = 0.3e-3
-# Relative errors of d: estimated from the shape of a frame, and from its amplitude.
+# Relative error of d estimated from the frame shape, and of d estimated from the frame amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 

@@ -21,7 +21,7 @@ from softfinger.daemon.errors import SoftfingerError
 
 # This sequence restores the terminal if the monitor was killed.
 RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
-_RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe, and for closing its file [s]
+_RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe or to close its file [s]
 
 
 class RecorderError(SoftfingerError):

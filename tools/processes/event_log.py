@@ -73,7 +73,7 @@ class EventLog:
         logging.getLogger().addHandler(handler)
 
     def close(self, patience: float = 1.0) -> None:
-        """Write the queued lines, and wait at most ``patience`` s."""
+        """Write the queued lines, and wait at most ``patience`` s until they are written."""
         self._closing = True
         self._news.set()
         self._thread.join(patience)

@@ -153,7 +153,7 @@ def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
             yield repaired
     servos = path == settings.servos.port
     # A board sends frames unprompted, so the latency timer merely delays the frames. A timeout of 1
-    # s therefore accepts every latency timer.
+    # s accepts every latency timer.
     found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
     if found is not None:
         yield found

@@ -146,7 +146,7 @@ def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, 
 def grasped(
     settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
 ) -> Cell:
-    """Grasp an object on the table, then load it with its own weight, directed away from the palm.
+    """Grasp an object on the table, then apply a force equal to its weight, away from the palm.
 
     The daemon's settings contain the object's width or diameter (``size`` [m]), friction and weight
     (from ``mass`` [kg]). The settings do not contain the ``shape``; the daemon assumes a block.

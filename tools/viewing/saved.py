@@ -55,8 +55,7 @@ def _pictures(
 ) -> tuple[list[tuple[str, list[str]]], str, int]:
     """Return each scene with its pictures, all plot rows, and the number of states.
 
-    The scenes, pictures and rows are JSON texts in the form in which the server sends them to a
-    page.
+    The scenes, pictures and rows are the JSON texts that the server would send to a page.
     """
     scenes: list[tuple[str, list[str]]] = []
     kept: dict[int, str] = {}
