@@ -76,7 +76,7 @@ class StopCondition:
     def wake(self, *_: object) -> None:
         """Interrupt a wait."""
         # Do not use an Event here, because the interrupted thread may hold the Event's lock.
-        with contextlib.suppress(BlockingIOError):  # A full buffer also wakes the thread.
+        with contextlib.suppress(BlockingIOError):  # A full buffer has already woken the thread.
             self._wake.send(b"!")
 
     def __enter__(self) -> Self:

@@ -147,7 +147,7 @@ def _daemon(sections: Sections) -> Daemon:
 def _frames(
     daemon: Daemon, count: int, place: Callable[[SimulatedHand, float], None] | None = None
 ) -> Iterator[Row]:
-    """Yield the true state at each sampling time, and the estimate from that frame alone."""
+    """Yield each frame's true state at the scan time, and the estimate from this frame alone."""
     hand, loop = daemon.hand, daemon.loop
     assert hand is not None
     if place is not None:

@@ -49,7 +49,7 @@ _FREE = {"table_friction": 0.0, "joint_friction": 0.0}
 
 
 class Held(NamedTuple):
-    """Poses of the hand and the object, and contacts of both tips."""
+    """Poses of the hand and the object, and the contacts of both tips."""
 
     q: FloatArray
     pose: FloatArray

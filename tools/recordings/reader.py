@@ -434,8 +434,7 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
-    """Unpack a chunk's records. Raises ValueError for an incorrect checksum or an excessive
-    size."""
+    """Unpack a chunk's records. Raises ValueError for an incorrect checksum or excessive size."""
     if size > _CHUNK_SIZE_MAX:
         raise ValueError(f"a chunk of {size >> 20} MB, which is too large")
     if method == "zstd":

@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Publish the recording, or recompute and compare its states.
+    """Publish the recording, or recompute its states and compare them with the recorded states.
 
     Raises
     ------

@@ -152,8 +152,8 @@ def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
         if repaired is not None:
             yield repaired
     servos = path == settings.servos.port
-    # A board sends frames unprompted, so the latency timer merely delays the frames. A timeout of 1
-    # s accepts every latency timer.
+    # A board sends frames unprompted, so the latency timer merely delays the frames. With a timeout
+    # of 1 s, every latency timer is acceptable.
     found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
     if found is not None:
         yield found

@@ -255,7 +255,7 @@ class Pictures:
         self._scene_text = _packed(self._scene)
 
     def mark(self, marks: list[Any]) -> None:
-        """Show a recording's ``marks``, which `sources.marks_of` returns."""
+        """Show the ``marks`` of a recording, as returned by `sources.marks_of`."""
         self._marks = self._scene["marks"] = marks
         self._scene_text = _packed(self._scene)
 
