@@ -17,9 +17,9 @@ These formulas are the contact law for ``simulation.tip_law = "springs"``. The l
 omits the term sin θ d_t. The tangential force of the bristle law is T = 2 s F cos θ d_t/d. For a
 constant E, T = 2πE s d d_t. A bristle at the centre of the contact exerts the tangential force.
 Tilt and compression do not bend the bristle. The bristle's deflection d_t changes only when the
-surfaces slide at the centre of the contact. The force at θ = 0, the force at d_t = 0 and the sensor
-readings are the same for both laws. A controller that compensates for the tangential terms of
-springs can be tested on a ``"bristles"`` tip, which lacks these terms.
+surfaces slide at the centre of the contact. The force at θ = 0, the normal force at d_t = 0 and the
+sensor readings are the same for both laws. A controller that compensates for the tangential terms
+of springs can be tested on a ``"bristles"`` tip, which lacks these terms.
 
 The tip touches the nearest point of the object. On a face, the contact direction is the face
 normal. At a corner, the contact direction is the line to the corner. The corner acts like a plane
